@@ -1,0 +1,20 @@
+# The compile flags every target of ours gets, and the two kinds of target.
+
+# Warnings are errors. -ffp-contract=off: floating point must give the same bits on every target (DESIGN, "Fixed point
+# and determinism"), so the compiler may not fuse a multiply and an add.
+add_library(pipefish_flags INTERFACE)
+target_compile_options(pipefish_flags INTERFACE
+  -Wall -Wextra -Wconversion -Wshadow -Werror -ffp-contract=off
+  $<$<COMPILE_LANGUAGE:C>:-Wstrict-prototypes -Wmissing-prototypes -Wvla>)
+if(PIPEFISH_SANITIZE)
+  set(PIPEFISH_SANITIZERS -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer)
+  target_compile_options(pipefish_flags INTERFACE ${PIPEFISH_SANITIZERS})
+  target_link_options(pipefish_flags INTERFACE ${PIPEFISH_SANITIZERS})
+endif()
+
+# pipefish_room(NAME sources...): a static library pf_NAME with the project's flags. Add what it may know of with
+# target_link_libraries afterwards; the arrows of DESIGN point one way only.
+function(pipefish_room name)
+  add_library(pf_${name} STATIC ${ARGN})
+  target_link_libraries(pf_${name} PRIVATE $<BUILD_INTERFACE:pipefish_flags>)
+endfunction()

@@ -1,0 +1,147 @@
+/* The feature tracker: corners spread over the image, pyramidal KLT with forward-backward check, a table of tracks with
+ * stable ids, bearings, keyframe choice. Integers only in the per-frame path; the same bits on all targets.
+ */
+#ifndef PIPEFISH_TRACK_H
+#define PIPEFISH_TRACK_H
+
+#include "pipefish/camera.h"
+#include "pipefish/image.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PF_TRACKS_MAX 2048u
+
+typedef enum pf_track_status {
+    PF_TRACK_NEW = 1,     /* detected in this frame */
+    PF_TRACK_TRACKED = 2, /* found again in this frame: .pos and .cov are valid */
+    PF_TRACK_LOST = 3,    /* not found; .reason says why; gone from the table at the next frame */
+} pf_track_status;
+
+typedef enum pf_track_reason {
+    PF_TRACK_OK = 0,
+    PF_TRACK_LEFT = 1,      /* its window left the image or the image circle */
+    PF_TRACK_FLAT = 2,      /* too little texture to locate it */
+    PF_TRACK_DIVERGED = 3,  /* the iteration did not settle */
+    PF_TRACK_RESIDUAL = 4,  /* the patch no longer looks the same */
+    PF_TRACK_BACKWARD = 5,  /* forward-backward check failed */
+    PF_TRACK_CROWDED = 6,   /* ran into an older track */
+    PF_TRACK_DRIFT = 7,     /* no longer looks like where it was first seen */
+} pf_track_reason;
+
+typedef struct pf_point_q16 {
+    int32_t x, y; /* Q16.16 pixels */
+} pf_point_q16;
+
+typedef struct pf_track {
+    uint64_t id;      /* unique in one boot, never reused, > 0 */
+    pf_point_q16 pos; /* in the current frame; last known where lost */
+    uint32_t cov_xx_q20, cov_yy_q20; /* Q12.20 px^2: variance of the position from patch and noise, saturating */
+    int32_t cov_xy_q20;
+    uint32_t age;     /* frames since detection; 0 = new */
+    uint8_t status;   /* pf_track_status */
+    uint8_t reason;   /* pf_track_reason */
+    uint16_t quality; /* similarity with the previous frame's patch, Q0.15 ZNCC (32767 = identical); 0 when new */
+} pf_track;
+
+/* Zero means the default in brackets. Bounds are checked by pf_tracker_init. */
+typedef struct pf_tracker_config {
+    uint32_t width, height;        /* frame size, 64..16384 */
+    uint32_t max_tracks;           /* 8..2048 [400] */
+    uint32_t levels;               /* pyramid levels, 1..6 [4] */
+    uint32_t window;               /* KLT window side in pixels, odd, 7..31 [21] */
+    uint32_t iterations;           /* most iterations a level, 1..30 [10] */
+    uint32_t cell;                 /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
+    uint32_t min_eigen;            /* detection: least smaller eigenvalue of the mean structure tensor, grey^2 [30] */
+    uint32_t fb_q16;               /* most forward-backward distance, Q16.16 px [0.5] */
+    uint32_t min_zncc_q15;         /* least similarity to the previous patch, Q0.15 [0.8] */
+    uint32_t noise_q8;             /* image noise sigma, grey levels Q8.8, for covariances [2.0] */
+    pf_point_q16 circle;           /* centre of the image circle, Q16.16 px */
+    uint32_t circle_radius_q16;    /* its radius; 0 = the whole image is used */
+} pf_tracker_config;
+
+typedef struct pf_tracker_stats { /* of the last frame */
+    uint32_t live;                /* tracks now alive, new ones included */
+    uint32_t tracked, lost, detected;
+    uint32_t lost_by[8];          /* by pf_track_reason */
+} pf_tracker_stats;
+
+/* Opaque; lives in the caller's workspace. */
+typedef struct pf_tracker pf_tracker;
+
+/* Bytes of workspace for this configuration; 0 if it is out of range. */
+size_t pf_tracker_workspace_size(const pf_tracker_config *config);
+
+/* Returns PF_OK and *tracker (inside `workspace`); PF_ERR_ARGUMENT (a bound is violated; nothing written);
+ * PF_ERR_SPACE (size < pf_tracker_workspace_size). */
+pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config, void *workspace, size_t size);
+
+/* The stages of one frame, in the order in which pf_tracker_frame runs them; for stage timers. */
+typedef enum pf_tracker_stage {
+    PF_STAGE_PYRAMID = 0,
+    PF_STAGE_TRACK = 1,
+    PF_STAGE_DETECT = 2,
+    PF_STAGES = 3,
+} pf_tracker_stage;
+
+/* Tracks from the previous frame into `frame`, then fills empty cells with new corners.
+ * `frame` has the configured size and must stay valid and unchanged until the next call of pf_tracker_frame or
+ * pf_tracker_reset returns (it is the next frame's reference; nothing is copied).
+ * `clock` (may be NULL) is read between stages, nanoseconds; stage_ns[PF_STAGES] (may be NULL) gets the times.
+ * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
+pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
+
+/* The table after the last frame: live tracks and those lost in it, by ascending id. Valid until the next call. */
+const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
+const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
+
+/* Forgets all tracks (a break in the video). Ids go on; none is reused. */
+void pf_tracker_reset(pf_tracker *tracker);
+
+/* Bearings: unit rays of track positions in Q1.30, camera frame. Items outside the camera's domain get (0, 0, 0).
+ * Rounded from double (camera/real); the table version of camera/fixed replaces it on targets without libm. */
+typedef struct pf_ray_q30 {
+    int32_t x, y, z;
+} pf_ray_q30;
+void pf_track_bearings(const pf_camera *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+
+/* --- Keyframe choice (RECONSTRUCTION section 6) --------------------------------------------------------------------
+ * A frame becomes a keyframe when the encoder has moved `step_counts` since the last one; without an encoder, when the
+ * rotation-compensated median angle between bearings of common tracks reaches `parallax`; and in any case when fewer
+ * than `min_common` tracks are shared with the last keyframe. */
+typedef enum pf_keyframe_cause {
+    PF_KEYFRAME_NO = 0,
+    PF_KEYFRAME_FIRST = 1,
+    PF_KEYFRAME_ENCODER = 2,
+    PF_KEYFRAME_PARALLAX = 3,
+    PF_KEYFRAME_FEW_COMMON = 4,
+} pf_keyframe_cause;
+
+typedef struct pf_keyframe_config { /* zero = default in brackets */
+    uint32_t step_counts;     /* encoder counts between keyframes; 0 = do not use the encoder */
+    uint32_t parallax_urad;   /* micro-radians [174533 = 10 degrees] */
+    uint32_t min_common;      /* forced below so many common tracks [100]; compared with what the last keyframe had */
+    uint32_t min_interval;    /* frames, at least so many between keyframes [2] */
+} pf_keyframe_config;
+
+typedef struct pf_keyframe_state { /* private; zero-initialise */
+    uint32_t n;                     /* tracks of the last keyframe; ids ascending */
+    uint32_t frames_since;
+    bool have_encoder, started;
+    int64_t encoder;
+    uint64_t id[PF_TRACKS_MAX];
+    pf_ray_q30 ray[PF_TRACKS_MAX];
+    uint32_t chord[PF_TRACKS_MAX]; /* scratch: squared chords for the median */
+} pf_keyframe_state;
+
+/* Decides for the current frame and, when it becomes a keyframe, makes it the new reference.
+ * tracks[n], rays[n]: the table and its bearings, ids ascending. encoder: NULL when there is none.
+ * *common (may be NULL) gets the number of tracks shared with the last keyframe. */
+pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks,
+                                     const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t *common);
+
+#ifdef __cplusplus
+}
+#endif
+#endif
