@@ -1,4 +1,4 @@
-"""The long tests: `make accept` writes build/accept.json, a list of {name, value, bound, holds}, and prints it as a table.
+"""The long tests: `make accept` writes build/accept.json ({name, value, bound, holds} each) and prints a table.
 
 Resumable: each check's result is kept in build/accept/ under the commit it was measured at; a second run at the same
 commit measures only what is missing. --fresh forgets them.
