@@ -253,6 +253,22 @@ static void test_round_trip_at_the_rim(void)
     }
 }
 
+/* Proves: Newton that starts where r' is 1e-11 (theta = 1; plain Newton leaps 1e10 away and needs hundreds of steps to
+ * come back) still lands within 1e-9 px. */
+static void test_unproject_survives_a_start_on_a_flat_spot(void)
+{
+    const double e = 1e-11;
+    pf_camera camera = camera_make(310, 300, 0, -1.0 / 3, e / 5, (-1 + e) / 7, (1 + e) / 9, 110);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_check(&camera, NULL));
+    double worst = 0;
+    for (int sign = -1; sign <= 1; sign += 2)
+        for (double off = 1; off > 1e-13; off *= 0.37) {
+            const double uv[2] = {camera.c_u + camera.f_u * (1 + sign * off), camera.c_v};
+            assert_round_trip(&camera, uv, &worst);
+        }
+    TEST_ASSERT_TRUE(worst <= 1e-9);
+}
+
 /* Proves: direction -> pixel -> direction, to the rounding error divided by how much the lens flattens there. */
 static void test_round_trip_from_directions(void)
 {
@@ -507,6 +523,7 @@ int main(void)
     RUN_TEST(test_derivative_by_parameters_equals_finite_differences);
     RUN_TEST(test_round_trip_from_pixels_over_the_whole_domain);
     RUN_TEST(test_round_trip_at_the_rim);
+    RUN_TEST(test_unproject_survives_a_start_on_a_flat_spot);
     RUN_TEST(test_round_trip_from_directions);
     RUN_TEST(test_derivative_of_unproject);
     RUN_TEST(test_project_refuses_and_leaves_outputs);
