@@ -230,6 +230,9 @@ static void test_y4m_truncation_at_each_byte(void)
             TEST_ASSERT_EQUAL_INT(cut <= strlen("YUV4MPEG2") ? PF_ERR_FORMAT : PF_ERR_TRUNCATED, status);
         }
     }
+    n = make_y4m(bytes, "YUV4MPEG2 W6 H4 F10:1 C420", "FRAME", 3, 12); /* a cut in the last chroma counts too */
+    for (size_t missing = 1; missing <= 12; missing++)
+        TEST_ASSERT_EQUAL_INT(PF_ERR_TRUNCATED, try_y4m(bytes, n - missing, &frames));
 }
 
 /* Proves: random changes and random bytes give a status and a message; run under the sanitizers. */

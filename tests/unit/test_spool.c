@@ -9,6 +9,7 @@
 #include <signal.h>
 #include <sqlite3.h>
 #include <sys/resource.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <time.h>
 
@@ -176,6 +177,41 @@ static void test_quota(void)
     close_spool();
     open_spool("quota.db", quota - 1);
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(6));
+}
+
+/* ---- syncs: SQLite's calls land here, the program's symbols come first ---- */
+
+static unsigned long syncs;
+
+int fsync(int fd)
+{
+    syncs++;
+    return (int)syscall(SYS_fsync, fd);
+}
+
+int fdatasync(int fd)
+{
+    syncs++;
+    return (int)syscall(SYS_fdatasync, fd);
+}
+
+/* Proves: each store and each removal is told to the medium before it is reported; a kill would not show that. */
+static void test_every_change_is_synced(void)
+{
+    pf_spool_item item;
+    open_spool("synced.db", 0);
+    for (uint64_t id = 1; id <= 10; id++) {
+        unsigned long before = syncs;
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+        TEST_ASSERT_TRUE_MESSAGE(syncs > before, "put");
+        before = syncs;
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, "id", &id, sizeof id));
+        TEST_ASSERT_TRUE_MESSAGE(syncs > before, "set");
+    }
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
+    unsigned long before = syncs;
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
+    TEST_ASSERT_TRUE_MESSAGE(syncs > before, "remove");
 }
 
 /* ---- kill -9 ---- */
@@ -384,7 +420,10 @@ static void test_second_opener_is_refused(void)
     pf_spool second = {NULL, NULL};
     open_spool("shared.db", 0);
     pf_spool_config config = {temporary_path("shared.db"), 0};
-    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, pf_spool_open(&second, &config, error, sizeof error));
+    pf_status status = pf_spool_open(&second, &config, error, sizeof error);
+    if (second.self != NULL)
+        second.ops->close(second.self);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, status);
     TEST_ASSERT_NOT_NULL(strstr(error, "another program uses it"));
 }
 
@@ -475,6 +514,7 @@ int main(void)
     RUN_TEST(test_first_in_first_out);
     RUN_TEST(test_values);
     RUN_TEST(test_quota);
+    RUN_TEST(test_every_change_is_synced);
     RUN_TEST(test_kill_at_any_time_loses_nothing);
     RUN_TEST(test_threads);
     RUN_TEST(test_wrong_files_are_refused_and_untouched);
