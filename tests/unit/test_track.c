@@ -250,6 +250,54 @@ static void test_occluder_takes_no_track_along(void)
     TEST_ASSERT_TRUE(hidden > 10 && kept > 30);
 }
 
+/* A spot of texture about (cx, cy), fading into grey. */
+static double spot(double x, double y, double cx, double cy)
+{
+    const double u = x - cx, v = y - cy;
+    return exp(-(u * u + v * v) / 60) * (60 * cos(0.4 * u + 0.2 * v) + 50 * sin(0.3 * v - 0.1 * u));
+}
+
+/* Proves: of two equal spots one vanishes; its track is lost and does not jump to the other. */
+static void test_vanished_spot_is_not_mistaken_for_its_twin(void)
+{
+    for (int gap = 16; gap <= 30; gap += 2) {
+        pf_tracker *t = start(NULL);
+        uint32_t n;
+        for (int k = 0; k < 2; k++)
+            for (int y = 0; y < HEIGHT; y++)
+                for (int x = 0; x < WIDTH; x++)
+                    frame[k][y * STRIDE + x] =
+                        (uint8_t)lrint(128 + (k ? 0 : spot(x, y, 150, 120)) + spot(x, y, 150 + gap, 120));
+        feed(t, frame[0]);
+        memcpy(before, pf_tracker_tracks(t, &n), sizeof before[0] * pf_tracker_last_stats(t)->live);
+        feed(t, frame[1]);
+        const pf_track *now = pf_tracker_tracks(t, &n);
+        for (uint32_t i = 0; i < n; i++)
+            if (now[i].status == PF_TRACK_TRACKED)
+                TEST_ASSERT_TRUE(hypot(now[i].pos.x - before[i].pos.x, now[i].pos.y - before[i].pos.y) < 65536);
+        TEST_ASSERT_GREATER_THAN_UINT32(0, pf_tracker_last_stats(t)->tracked);
+        TEST_ASSERT_GREATER_THAN_UINT32(0, pf_tracker_last_stats(t)->lost);
+    }
+}
+
+/* Proves: the forward-backward distance is measured and compared: noise moves the way back by hundredths of a pixel, so
+ * a limit of 1/65536 px loses nearly all tracks by that reason, the default none. */
+static void test_forward_backward_distance_is_enforced(void)
+{
+    const pf_tracker_config tight = {.fb_q16 = 1}, usual = {0};
+    const motion m = {{1, 0, 0, 1}, {2.4, 1.3}, 1, 0};
+    for (int k = 0; k < 2; k++) {
+        pf_tracker *t = start(k ? &usual : &tight);
+        render(frame[0], &still, 3, 0);
+        render(frame[1], &m, 3, 0);
+        feed(t, frame[0]);
+        const uint32_t detected = pf_tracker_last_stats(t)->detected;
+        feed(t, frame[1]);
+        const uint32_t lost = pf_tracker_last_stats(t)->lost_by[PF_TRACK_BACKWARD];
+        TEST_ASSERT_TRUE(k ? lost == 0 : 10 * lost > 8 * detected);
+    }
+}
+
 /* Proves: black, saturated and evenly grey frames give no tracks and no crash; noise gives tracks that do not live. */
 static void test_frames_without_a_scene_give_nothing(void)
 {
@@ -346,6 +394,8 @@ int main(void)
     RUN_TEST(test_still_scene_does_not_drift);
     RUN_TEST(test_unrelated_frame_loses_all_and_ids_are_never_reused);
     RUN_TEST(test_occluder_takes_no_track_along);
+    RUN_TEST(test_vanished_spot_is_not_mistaken_for_its_twin);
+    RUN_TEST(test_forward_backward_distance_is_enforced);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);
     RUN_TEST(test_each_bound_of_the_configuration_is_checked);
