@@ -298,6 +298,29 @@ static void test_forward_backward_distance_is_enforced(void)
     }
 }
 
+/* Proves: when the scene shrinks and tracks run together the younger is lost as CROWDED: no two stay within a quarter
+ * of a cell. */
+static void test_tracks_that_run_together_are_thinned(void)
+{
+    const pf_tracker_config c = {.cell = 32};
+    pf_tracker *t = start(&c);
+    uint32_t crowded = 0;
+    double scale = 1;
+    for (int k = 0; k < 14; k++, scale *= 0.95) {
+        const motion m = {{scale, 0, 0, scale}, {0, 0}, 1, 0};
+        uint32_t n;
+        render(frame[k % 2], &m, 1, 0);
+        feed(t, frame[k % 2]);
+        crowded += pf_tracker_last_stats(t)->lost_by[PF_TRACK_CROWDED];
+        const pf_track *now = pf_tracker_tracks(t, &n);
+        for (uint32_t i = 0; i < n; i++)
+            for (uint32_t j = 0; j < i; j++)
+                if (now[i].status != PF_TRACK_LOST && now[j].status != PF_TRACK_LOST)
+                    TEST_ASSERT_TRUE(hypot(now[i].pos.x - now[j].pos.x, now[i].pos.y - now[j].pos.y) >= 8 * 65536);
+    }
+    TEST_ASSERT_GREATER_THAN_UINT32(0, crowded);
+}
+
 /* Proves: black, saturated and evenly grey frames give no tracks and no crash; noise gives tracks that do not live. */
 static void test_frames_without_a_scene_give_nothing(void)
 {
@@ -396,6 +419,7 @@ int main(void)
     RUN_TEST(test_occluder_takes_no_track_along);
     RUN_TEST(test_vanished_spot_is_not_mistaken_for_its_twin);
     RUN_TEST(test_forward_backward_distance_is_enforced);
+    RUN_TEST(test_tracks_that_run_together_are_thinned);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);
     RUN_TEST(test_each_bound_of_the_configuration_is_checked);
