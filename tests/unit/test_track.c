@@ -306,7 +306,7 @@ static void test_tracks_that_run_together_are_thinned(void)
     pf_tracker *t = start(&c);
     uint32_t crowded = 0;
     double scale = 1;
-    for (int k = 0; k < 14; k++, scale *= 0.95) {
+    for (int k = 0; k < 30; k++, scale *= 0.96) {
         const motion m = {{scale, 0, 0, scale}, {0, 0}, 1, 0};
         uint32_t n;
         render(frame[k % 2], &m, 1, 0);
