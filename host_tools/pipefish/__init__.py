@@ -12,11 +12,12 @@ __version__ = "0.1.0"
 
 _LAZY = {
     "Camera": "pipefish.camera",
-    "Profile": "pipefish.camera",
     "Scene": "pipefish.simulate",
     "Survey": "pipefish.survey",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
+    "PARAMETERS": "pipefish.camera",
+    "ArgumentError": "pipefish.errors",
     "PipefishError": "pipefish.errors",
     "FormatError": "pipefish.errors",
     "ProfileError": "pipefish.errors",

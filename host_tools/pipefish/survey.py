@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -433,7 +434,14 @@ def profile_summary(binary: bytes) -> dict[str, Any] | None:
     from pipefish.errors import PipefishError
 
     try:
-        camera = Camera.from_bytes(binary)
+        camera = Camera.from_binary(binary)
     except PipefishError as error:
         return {"error": str(error)}
-    return {"name": camera.name, "serial": camera.serial}
+    return {
+        "name": camera.name,
+        "serial": camera.serial,
+        "model": camera.radial,
+        "source": camera.source,
+        "theta_max_deg": math.degrees(camera.theta_max),
+        "rms_px": camera.rms_px,
+    }

@@ -7,7 +7,6 @@ the moment of a power cut: a chunk carries its length and checksum.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import time
 from dataclasses import dataclass, field
@@ -309,7 +308,7 @@ def profile_json(binary: bytes) -> str | None:
     from pipefish.camera import Camera
 
     try:
-        return json.dumps(Camera.from_bytes(binary).to_dict(), indent=2)
+        return Camera.from_binary(binary).to_json()
     except PipefishError:
         return None
 
