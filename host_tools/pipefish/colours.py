@@ -4,19 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-# Ages run over several decades, so the scale is logarithmic: new tracks are dark violet, old ones yellow (the "plasma"
-# map of matplotlib, CC0, sampled at 8 points; readable on grey pictures and for colour-blind people).
+# Ages run over several decades, so the scale is logarithmic: new tracks are violet, old ones yellow, lightness rising all
+# the way (readable on grey pictures and for colour-blind people).
 STOPS = np.array(
-    [
-        [92, 1, 166],
-        [126, 3, 168],
-        [156, 23, 158],
-        [204, 71, 120],
-        [225, 100, 98],
-        [248, 149, 64],
-        [253, 180, 47],
-        [240, 249, 33],
-    ],
+    [(112, 78, 236), (146, 58, 214), (182, 50, 180), (212, 64, 138), (232, 95, 98), (246, 138, 62), (253, 182, 45), (244, 236, 60)],
     dtype=float,
 )
 AGE_MAX = 300  # frames; older tracks share the last colour

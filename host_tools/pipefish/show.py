@@ -32,8 +32,8 @@ class Style:
 
     width: int
     legend: bool = True
-    line: float = 1.5
-    dot: float = 2.4
+    line: float = 1.8
+    dot: float = 2.6
 
 
 class Painter:
