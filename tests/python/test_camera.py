@@ -87,7 +87,7 @@ def test_round_trip_over_the_image_and_origins():
     u, v = np.meshgrid(np.arange(0, 1280, 9.7), np.arange(0, 800, 9.7))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     rays, ok = cam.unproject(pixels)
-    assert 0.9 < ok.mean() < 1  # the corners lie beyond 110 degrees
+    assert 0.8 < ok.mean() < 1  # the corners lie beyond 110 degrees
     np.testing.assert_allclose(np.linalg.norm(rays[ok], axis=1), 1, atol=1e-15)
     back, again = cam.project(3.7 * rays[ok])
     assert again.all() and np.abs(back - pixels[ok]).max() <= 1e-9

@@ -319,6 +319,27 @@ static void test_bad_fields_are_refused_and_named(void)
     refused(PF_ERR_FORMAT, tiny, 15, "length");
 }
 
+/* Proves: what RFC 3629 excludes is no text: overlong forms, surrogates, beyond U+10FFFF, cut and stray bytes, C1. */
+static void test_text_must_be_utf8(void)
+{
+    static const char *const bad[] = {
+        "\xC0\x80", "\xE0\x9F\xBF", "\xED\xA0\x80", "\xF0\x8F\xBF\xBF", "\xF4\x90\x80\x80", "\xF5",
+        "\xE2\x82", "\xE2\x28\xA1", "a\xBF",        "\xC2\x9F"};
+    for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
+        pf_profile profile = sample();
+        uint8_t bytes[PF_PROFILE_BINARY_MAX];
+        size_t n = encode_ok(&profile, bytes);
+        memset(bytes + 104, 0, 64);
+        memcpy(bytes + 104, bad[i], strlen(bad[i]));
+        repair(bytes, n);
+        refused(PF_ERR_FORMAT, bytes, n, "serial");
+        memset(bytes + 104, 'x', 64);
+        memcpy(bytes + 168 - strlen(bad[i]), bad[i], strlen(bad[i]));
+        repair(bytes, n);
+        refused(PF_ERR_FORMAT, bytes, n, "serial");
+    }
+}
+
 /* Proves: random bytes, bare or behind a right envelope, never pass and never read out of bounds (ASan). */
 static void test_garbage(void)
 {
@@ -387,6 +408,7 @@ int main(void)
     RUN_TEST(test_every_flipped_bit_is_detected);
     RUN_TEST(test_other_versions_are_named_as_such);
     RUN_TEST(test_bad_fields_are_refused_and_named);
+    RUN_TEST(test_text_must_be_utf8);
     RUN_TEST(test_garbage);
     RUN_TEST(test_encode_refuses);
     return UNITY_END();
