@@ -72,7 +72,10 @@ def run_receive(args: argparse.Namespace) -> Result:
     recovered = summary["recovered_objects"]
     rows = [
         ("file", summary["file"]),
-        ("keyframes", f"{summary['keyframes']}" + (f", {summary['lost']} lost on the device" if summary["lost"] else "")),
+        (
+            "keyframes",
+            f"{summary['keyframes']}" + (f", {summary['lost']} lost on the device" if summary["lost"] else ""),
+        ),
         ("received", f"{size_text(link['bytes'])} in {seconds_text(link['duration_s'])}"),
         ("goodput", f"{goodput / 1000:.1f} kB/s" if goodput else None),
         ("from before", f"{recovered} objects of an interrupted run" if recovered else None),
@@ -100,7 +103,9 @@ def info_text(info: dict[str, Any]) -> str:
     tracks, link, profile = info["tracks"], info["link"], info["profile"]
     when = info["first_time_unix_ns"]
     started = datetime.datetime.fromtimestamp(when / 1e9).astimezone().isoformat(" ", "seconds") if when else None
-    missing = f"{len(info['missing'])} missing, {len(info['lost'])} of them lost on the device" if info["missing"] else ""
+    missing = (
+        f"{len(info['missing'])} missing, {len(info['lost'])} of them lost on the device" if info["missing"] else ""
+    )
     length = f"{info['length_m']:.2f} m" if info["length_m"] is not None else "unknown (no encoder)"
     breaks = ", ".join(f"at keyframe {b['index']} ({b['reason']})" for b in info["breaks"])
     diameter = info["nominal_diameter_m"]
@@ -114,7 +119,10 @@ def info_text(info: dict[str, Any]) -> str:
         ("device", info["software"]),
         ("source", info["source"]),
         ("profile", lens or "none"),
-        ("picture", f"{info['width']} x {info['height']}" + (f" at {info['frame_rate']:g}/s" if info["frame_rate"] else "")),
+        (
+            "picture",
+            f"{info['width']} x {info['height']}" + (f" at {info['frame_rate']:g}/s" if info["frame_rate"] else ""),
+        ),
         ("pipe", f"DN{diameter * 1000:.0f}" if diameter else None),
         ("length", length),
         ("duration", seconds_text(info["duration_s"]) + (f" in {info['boots']} runs" if info["boots"] > 1 else "")),
@@ -174,11 +182,17 @@ def run_status(args: argparse.Namespace) -> Result:
         ("survey", info.survey_id.hex()),
         ("state", status.state),
         ("up for", seconds_text(status.uptime_ns / 1e9)),
-        ("frames", f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped, {status.frames_skipped} skipped"),
+        (
+            "frames",
+            f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped, {status.frames_skipped} skipped",
+        ),
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
         ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
         ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)}), {status.spool.evicted} evicted"),
-        ("link", f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, {link.fragments_resent} fragments again"),
+        (
+            "link",
+            f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, {link.fragments_resent} fragments again",
+        ),
         ("frame time", f"{stage.pyramid + stage.track + stage.detect:.0f} us, slowest {stage.frame_max:.0f} us"),
     ]
     return document, table(rows)
@@ -228,7 +242,10 @@ def run_profile_show(args: argparse.Namespace) -> Result:
         ("field of view", f"{2 * math.degrees(camera.theta_max):.1f} deg (data covered half of it up to {covered})"),
         ("image circle", circle if camera.circle_radius else "the whole picture"),
         ("residual", f"{camera.rms_px:.4f} px rms" if camera.rms_px is not None else "unknown"),
-        ("covariance", f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none"),
+        (
+            "covariance",
+            f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
+        ),
     ]
     return json.loads(camera.to_json()), table(rows)
 
@@ -333,10 +350,16 @@ def build_parser() -> argparse.ArgumentParser:
         "pipefish receive serial:/dev/ttyUSB0@3000000 -o survey.mcap",
     )
     add_device(p)
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete")
+    p.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete"
+    )
     p.add_argument("--overwrite", action="store_true", help="start anew even if FILE or FILE.partial is there")
     p.add_argument(
-        "--timeout", type=not_negative, default=30.0, metavar="S", help="give up after S seconds without a device [30]; 0: never"
+        "--timeout",
+        type=not_negative,
+        default=30.0,
+        metavar="S",
+        help="give up after S seconds without a device [30]; 0: never",
     )
 
     p = add_command(commands, "info", run_info, "Tell what is in a survey file.", "pipefish info survey.mcap")
@@ -365,12 +388,18 @@ def build_parser() -> argparse.ArgumentParser:
 
 def add_profile(commands: Any) -> None:
     """`pipefish profile show|check|convert`."""
-    parser = commands.add_parser("profile", help="look at, check and convert camera profiles", description="Camera profiles.")
+    parser = commands.add_parser(
+        "profile", help="look at, check and convert camera profiles", description="Camera profiles."
+    )
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     p = add_command(actions, "show", run_profile_show, "Tell what a profile says.", "pipefish profile show camera.json")
     p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
     p = add_command(
-        actions, "check", run_profile_check, "Check a profile; exit code 1 if it is not valid.", "pipefish profile check camera.json"
+        actions,
+        "check",
+        run_profile_check,
+        "Check a profile; exit code 1 if it is not valid.",
+        "pipefish profile check camera.json",
     )
     p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
     p = add_command(

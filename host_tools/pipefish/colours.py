@@ -7,7 +7,16 @@ import numpy as np
 # Ages run over several decades, so the scale is logarithmic: new tracks are violet, old ones yellow, lightness rising all
 # the way (readable on grey pictures and for colour-blind people).
 STOPS = np.array(
-    [(112, 78, 236), (146, 58, 214), (182, 50, 180), (212, 64, 138), (232, 95, 98), (246, 138, 62), (253, 182, 45), (244, 236, 60)],
+    [
+        (112, 78, 236),
+        (146, 58, 214),
+        (182, 50, 180),
+        (212, 64, 138),
+        (232, 95, 98),
+        (246, 138, 62),
+        (253, 182, 45),
+        (244, 236, 60),
+    ],
     dtype=float,
 )
 AGE_MAX = 300  # frames; older tracks share the last colour

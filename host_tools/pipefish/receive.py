@@ -122,7 +122,8 @@ class Receiver(Handlers):
                 return self.complete or stop()
 
             self.client.run(done, timeout_s)
-        self._linger()
+        if self.complete:
+            self._linger()
 
     def _linger(self) -> None:
         """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure."""

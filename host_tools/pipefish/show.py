@@ -158,12 +158,13 @@ def animation(
     limit: int = ANIMATION_LIMIT,
     width: int = ANIMATION_WIDTH,
     frames: int = ANIMATION_FRAMES,
+    legend: bool = True,
     quiet: bool = True,
 ) -> bytes:
     """The keyframes one after the other, tracks drawn, at most `frames` of them and `limit` bytes."""
     count = len(painter.survey.keyframes)
     step = max(1, count // frames)
-    style = Style(width, line=1.1, dot=1.6)
+    style = Style(width, legend, line=1.1, dot=1.6)
     positions = list(range(0, count, step))[:frames]
     pictures = [painter.draw(p, style) for p in progress_over(positions, "drawing", len(positions), quiet)]
     quality = 60

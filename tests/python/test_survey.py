@@ -10,12 +10,12 @@ import io
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError, PipefishError
 from pipefish.survey import Observations, Survey
 from pipefish.surveywrite import SurveyStore, SurveyWriter
+from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 
 def test_survey_round_trip_keeps_every_field(tmp_path):
