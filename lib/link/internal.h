@@ -119,8 +119,8 @@ typedef struct pf_latest_message {
 
 typedef struct pf_latest {
     pf_latest_message topics[PF_LINK_TOPICS];
-    pf_latest_message sending; /* the one message of several fragments under way */
-    uint32_t sending_topic, turn;
+    pf_latest_message sending;        /* the one message of several fragments under way */
+    uint32_t sending_topic, turns[2]; /* last topic of a large and of a small message */
     bool small_last;
     uint32_t seen[PF_LINK_TOPICS]; /* number of the newest delivered */
     uint32_t seen_mask;
@@ -222,7 +222,7 @@ struct pf_link {
     pf_latest latest;
     pf_sender sender;
     pf_receiver receiver;
-    bool bulk_turn;     /* the last of latest and bulk was latest */
+    int32_t credit;     /* bytes of bulk sent since, less those of latest: above zero it is the turn of latest */
     bool delimiter_due; /* a leading zero ends whatever half frame the peer holds */
     bool overlong;      /* more bytes than any frame has: wait for the delimiter */
     uint32_t in_size;
@@ -241,7 +241,7 @@ uint8_t *pf_link_frame(pf_link *link, pf_frame_type type);
 
 static inline uint16_t pf_get16(const uint8_t *p)
 {
-    return (uint16_t)(p[0] | p[1] << 8);
+    return (uint16_t)(p[0] | (uint32_t)p[1] << 8);
 }
 static inline uint32_t pf_get32(const uint8_t *p)
 {
@@ -277,7 +277,7 @@ static inline bool pf_later(uint32_t a, uint32_t b)
 }
 static inline bool pf_bit(const uint8_t *bits, uint32_t i)
 {
-    return (bits[i / 8] >> (i % 8) & 1u) != 0;
+    return ((uint32_t)bits[i / 8] & 1u << (i % 8)) != 0;
 }
 static inline void pf_bit_set(uint8_t *bits, uint32_t i)
 {

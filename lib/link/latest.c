@@ -48,7 +48,7 @@ static uint32_t next_topic(const pf_link *link, bool small)
 {
     const pf_latest *l = &link->latest;
     for (uint32_t i = 1; i <= PF_LINK_TOPICS; i++) {
-        uint32_t topic = (l->turn + i) % PF_LINK_TOPICS;
+        uint32_t topic = (l->turns[small] + i) % PF_LINK_TOPICS;
         if (l->topics[topic].waiting && (l->topics[topic].size <= link->session.fragment) == small)
             return topic;
     }
@@ -79,7 +79,7 @@ size_t pf_latest_build(pf_link *link)
     bool any_large = l->sending.waiting || large < PF_LINK_TOPICS;
     l->small_last = small < PF_LINK_TOPICS && !(l->small_last && any_large);
     if (l->small_last) {
-        l->turn = small;
+        l->turns[true] = small;
         l->topics[small].index = 0;
         return build(link, small, &l->topics[small]);
     }
@@ -87,7 +87,7 @@ size_t pf_latest_build(pf_link *link)
         uint8_t *spare = l->sending.bytes;
         l->sending = l->topics[large];
         l->sending.index = 0;
-        l->sending_topic = l->turn = large;
+        l->sending_topic = l->turns[false] = large;
         l->topics[large].bytes = spare;
         l->topics[large].waiting = false;
     }

@@ -259,8 +259,17 @@ static size_t build_next(pf_link *link, size_t room)
     bool latest = pf_latest_ready(link), bulk = pf_sender_ready(link);
     if ((!latest && !bulk) || room < wire_size(PF_SIZE_LATEST + link->session.fragment))
         return 0;
-    link->bulk_turn = latest && !(bulk && link->bulk_turn);
-    return link->bulk_turn ? pf_latest_build(link) : pf_sender_build_data(link);
+    if (!bulk)
+        return pf_latest_build(link);
+    if (!latest)
+        return pf_sender_build_data(link);
+    /* Half of the line each, in bytes; at most one frame is owed, for the past does not count. */
+    bool latest_turn = link->credit >= 0;
+    size_t n = latest_turn ? pf_latest_build(link) : pf_sender_build_data(link);
+    link->credit += latest_turn ? -(int32_t)n : (int32_t)n;
+    if (link->credit > PF_LINK_RAW_MAX)
+        link->credit = PF_LINK_RAW_MAX;
+    return n;
 }
 
 size_t pf_link_output(pf_link *link, uint8_t *out, size_t capacity, uint64_t now_ns)
