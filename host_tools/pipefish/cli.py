@@ -135,8 +135,8 @@ def info_text(info: dict[str, Any]) -> str:
             ("tracks", f"{tracks['tracks']}, {tracks['per_keyframe_median']:.0f} on a typical keyframe"),
             (
                 "track length",
-                f"median {tracks['length_frames_median']:.0f}, 90 % up to {tracks['length_frames_p90']:.0f} camera frames; "
-                f"median {tracks['length_keyframes_median']:.0f} keyframes",
+                f"median {tracks['length_frames_median']:.0f}, 90 % up to {tracks['length_frames_p90']:.0f} camera "
+                f"frames; median {tracks['length_keyframes_median']:.0f} keyframes",
             ),
         ]
     rows.append(("ended", info["end_reason"]))
@@ -191,7 +191,8 @@ def run_status(args: argparse.Namespace) -> Result:
         ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)}), {status.spool.evicted} evicted"),
         (
             "link",
-            f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, {link.fragments_resent} fragments again",
+            f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, "
+            f"{link.fragments_resent} fragments sent again",
         ),
         ("frame time", f"{stage.pyramid + stage.track + stage.detect:.0f} us, slowest {stage.frame_max:.0f} us"),
     ]
@@ -312,7 +313,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="pipefish",
         description="Measure pipes with one fisheye camera.",
-        epilog="example:\n  pipefish receive /dev/ttyUSB0 --baud 3000000 -o survey.mcap\n\n`pipefish COMMAND --help` tells more.",
+        epilog="example:\n  pipefish receive /dev/ttyUSB0 --baud 3000000 -o survey.mcap\n\n"
+        "`pipefish COMMAND --help` tells more.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"pipefish {__version__}")

@@ -224,7 +224,7 @@ class Client:
         return request.id
 
     def answer_to(self, timeout_s: float, **what: Any) -> pb.Reply:
-        """Sends a request and serves the link until its reply. Raises PipefishError: no answer, or the device's error."""
+        """Sends a request, serves the link until its reply. Raises PipefishError: no answer, or the device's text."""
         self.run(lambda: self.up, timeout_s)
         wanted = self.ask(**what)
         end = time.monotonic() + timeout_s

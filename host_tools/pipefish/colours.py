@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# Ages run over several decades, so the scale is logarithmic: new tracks are violet, old ones yellow, lightness rising all
-# the way (readable on grey pictures and for colour-blind people).
+# Ages run over several decades, so the scale is logarithmic: new tracks are violet, old ones yellow, lightness rising
+# all the way (readable on grey pictures and for colour-blind people).
 STOPS = np.array(
     [
         (112, 78, 236),

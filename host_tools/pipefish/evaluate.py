@@ -1,12 +1,13 @@
 """How well tracks hold on to the wall, where a simulator knows the truth.
 
 Each track is anchored at the keyframe that saw it first: that observation is cast onto the true wall with the true lens
-and pose. The wall point is then projected into every later keyframe that saw the track; the error is the distance between
-that projection and the observation. So an error is what the tracker drifted since the anchor (and the anchor's own noise).
+and pose. The wall point is then projected into every later keyframe that saw the track; the error is the distance
+between that projection and the observation. So an error is what the tracker drifted since the anchor.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -69,14 +70,15 @@ def percentile(error: np.ndarray, share: float) -> float | None:
 def evaluate(survey: Survey, truth: Truth) -> dict[str, Any] | None:
     """Figures of `track_errors` as plain values; None if no track was seen twice.
 
-    within_1px: share of observations; median_px, p95_px; by_age: list of {age_low, age_high, count, within_1px, median_px}.
+    within_1px: share of observations; median_px, p95_px; by_age: list of age_low, age_high, count, within_1px and
+    median_px.
     """
     result = track_errors(survey, truth)
     error, age = result["error"], result["age"]
     if not len(error):
         return None
     by_age = []
-    for low, high in zip(AGE_EDGES[:-1], AGE_EDGES[1:], strict=True):
+    for low, high in pairwise(AGE_EDGES):
         here = error[(age >= low) & (age < high)]
         if len(here):
             by_age.append(

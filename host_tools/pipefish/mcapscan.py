@@ -1,7 +1,7 @@
 """Reading MCAP records one by one, so that damage has an offset and a torn tail does not hide what stands before it.
 
-The `mcap` package writes survey files and parses each record; its readers, however, give up on a file without a footer and
-do not say where a file is damaged. A survey must open whatever happened to the host, so records are walked here.
+The `mcap` package writes survey files and parses each record; its readers, however, give up on a file without a footer
+and do not say where a file is damaged. A survey must open whatever happened to the host, so records are walked here.
 """
 
 from __future__ import annotations

@@ -76,8 +76,9 @@ class Page:
             {
                 "id": "lengths",
                 "title": "How long tracks live",
-                "text": f"Age of each track when a keyframe last saw it, in camera frames: median {np.median(lengths):.0f}, "
-                f"90th percentile {np.percentile(lengths, 90):.0f}. The last bar holds all longer ones.",
+                "text": f"Age of each track when a keyframe last saw it, in camera frames: median "
+                f"{np.median(lengths):.0f}, 90th percentile {np.percentile(lengths, 90):.0f}. "
+                "The last bar holds all longer ones.",
                 "data": [
                     {
                         "type": "bar",
@@ -115,15 +116,14 @@ class Page:
         return charts
 
     def _chart_accuracy(self, by_age: list[dict[str, Any]]) -> Chart:
-        ages = [f"{b['age_low']}–{b['age_high']}" for b in by_age]
+        ages = [f"{b['age_low']}-{b['age_high']}" for b in by_age]
         error = self.evaluation["median_px"]
         median = f"; the median error is {error:.3f} px" if error is not None else ""
         return {
             "id": "accuracy",
             "title": "Accuracy against the simulator's truth",
-            "text": f"{100 * self.evaluation['within_1px']:.2f} % of all observations lie within one pixel of where the point "
-            f"really is{median}. Each track is anchored at the keyframe "
-            "that saw it first.",
+            "text": f"{100 * self.evaluation['within_1px']:.2f} % of all observations lie within one pixel of where "
+            f"the point really is{median}. Each track is anchored at the keyframe that saw it first.",
             "data": [
                 {
                     "type": "bar",
@@ -163,8 +163,8 @@ class Page:
                 {
                     "id": "stages",
                     "title": "Where the device spends its time",
-                    "text": f"Mean of each stage; {status.fps:.1f} frames tracked per second over the run, slowest frame "
-                    f"{stage.frame_max / 1000:.1f} ms.",
+                    "text": f"Mean of each stage; {status.fps:.1f} frames tracked per second over the run, slowest "
+                    f"frame {stage.frame_max / 1000:.1f} ms.",
                     "data": [
                         {
                             "type": "bar",
@@ -185,7 +185,8 @@ class Page:
                 {
                     "id": "sizes",
                     "title": "Size of a keyframe on the wire",
-                    "text": f"Picture and observations together: median {np.median(values):.1f} kB, largest {values.max():.1f} kB.",
+                    "text": f"Picture and observations together: median {np.median(values):.1f} kB, largest "
+                    f"{values.max():.1f} kB.",
                     "data": [
                         {
                             "type": "bar",
@@ -266,7 +267,7 @@ class Page:
         info, start, status = self.info, self.survey.start, self.survey.last_status
         profile = info["profile"] or {}
         survey = [
-            ("name", info["name"] or "–"),
+            ("name", info["name"] or "-"),
             ("survey id", info["survey_id"]),
             ("state", "complete" if info["complete"] else "incomplete"),
             (
@@ -275,11 +276,11 @@ class Page:
             ),
             (
                 "camera",
-                f"{info['width']} × {info['height']}" + (f" at {info['frame_rate']:g}/s" if info["frame_rate"] else ""),
+                f"{info['width']} x {info['height']}" + (f" at {info['frame_rate']:g}/s" if info["frame_rate"] else ""),
             ),
             ("profile", profile.get("error") or profile.get("name") or "none"),
-            ("source", info["source"] or "–"),
-            ("device", info["software"] or "–"),
+            ("source", info["source"] or "-"),
+            ("device", info["software"] or "-"),
             ("duration", f"{info['duration_s']:.1f} s of the device's time"),
             ("ended", info["end_reason"] or "not yet"),
         ]
@@ -316,7 +317,8 @@ def _chart(chart: Chart) -> str:
     return (
         f"<figure class='card chart'><figcaption><h3>{html.escape(chart['title'])}</h3>"
         f"<p>{html.escape(chart['text'])}</p></figcaption>"
-        f"<div class='plot' id='plot-{chart['id']}' role='img' aria-label='{html.escape(chart['title'], quote=True)}'></div></figure>"
+        f"<div class='plot' id='plot-{chart['id']}' role='img' "
+        f"aria-label='{html.escape(chart['title'], quote=True)}'></div></figure>"
     )
 
 

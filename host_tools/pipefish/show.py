@@ -60,7 +60,7 @@ class Painter:
                 yield self.tracks.pixels[part], self.tracks.age[part]
 
     def draw(self, position: int, style: Style) -> Image.Image:
-        """The keyframe at `position` of survey.keyframes with its tracks: trails of the last keyframes, coloured by age."""
+        """The keyframe at `position` of survey.keyframes with its tracks: trails of the last few, coloured by age."""
         frame = self.survey.keyframes[position]
         picture = frame.image
         scale = style.width / picture.width
@@ -135,7 +135,7 @@ def position_of(survey: Survey, index: int | None) -> int:
 
 
 def natural_width(survey: Survey) -> int:
-    """Width of an overlay: the picture's own, or twice or three times that for small ones, so that tracks are legible."""
+    """Width of an overlay: the picture's own or a multiple of it, so that tracks are legible on small ones."""
     width = survey.keyframes[0].width if survey.keyframes else 640
     return width * max(1, round(1100 / width))
 
@@ -192,7 +192,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def show(survey: Survey, out: Path, keyframe: int | None = None, quiet: bool = False) -> dict[str, object]:
-    """Writes an overlay (.png, .jpg, .webp with a keyframe named) or an animation (.gif, .webp). Returns what was written.
+    """Writes an overlay (.png, .jpg, .webp with a keyframe named) or an animation (.gif, .webp). Returns what it wrote.
 
     Raises PipefishError for another suffix or a keyframe that is not there; OSError.
     """

@@ -1,4 +1,4 @@
-"""Reading surveys: one MCAP file as written by `pipefish receive`, finished or still `.partial`. docs/survey.md has the layout."""
+"""Reading surveys: MCAP files of `pipefish receive`, finished or still `.partial`. docs/survey.md has the layout."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ class Tracks:
 
     @property
     def length_frames(self) -> np.ndarray:
-        """(K,) int64: age at the last sighting among the keyframes, in camera frames (0 = seen only when it was new)."""
+        """(K,) int64: age at the last sighting among the keyframes, in camera frames (0 = seen only when new)."""
         return self.age[self.bounds[1:] - 1]
 
     @property
@@ -381,7 +381,7 @@ class Survey:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """What there is to say about the survey, as plain values (JSON-ready). Keys are documented in docs/survey.md."""
+        """What there is to say about the survey, as plain values, ready for JSON. docs/survey.md lists the keys."""
         start, status, tracks = self.start, self.last_status, self.tracks()
         chainage = self.chainage()
         length = float(np.nanmax(chainage) - np.nanmin(chainage)) if np.isfinite(chainage).any() else None

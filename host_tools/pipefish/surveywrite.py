@@ -1,7 +1,7 @@
 """Writing surveys durably: each object of the device becomes one MCAP chunk, on disk before it is acknowledged.
 
-docs/survey.md has the layout. One chunk an object means that an object is in the file as a whole or not at all, whatever
-the moment of a power cut: a chunk carries its length and checksum.
+docs/survey.md has the layout. One chunk an object means that an object is in the file as a whole or not at all,
+whatever the moment of a power cut: a chunk carries its length and checksum.
 """
 
 from __future__ import annotations
@@ -137,8 +137,8 @@ class SurveyWriter:
     """One survey file in the making.
 
     `path` is the final name; the file is `<path>.partial` until `finish`. An existing partial file is recovered: every
-    whole object is kept, a torn tail dropped. `recovered` then counts the objects found, and `damaged` names the copy of
-    the old file that is kept when it was damaged elsewhere than at its end.
+    whole object is kept, a torn tail dropped. `recovered` then counts the objects found, and `damaged` names the copy
+    of the old file that is kept when it was damaged elsewhere than at its end.
     """
 
     def __init__(self, path: Path) -> None:
@@ -316,8 +316,8 @@ def profile_json(binary: bytes) -> str | None:
 class SurveyStore:
     """The survey files of one `pipefish receive`.
 
-    A device may first deliver what is left of earlier surveys. The survey that the device is working on (`primary`) gets
-    the name that the user gave; every other one gets a name beside it: survey-2.mcap, survey-3.mcap, ...
+    A device may first deliver what is left of earlier surveys. The survey that the device is working on (`primary`)
+    gets the name that the user gave; every other one gets a name beside it: survey-2.mcap, survey-3.mcap, ...
     """
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
@@ -399,8 +399,8 @@ class SurveyStore:
                 raise ValueError("no survey id")
         except (KeyError, DecodeError, ValueError) as error:
             raise PipefishError(
-                f"the device sent an object (kind {kind}, {name.hex()[:16]}...) that this version of pipefish cannot read: "
-                f"{error}; it stays on the device, update pipefish on both ends"
+                f"the device sent an object (kind {kind}, {name.hex()[:16]}...) that this version of pipefish cannot "
+                f"read: {error}; it stays on the device, update pipefish on both ends"
             ) from error
         writer = self.writer(message.survey_id)
         writer.store(name, kind, message, len(data), measured.get(message.time.boot_id), now_unix_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 import threading
@@ -69,11 +70,8 @@ class Device(threading.Thread):
             except TimeoutError:
                 continue
             self.connections += 1
-            with line:
-                try:
-                    self._serve(line)
-                except OSError:
-                    pass
+            with line, contextlib.suppress(OSError):
+                self._serve(line)
             self.link.reset(time.monotonic_ns())
 
     def _serve(self, line: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""Evaluation against truth: the anchor is the first sighting, errors are pixel distances, what cannot be seen counts as wrong."""
+"""Evaluation against truth: anchored at the first sighting, in pixels; what cannot be seen counts as wrong."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from synthetic import write_survey
 
 
 class Flat:
-    """A world in which the points of the synthetic survey move outwards exactly as it draws them, plus `drift` a frame."""
+    """A world in which the points of the synthetic survey move outwards as it draws them, plus `drift` a frame."""
 
     def __init__(self, drift: float = 0.0, blind_after: int = 10**9) -> None:
         self.drift, self.blind_after = drift, blind_after
