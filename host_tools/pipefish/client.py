@@ -44,8 +44,7 @@ class Handlers:
         """The device has gone silent."""
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int:
-        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. A client that stores nothing refuses
-        nothing: see `Client.wants_objects`."""
+        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send; refused is lost: the device drops it."""
         raise NotImplementedError
 
     def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
@@ -66,10 +65,11 @@ class Client:
     """
 
     def __init__(self, transport: Transport, handlers: Handlers, wants_objects: bool, link: Any = None) -> None:
-        """`wants_objects`: False for a client that only asks; the device then keeps its objects.
+        """`wants_objects`: False for a client that only asks: it leaves offers unanswered, so the device keeps its objects.
         `link`: for tests."""
         self.transport = transport
         self.handlers = handlers
+        self.wants_objects = wants_objects
         if link is None:
             from pipefish._engine import Link
 
@@ -77,8 +77,8 @@ class Client:
                 role=ROLE_HOST,
                 nonce=secrets.randbits(32) | 1,
                 schema=SCHEMA_VERSION,
-                max_object=MAX_OBJECT if wants_objects else 0,
-                receive_slots=RECEIVE_SLOTS if wants_objects else 0,
+                max_object=MAX_OBJECT,  # also for a client that wants none: a link without room refuses, for ever
+                receive_slots=RECEIVE_SLOTS,
                 max_latest=65536,
                 max_control=1000,
             )
@@ -181,7 +181,7 @@ class Client:
                 self._reply(event.data)
             case x if x == LATEST:
                 self._latest(event.topic, event.data)
-            case x if x == OFFER:
+            case x if x == OFFER and self.wants_objects:
                 self.link.answer_object(event.slot, self.handlers.on_offer(event.name, event.kind, event.size))
             case x if x == OBJECT:
                 self._pending.append((event.slot, event.name, event.kind, event.data))

@@ -70,7 +70,9 @@ class Page:
     def charts_tracks(self) -> list[Chart]:
         """Length of tracks, tracks along the pipe, and accuracy where the truth is known."""
         lengths = self.tracks.length_frames
-        top = int(min(lengths.max(initial=1), max(30, np.percentile(lengths, 99)) if len(lengths) else 1)) + 1
+        if not len(lengths):
+            return []
+        top = int(min(lengths.max(), max(30, np.percentile(lengths, 99)))) + 1
         counts, edges = np.histogram(np.minimum(lengths, top), bins=min(60, top), range=(0, top))
         charts = [
             {
