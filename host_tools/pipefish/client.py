@@ -44,7 +44,7 @@ class Handlers:
         """The device has gone silent."""
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int:
-        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send; refused is lost: the device drops it."""
+        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused."""
         raise NotImplementedError
 
     def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
@@ -65,7 +65,7 @@ class Client:
     """
 
     def __init__(self, transport: Transport, handlers: Handlers, wants_objects: bool, link: Any = None) -> None:
-        """`wants_objects`: False for a client that only asks: it leaves offers unanswered, so the device keeps its objects.
+        """`wants_objects`: False for a client that only asks: it leaves offers open, the device keeps its objects.
         `link`: for tests."""
         self.transport = transport
         self.handlers = handlers
@@ -77,7 +77,7 @@ class Client:
                 role=ROLE_HOST,
                 nonce=secrets.randbits(32) | 1,
                 schema=SCHEMA_VERSION,
-                max_object=MAX_OBJECT,  # also for a client that wants none: a link without room refuses, for ever
+                max_object=MAX_OBJECT,  # even if none is wanted: no room means refused for ever
                 receive_slots=RECEIVE_SLOTS,
                 max_latest=65536,
                 max_control=1000,
