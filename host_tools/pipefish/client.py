@@ -65,11 +65,10 @@ class Client:
     """
 
     def __init__(self, transport: Transport, handlers: Handlers, wants_objects: bool, link: Any = None) -> None:
-        """`wants_objects`: False for a client that only asks: it leaves offers open, the device keeps its objects.
+        """`wants_objects`: False for a client that only asks; the device then keeps its objects.
         `link`: for tests."""
         self.transport = transport
         self.handlers = handlers
-        self.wants_objects = wants_objects
         if link is None:
             from pipefish._engine import Link
 
@@ -77,8 +76,8 @@ class Client:
                 role=ROLE_HOST,
                 nonce=secrets.randbits(32) | 1,
                 schema=SCHEMA_VERSION,
-                max_object=MAX_OBJECT,  # even if none is wanted: no room means refused for ever
-                receive_slots=RECEIVE_SLOTS,
+                max_object=MAX_OBJECT if wants_objects else 0,
+                receive_slots=RECEIVE_SLOTS if wants_objects else 0,
                 max_latest=65536,
                 max_control=1000,
             )
@@ -89,7 +88,8 @@ class Client:
         self.replies: dict[int, pb.Reply] = {}
         self._open = False
         self._backlog = b""  # bytes of the link that the line has not taken
-        self._pending: list[tuple[int, bytes, int, bytes]] = []  # objects whose answer is due
+        # Objects whose answer is due: slot, name, kind, bytes. The link asks once, whatever happens to the line.
+        self._pending: list[tuple[int, bytes, int, bytes]] = []
         self._last_id = 0
         self._asked: set[int] = set()
         self._retry_ns = 0
@@ -167,8 +167,6 @@ class Client:
             case x if x == UP:
                 self.up, self.boot = True, event.peer_boot_id
                 self._backoff_s = BACKOFF_S[0]
-                if event.peer_restarted:
-                    self._pending.clear()
                 self.handlers.on_up(event)
             case x if x == DOWN:
                 self._down()
@@ -181,7 +179,7 @@ class Client:
                 self._reply(event.data)
             case x if x == LATEST:
                 self._latest(event.topic, event.data)
-            case x if x == OFFER and self.wants_objects:
+            case x if x == OFFER:
                 self.link.answer_object(event.slot, self.handlers.on_offer(event.name, event.kind, event.size))
             case x if x == OBJECT:
                 self._pending.append((event.slot, event.name, event.kind, event.data))
@@ -216,10 +214,13 @@ class Client:
     def ask(self, **what: Any) -> int:
         """Sends a request, for example ask(get_status=pb.Nothing()). Returns its id; the reply appears in `replies`.
 
-        Raises PipefishError if the device is not there."""
+        Raises NoDevice if it is not there."""
         self._last_id += 1
         request = pb.Request(id=self._last_id, **what)
-        self.link.send_control(request.SerializeToString())
+        try:
+            self.link.send_control(request.SerializeToString())
+        except (ConnectionError, BufferError) as error:
+            raise NoDevice(f"the device on {self.transport.name} does not listen: {error}") from error
         self._asked.add(request.id)
         return request.id
 
@@ -247,7 +248,6 @@ class Client:
         now = time.monotonic_ns()
         self.close()
         self._backlog = b""
-        self._pending.clear()
         self.link.reset(now)
         for event in self.link.input(b"", now):
             self._serve(event)

@@ -197,9 +197,8 @@ def link_goodput(bench: Path | None, quiet: bool) -> dict[str, float]:
 def link_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """The page's table about the link."""
     link, cable = summary["received"]["link"], summary["received"]["cable"]
-    share = (
-        f" ({100 * link['goodput_bytes_per_s'] / (BAUD / 10):.0f} % of the line)" if link["goodput_bytes_per_s"] else ""
-    )
+    goodput = link["goodput_bytes_per_s"] or 0
+    share = f" ({100 * goodput / (BAUD / 10):.0f} % of the line)" if goodput else ""
     rows = [
         ("line", f"emulated serial cable, {BAUD / 1e6:g} Mbaud"),
         ("objects delivered", f"{link['objects']}, {link['bytes'] / 1e6:.2f} MB in {link['duration_s']:.1f} s"),
@@ -223,7 +222,7 @@ def demo(
     fresh: bool = False,
     quiet: bool = False,
 ) -> tuple[dict[str, Any], Path]:
-    """Runs the whole demo into the folder `out`. Returns the summary (also written as summary.json) and the page's path.
+    """Runs the whole demo into the folder `out`. Returns the summary (that of summary.json) and the page's path.
 
     Raises PipefishError, with the log of the program that failed; OSError.
     """
@@ -263,8 +262,9 @@ def demo(
     length = f"{info['length_m']:.1f} m of " if info["length_m"] is not None else ""
     lead = (
         f"{length}simulated DN{info['nominal_diameter_m'] * 1000:.0f} concrete pipe with a bend and an oval stretch, "
-        f"driven in {info['duration_s']:.0f} s. The recorded frames went through pipefishd, its keyframes over an emulated "
-        f"serial line of {BAUD / 1e6:g} Mbaud into one survey file. The simulator knows the truth, so every track is checked."
+        f"driven in {info['duration_s']:.0f} s. The recorded frames went through pipefishd, its keyframes over an "
+        f"emulated serial line of {BAUD / 1e6:g} Mbaud into one survey file. The simulator knows the truth, so every "
+        "track is checked."
     )
     extra = {"goodput_bytes_per_s": link["goodput_bytes_per_s"], "link_rows": link_rows(summary)}
     write_page(survey, page, title="Demo pipe", lead=lead, evaluation=evaluation, extra=extra, quiet=quiet)

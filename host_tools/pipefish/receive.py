@@ -49,7 +49,7 @@ class Receiver(Handlers):
         self.sessions += 1
         self._up_since = time.monotonic()
         self._clock_told = False
-        self._info_id = self.client.ask(get_info=pb.Nothing())
+        self._info_id = self._ask(get_info=pb.Nothing())
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int:
         if kind not in SURVEY_KINDS:
@@ -83,6 +83,13 @@ class Receiver(Handlers):
         if writer is not None and clock is not None:
             writer.note_status(status, status.time.monotonic_ns + clock.offset_ns, time.time_ns())
 
+    def _ask(self, **what: Any) -> int | None:
+        """Sends a request; None if the device went away this moment: all is asked again when it is back."""
+        try:
+            return self.client.ask(**what)
+        except NoDevice:
+            return None
+
     def _learn(self) -> None:
         """Takes in what the link has measured and the device has said since."""
         clock = self.client.clock
@@ -90,7 +97,7 @@ class Receiver(Handlers):
             self._clocks[self.client.boot] = clock
             if not self._clock_told:
                 self._clock_told = True
-                self.client.ask(
+                self._ask(
                     clock_sync=pb.ClockSync(
                         boot_id=self.client.boot, offset_ns=clock.offset_ns, error_ns=clock.error_ns
                     )
@@ -129,13 +136,13 @@ class Receiver(Handlers):
         """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure."""
         end = time.monotonic() + LINGER_S
         while time.monotonic() < end and self.client.up:
-            asked = self.client.ask(get_status=pb.Nothing())
-            turn = time.monotonic() + 0.5
-            while asked not in self.client.replies and time.monotonic() < min(turn, end) and self.client.up:
+            asked = self._ask(get_status=pb.Nothing())
+            turn = min(end, time.monotonic() + 0.5)
+            while self.client.up and time.monotonic() < turn and (asked is None or asked not in self.client.replies):
                 self.client.step(0.05)
-            reply = self.client.replies.pop(asked, None)
-            if reply is not None:
-                self.status = reply.status if reply.HasField("status") else self.status
+            reply = self.client.replies.pop(asked, None) if asked is not None else None
+            if reply is not None and reply.HasField("status"):
+                self.status = reply.status
                 if reply.status.spool.objects == 0:
                     return
 

@@ -132,8 +132,8 @@ static pf_send_slot *next_signal(const pf_link *link, uint64_t *at)
             *at = slot->poll_at;
         }
     }
-    /* No more than the peer has room for; one at least, so that a peer that takes none can say so. */
-    if (oldest_new != NULL && (known == 0 || known < link->session.peer_slots)) {
+    /* No more than the peer has room for; a peer without slots only talks, and the objects wait for another. */
+    if (oldest_new != NULL && known < link->session.peer_slots) {
         best = oldest_new;
         *at = 0;
     }

@@ -578,6 +578,29 @@ static void test_offers_beyond_the_slots_or_the_size_are_turned_down(void)
     TEST_ASSERT_EQUAL_UINT32(1, a.counts[PF_LINK_OFFER]);
 }
 
+/* A host that only asks for the status must not make the device drop its spool. */
+static void test_objects_wait_for_a_peer_that_takes_objects(void)
+{
+    uint8_t name[PF_LINK_NAME_SIZE] = {1};
+    b.config.max_object = b.config.receive_slots = 0;
+    open_both();
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_send_object(a.link, name, 2, "x", 1));
+    talk(3000);
+    TEST_ASSERT_EQUAL_UINT32(0, a.counts[PF_LINK_REFUSED]);
+    TEST_ASSERT_EQUAL_UINT32(3, pf_link_free_send_slots(a.link));
+    b.config.max_object = 1;
+    b.config.nonce = 99;
+    open_end(&b);
+    talk(2);
+    TEST_ASSERT_EQUAL_UINT32(1, b.counts[PF_LINK_OFFER]);
+    pf_link_reset(b.link, now); /* the question outlives the session */
+    talk(300);
+    TEST_ASSERT_EQUAL_UINT32(1, b.counts[PF_LINK_OFFER]);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_answer_object(b.link, b.last[PF_LINK_OFFER].slot, PF_ANSWER_STORED));
+    talk(2);
+    TEST_ASSERT_EQUAL_UINT32(1, a.counts[PF_LINK_SENT]);
+}
+
 /* A partial blocks its slot only while its sender still speaks of it. */
 static void test_partial_of_an_earlier_session_gives_way(void)
 {
@@ -795,6 +818,7 @@ int main(void)
     RUN_TEST(test_newer_latest_replaces_the_one_that_waits);
     RUN_TEST(test_repeated_offer_asks_once_and_gets_the_answer_again);
     RUN_TEST(test_offers_beyond_the_slots_or_the_size_are_turned_down);
+    RUN_TEST(test_objects_wait_for_a_peer_that_takes_objects);
     RUN_TEST(test_partial_of_an_earlier_session_gives_way);
     RUN_TEST(test_cancelled_object_frees_both_ends);
     RUN_TEST(test_acknowledgements_that_cannot_be_are_malformed);
