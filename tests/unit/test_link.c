@@ -381,6 +381,75 @@ static void test_frames_of_an_earlier_session_are_dropped(void)
     TEST_ASSERT_TRUE(pf_link_get_stats(a.link)->stale >= 2);
 }
 
+static uint32_t hellos(uint32_t *echo, bool *asks)
+{
+    uint32_t n = 0;
+    wire_size = pf_link_output(a.link, wire, sizeof wire, now);
+    for (size_t i = 0, start = 0; i < wire_size; i++) {
+        uint8_t frame[PF_LINK_FRAME_MAX];
+        size_t size = 0;
+        if (wire[i] != 0)
+            continue;
+        if (pf_cobs_decode(wire + start, i - start, frame, &size) == PF_OK && (frame[0] & 15) == PF_FRAME_HELLO) {
+            n++;
+            *echo = pf_get32(frame + 12);
+            *asks = (frame[7] & 1) != 0;
+        }
+        start = i + 1;
+    }
+    return n;
+}
+
+/* A stranger's hello is answered until it shows that it exists; a frame of a wrong session asks who is there. */
+static void test_hello_is_said_when_sessions_disagree(void)
+{
+    uint8_t frame[PF_LINK_RAW_MAX];
+    uint32_t echo = 0;
+    bool asks = false;
+    open_both();
+    TEST_ASSERT_EQUAL_UINT32(0, hellos(&echo, &asks));
+    now += 250 * MS;
+    hand_made(frame, PF_FRAME_CONTROL);
+    frame[2] ^= 1;
+    feed_raw(&a, frame, PF_SIZE_CONTROL);
+    TEST_ASSERT_EQUAL_UINT32(1, hellos(&echo, &asks));
+    TEST_ASSERT_TRUE(asks && echo == b.config.nonce);
+    hand_made(frame, PF_FRAME_HELLO);
+    frame[4] = PF_LINK_HOST;
+    pf_put32(frame + 8, 0x600D);
+    pf_put16(frame + 24, 1024);
+    feed_raw(&a, frame, PF_SIZE_HELLO);
+    for (int i = 0; i < 3; i++, now += 200 * MS) {
+        TEST_ASSERT_EQUAL_UINT32(1, hellos(&echo, &asks));
+        TEST_ASSERT_TRUE(asks && echo == 0x600D);
+    }
+    TEST_ASSERT_EQUAL_UINT32(1, a.counts[PF_LINK_UP]);
+    pf_put32(frame + 12, a.config.nonce);
+    feed_raw(&a, frame, PF_SIZE_HELLO);
+    TEST_ASSERT_EQUAL_UINT32(2, a.counts[PF_LINK_UP]);
+    now += 250 * MS;
+    TEST_ASSERT_EQUAL_UINT32(0, hellos(&echo, &asks));
+}
+
+static void control_by_hand(uint32_t sequence)
+{
+    uint8_t frame[PF_LINK_RAW_MAX];
+    hand_made(frame, PF_FRAME_CONTROL);
+    pf_put32(frame + 4, sequence);
+    feed_raw(&a, frame, PF_SIZE_CONTROL);
+}
+
+/* A number left out is a message that the peer has given up; an older one is a repetition. */
+static void test_control_takes_what_is_not_older(void)
+{
+    static const uint32_t numbers[] = {0, 0, 5, 5, 3, 6}, seen[] = {1, 1, 2, 2, 2, 3};
+    open_both();
+    for (size_t i = 0; i < 6; i++) {
+        control_by_hand(numbers[i]);
+        TEST_ASSERT_EQUAL_UINT32(seen[i], a.counts[PF_LINK_CONTROL]);
+    }
+}
+
 /* The peer's clock runs three hours ahead and the way there takes 4 ms, the way back 2 ms. */
 static void test_clock_offset_lies_within_its_error(void)
 {
@@ -520,6 +589,11 @@ static void test_latest_never_goes_back_and_is_whole(void)
     TEST_ASSERT_EQUAL_UINT64(1, pf_link_get_stats(a.link)->latest_incomplete);
     latest_by_hand(1, 9, 0, 0); /* empty is whole, and newer than the partial 8 */
     TEST_ASSERT_EQUAL_UINT32(4, *got);
+    b.config.nonce = 0x31313131;
+    open_end(&b);
+    talk(2);
+    latest_by_hand(1, 1, 10, 0); /* a new session counts anew */
+    TEST_ASSERT_EQUAL_UINT32(5, *got);
     uint64_t malformed = pf_link_get_stats(a.link)->malformed;
     latest_by_hand(1, 10, 16385, 0); /* larger than we take */
     TEST_ASSERT_EQUAL_UINT64(malformed + 1, pf_link_get_stats(a.link)->malformed);
@@ -578,6 +652,21 @@ static void test_offers_beyond_the_slots_or_the_size_are_turned_down(void)
     TEST_ASSERT_EQUAL_UINT32(1, a.counts[PF_LINK_OFFER]);
 }
 
+/* The same without a restart: the peer has reset, and does not offer the partial again. */
+static void test_partial_that_a_reset_peer_does_not_offer_gives_way(void)
+{
+    open_both();
+    offer_by_hand(1, 1, 4096);
+    pf_link_answer_object(a.link, 0, PF_ANSWER_ACCEPT);
+    data_by_hand(1, 0, 1, 1024);
+    TEST_ASSERT_EQUAL_UINT32(PF_ACK_RECEIVING, ack_state(1));
+    pf_link_reset(b.link, now);
+    talk(2);
+    TEST_ASSERT_EQUAL_UINT32(0, a.counts[PF_LINK_DOWN]);
+    offer_by_hand(2, 2, 4096);
+    TEST_ASSERT_EQUAL_UINT32(2, a.counts[PF_LINK_OFFER]);
+}
+
 /* A host that only asks for the status must not make the device drop its spool. */
 static void test_objects_wait_for_a_peer_that_takes_objects(void)
 {
@@ -608,11 +697,15 @@ static void test_partial_of_an_earlier_session_gives_way(void)
     offer_by_hand(1, 1, 4096);
     pf_link_answer_object(a.link, 0, PF_ANSWER_ACCEPT);
     data_by_hand(1, 0, 1, 1024);
+    TEST_ASSERT_EQUAL_UINT32(PF_ACK_RECEIVING, ack_state(1));
     offer_by_hand(2, 2, 4096);
     TEST_ASSERT_EQUAL_UINT32(PF_ACK_BUSY, ack_state(2));
     b.config.nonce = 0x55556666;
     open_end(&b);
     talk(2);
+    data_by_hand(1, 1, 1, 1024); /* another session's handle */
+    TEST_ASSERT_EQUAL_UINT32(PF_ACK_UNKNOWN, ack_state(1));
+    TEST_ASSERT_EQUAL_UINT64(1, pf_link_get_stats(a.link)->fragments_received);
     offer_by_hand(1, 2, 4096);
     TEST_ASSERT_EQUAL_UINT32(2, a.counts[PF_LINK_OFFER]);
     TEST_ASSERT_EQUAL_UINT32(PF_ACK_WAITING, ack_state(1));
@@ -676,12 +769,51 @@ static void test_acknowledgements_that_cannot_be_are_malformed(void)
     ack_by_hand(9, PF_ACK_STORED, 5, 0, 0, 0); /* a handle that is gone is no fault */
     TEST_ASSERT_EQUAL_UINT64(5, *malformed);
     TEST_ASSERT_EQUAL_UINT32(0, a.counts[PF_LINK_SENT]);
+    /* one sent two earlier than the newest seen may still come */
+    ack_by_hand(1, PF_ACK_RECEIVING, 4, 1, 1, 0x03);
+    TEST_ASSERT_EQUAL_size_t(0, pf_link_output(a.link, wire, sizeof wire, now));
     /* 0, 2 and 3 have arrived, 4 is too young to be lost: exactly 1 is repeated */
     ack_by_hand(1, PF_ACK_RECEIVING, 5, 1, 1, 0x03);
     pf_link_output(a.link, wire, sizeof wire, now);
     TEST_ASSERT_EQUAL_UINT64(1, pf_link_get_stats(a.link)->fragments_resent);
     ack_by_hand(1, PF_ACK_STORED, 6, 5, 0, 0);
     TEST_ASSERT_EQUAL_UINT32(1, a.counts[PF_LINK_SENT]);
+}
+
+/* What was taken for lost arrives after all before it is repeated. */
+static void test_fragment_that_was_only_late_is_not_repeated(void)
+{
+    static uint8_t bytes[5000];
+    uint8_t name[PF_LINK_NAME_SIZE] = {1};
+    open_both();
+    pf_link_send_object(a.link, name, 2, bytes, sizeof bytes);
+    pf_link_output(a.link, wire, sizeof wire, now);
+    ack_by_hand(1, PF_ACK_RECEIVING, 0, 0, 0, 0);
+    pf_link_output(a.link, wire, sizeof wire, now);
+    ack_by_hand(1, PF_ACK_RECEIVING, 5, 0, 1, 0x0E); /* 0 is lost */
+    ack_by_hand(1, PF_ACK_RECEIVING, 5, 4, 0, 0);
+    for (int i = 0; i < 20; i++, now += MS)
+        pf_link_output(a.link, wire, sizeof wire, now);
+    TEST_ASSERT_EQUAL_UINT64(0, pf_link_get_stats(a.link)->fragments_resent);
+}
+
+/* The only fragment of one object is lost while another object makes progress all the time: no timeout of the line. */
+static void test_loss_is_found_while_another_object_progresses(void)
+{
+    static uint8_t bytes[60000];
+    a.config.window = 4096;
+    open_both();
+    pf_link_send_object(a.link, (const uint8_t[PF_LINK_NAME_SIZE]){1}, 2, bytes, 10);
+    pf_link_send_object(a.link, (const uint8_t[PF_LINK_NAME_SIZE]){2}, 2, bytes, 58 * 1024);
+    pf_link_output(a.link, wire, sizeof wire, now);
+    ack_by_hand(1, PF_ACK_RECEIVING, 0, 0, 0, 0);
+    ack_by_hand(2, PF_ACK_RECEIVING, 0, 0, 0, 0);
+    for (uint32_t i = 1; i < 50; i++, now += 20 * MS) {
+        pf_link_output(a.link, wire, sizeof wire, now);
+        ack_by_hand(2, PF_ACK_RECEIVING, i + 1, i, 0, 0);
+    }
+    TEST_ASSERT_EQUAL_UINT64(0, pf_link_get_stats(a.link)->malformed);
+    TEST_ASSERT_TRUE(pf_link_get_stats(a.link)->fragments_resent > 0);
 }
 
 /* All counters start just below their wrap. */
@@ -809,6 +941,8 @@ int main(void)
     RUN_TEST(test_other_version_is_told_once_a_peer);
     RUN_TEST(test_longer_hello_is_accepted_and_own_echo_is_not);
     RUN_TEST(test_frames_of_an_earlier_session_are_dropped);
+    RUN_TEST(test_hello_is_said_when_sessions_disagree);
+    RUN_TEST(test_control_takes_what_is_not_older);
     RUN_TEST(test_clock_offset_lies_within_its_error);
     RUN_TEST(test_garbage_does_no_harm);
     RUN_TEST(test_overlong_frame_is_skipped_and_the_next_is_read);
@@ -818,10 +952,13 @@ int main(void)
     RUN_TEST(test_newer_latest_replaces_the_one_that_waits);
     RUN_TEST(test_repeated_offer_asks_once_and_gets_the_answer_again);
     RUN_TEST(test_offers_beyond_the_slots_or_the_size_are_turned_down);
+    RUN_TEST(test_partial_that_a_reset_peer_does_not_offer_gives_way);
     RUN_TEST(test_objects_wait_for_a_peer_that_takes_objects);
     RUN_TEST(test_partial_of_an_earlier_session_gives_way);
     RUN_TEST(test_cancelled_object_frees_both_ends);
     RUN_TEST(test_acknowledgements_that_cannot_be_are_malformed);
+    RUN_TEST(test_fragment_that_was_only_late_is_not_repeated);
+    RUN_TEST(test_loss_is_found_while_another_object_progresses);
     RUN_TEST(test_counters_wrap);
     RUN_TEST(test_examples_of_the_specification_are_what_is_sent);
     return UNITY_END();
