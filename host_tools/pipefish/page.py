@@ -149,7 +149,12 @@ class Page:
                 "xaxis": _axis("camera frames since the anchor", type="category"),
                 "yaxis": _axis("within 1 px, %", range=[0, 100]),
                 "yaxis2": _axis(
-                    "median error, px", overlaying="y", side="right", rangemode="tozero", showgrid=False, nticks=6
+                    "median error, px",
+                    overlaying="y",
+                    side="right",
+                    rangemode="tozero",
+                    showgrid=False,
+                    tickformat=".2f",
                 ),
             },
         }

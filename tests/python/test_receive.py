@@ -110,6 +110,22 @@ def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path):
     assert sorted(names) == sorted(n for n, _, _ in objects)
 
 
+def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):
+    path = tmp_path / "a.mcap"
+    with Device(survey_objects(5)[:-1], SURVEY) as device:  # the survey has not ended: receive would wait
+        command = [sys.executable, "-m", "pipefish", "receive", device.address, "-o", str(path)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        while device.spool:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert process.returncode == 1 and out == ""
+    assert (
+        err == f"pipefish: interrupted: 5 keyframes are safe in {path}.partial; the same command goes on from there\n"
+    )
+    assert len(Survey.open(tmp_path / "a.mcap.partial").keyframes) == 5
+
+
 def test_a_restart_of_the_device_stays_in_one_survey(tmp_path):
     second = dict(boot=BOOT + 1, first=3)
     objects = [
