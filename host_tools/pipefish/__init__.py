@@ -1,0 +1,5 @@
+"""Pipefish: measure pipes with one fisheye camera."""
+
+from .camera import Camera
+
+__all__ = ["Camera"]
