@@ -122,6 +122,10 @@ bool pf_receiver_offer(pf_link *link, const uint8_t *frame, size_t frame_size)
     if (handle == 0 || size == 0 || fragment < PF_LINK_FRAGMENT_MIN || fragment > link->session.fragment)
         return false;
     uint32_t count = pf_fragments(size, fragment);
+    if (link->config.receive_slots == 0) {
+        reply(link, handle, PF_ACK_BUSY);
+        return true;
+    }
     if (size > link->config.max_object || count > PF_LINK_COUNT_MAX) {
         reply(link, handle, PF_ACK_REFUSED);
         return true;

@@ -53,7 +53,8 @@ typedef struct pf_link_config {
     uint32_t schema;        /* version of pipefish.proto that this end speaks */
     uint32_t max_fragment;  /* 64..1024 bytes [1024]; the smaller of both ends is used */
     uint32_t send_slots;    /* objects under way at once, 1..16 [4] */
-    uint32_t receive_slots; /* objects being received at once, 1..16 [4]; 0 with max_object = 0: receives none */
+    uint32_t receive_slots; /* objects being received at once, 1..16 [4]; 0 with max_object = 0: receives none, and
+                               the peer keeps what it has to send for another session */
     uint32_t max_object;    /* most bytes of a received object [0: receives none] */
     uint32_t max_latest;    /* most bytes of a latest message, sent or received [16384] */
     uint32_t max_control;   /* most bytes of a control message, 16..1000 [512] */
@@ -67,8 +68,9 @@ typedef struct pf_link_stats { /* since init; never reset */
     uint64_t bytes_in, bytes_out;      /* on the wire */
     uint64_t frames_in, frames_out;
     uint64_t crc_errors;               /* frames whose checksum or COBS coding was wrong */
-    uint64_t malformed;                /* intact frames that make no sense: wrong length, unknown type or handle */
-    uint64_t stale;                    /* frames of an earlier session */
+    uint64_t malformed;                /* intact frames that make no sense: wrong length, unknown type, out of range */
+    uint64_t stale;                    /* frames of an earlier session, or of an object that is done */
+    /* sent counts repetitions too; duplicate: received, but not needed */
     uint64_t fragments_sent, fragments_resent, fragments_received, fragments_duplicate;
     uint64_t objects_sent, objects_received; /* durably acknowledged / handed to the caller */
     uint64_t object_bytes_sent, object_bytes_received;
@@ -146,7 +148,8 @@ typedef enum pf_link_answer {
     PF_ANSWER_AGAIN = 4,  /* object: the bytes do not match the name; send all of it again */
 } pf_link_answer;
 
-/* Answers PF_LINK_OFFER or PF_LINK_OBJECT. PF_ERR_ARGUMENT: no such question is open. */
+/* Answers PF_LINK_OFFER or PF_LINK_OBJECT. A question stays open, and is not asked again, whatever happens to the session
+ * or the line: it must be answered once. PF_ERR_ARGUMENT: no such question is open, or not with this answer. */
 pf_status pf_link_answer_object(pf_link *link, uint32_t slot, pf_link_answer answer);
 
 const pf_link_stats *pf_link_get_stats(const pf_link *link);
