@@ -43,7 +43,7 @@ static void unpack(pf_klt *klt, const uint8_t *pixels)
         for (int32_t i = klt->window; i < klt->cols; i++)
             t[i] = gx[i] = gy[i] = 0;
         int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
-        for (int32_t i = 0; i < klt->cols; i++) {
+        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
             px[i] = (int16_t)(gx[i] * (i - klt->half));
             py[i] = (int16_t)(gy[i] * (i - klt->half));
         }
@@ -186,7 +186,7 @@ static void right_hand_side(const pf_klt *klt, const pf_anchor *anchor, pf_rhs *
         const int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
         const int16_t first = (int16_t)-klt->half;
         int32_t s = 0, sx = 0, ss = 0, st = 0, x = 0, y = 0, xx = 0, xy = 0;
-        for (int32_t i = 0; i < klt->cols; i++) {
+        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
             s += c[i];
             sx += c[i] * (int16_t)(first + i);
             ss += c[i] * c[i];

@@ -1,7 +1,7 @@
 /* What the files of the tracker share. Not for users.
  *
  * Fixed point inside: pixels of a patch are Q5 less 4080 (a signed 16-bit number that centres 0..255), positions are
- * Q16.16, bilinear weights Q14. A row of products of two patch values is summed in 32 bits (31 columns of
+ * Q16.16, bilinear weights Q15. A row of products of two patch values is summed in 32 bits (31 columns of
  * 8160 * 4080 stay below 2^31), rows in 64: every sum is exact, so its order cannot matter and vector code may choose.
  */
 #ifndef PIPEFISH_TRACK_PRIVATE_H
@@ -10,12 +10,13 @@
 #include "pipefish/image.h"
 #include "pipefish/track.h"
 
-#define WINDOW_MAX 31
-#define PATCH_ROW  40 /* row stride of a patch: window + 2 border columns, padded to whole groups of 8 */
-#define PATCH_MAX  ((WINDOW_MAX + 2) * PATCH_ROW)
-#define GAIN_ONE   16384          /* gains are Q14 */
-#define GAIN_MIN   (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
-#define GAIN_MAX   (GAIN_ONE * 8)
+#define WINDOW_MAX  31
+#define PATCH_ROW   40 /* row stride of a patch: window + 2 border columns, padded to whole groups of 8 */
+#define PATCH_MAX   ((WINDOW_MAX + 2) * PATCH_ROW)
+#define WHOLE(cols) ((cols) & ~7)  /* tells the compiler that rows are whole groups: no loop for a rest */
+#define GAIN_ONE    16384          /* gains are Q14 */
+#define GAIN_MIN    (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
+#define GAIN_MAX    (GAIN_ONE * 8)
 
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {
