@@ -162,7 +162,8 @@ static void set_telemetry(pipefish_v1_Telemetry *out, const pf_msg_telemetry *in
     out->has_encoder_count = in->has_encoder;
     out->encoder_count = in->encoder_count;
     out->encoder_missed = in->encoder_missed;
-    out->has_roll_rad = out->has_pitch_rad = out->has_attitude_sigma_rad = in->has_attitude;
+    out->has_roll_rad = out->has_pitch_rad = in->has_attitude;
+    out->has_attitude_sigma_rad = in->has_attitude && in->attitude_sigma_rad > 0.0f;
     out->roll_rad = in->roll_rad;
     out->pitch_rad = in->pitch_rad;
     out->attitude_sigma_rad = in->attitude_sigma_rad;
@@ -230,7 +231,7 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     observation_column columns[OBSERVATION_COLUMNS];
     bytes_view jpeg;
 
-    if (k->n_tracks > PF_TRACKS_MAX)
+    if (k->n_tracks > 2 * PF_TRACKS_MAX)
         return PF_ERR_ARGUMENT;
     for (uint32_t i = 1; i < k->n_tracks; i++)
         if (k->tracks[i].id <= k->tracks[i - 1].id)

@@ -26,7 +26,8 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     bool has_encoder, has_attitude, has_exposure, has_gain, has_lamp;
     int64_t encoder_count;
     uint32_t encoder_missed; /* edges */
-    float roll_rad, pitch_rad, attitude_sigma_rad;
+    float roll_rad, pitch_rad;
+    float attitude_sigma_rad; /* 0 = not stated */
     uint32_t exposure_us;
     float gain, lamp;
 } pf_msg_telemetry;
@@ -49,7 +50,8 @@ typedef struct pf_msg_keyframe {
     const char *break_reason; /* NULL = tracks go on from the keyframe before */
 } pf_msg_keyframe;
 
-/* Most bytes that a keyframe with so many tracks and so large a JPEG takes, its break_reason at most 256 bytes: 10 (id)
+/* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break_reason at most 256 bytes: 10
+ * (id)
  * + 5 x 5 (x, y, covariance) + 5 (age) + 3 (quality) + 1 (status) a track. */
 #define PF_MSG_KEYFRAME_MAX(n_tracks, jpeg_size) ((size_t)1024 + 44u * (size_t)(n_tracks) + (size_t)(jpeg_size))
 
@@ -150,7 +152,7 @@ typedef struct pf_msg_request {
     pf_msg_clock_sync clock; /* PF_REQUEST_CLOCK_SYNC */
 } pf_msg_request;
 
-/* PF_ERR_ARGUMENT: n_tracks > PF_TRACKS_MAX or ids that do not ascend. */
+/* PF_ERR_ARGUMENT: n_tracks > 2 PF_TRACKS_MAX (a whole table, lost tracks included) or ids that do not ascend. */
 pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *keyframe, uint8_t *out, size_t capacity, size_t *n);
 pf_status pf_msg_encode_survey_start(const pf_msg_survey_start *start, uint8_t *out, size_t capacity, size_t *n);
 pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *end, uint8_t *out, size_t capacity, size_t *n);
