@@ -24,6 +24,10 @@ ROOT = Path(__file__).resolve().parents[2]
 START, KEYFRAME, END = 1, 2, 3
 WIDTH, HEIGHT = 192, 160
 COUNTS_PER_FRAME = 10
+EVERY_FRAME = (
+    *("--set", "keyframe.step_mm=1", "--set", "keyframe.min_interval=1"),
+    *("--set", "keyframe.jpeg_quality=100"),
+)
 
 
 def find_daemon() -> Path:
@@ -114,7 +118,7 @@ class Crawler:
         return self.process.wait(timeout)
 
     def status(self) -> dict:
-        return json.loads(self.status_file.read_text())
+        return json.loads(self.status_file.read_text()) if self.status_file.exists() else {}
 
     def text(self) -> str:
         return self.log.read_text()
@@ -393,8 +397,10 @@ def test_what_could_not_be_sent_is_delivered_by_the_next_start_before_its_new_su
     assert len({s.survey_id for s in store.starts}) == 2
     assert [e.boots for e in store.ends] == [1, 1]
     assert Counter(k.survey_id for k in store.keyframes) == {s.survey_id: 20 for s in store.starts}
-    kinds = [kind for kind, _ in store.objects.values()]
-    assert kinds.index(END) < len(kinds) - 1 - kinds[::-1].index(START) + 1  # the old end before the new start is through
+    # Up to four objects are under way at once, so the order is that of starting, give or take four.
+    order = list(store.objects.values())
+    old_end = next(i for i, (kind, _) in enumerate(order) if kind == END)
+    assert old_end <= 21 + 3
 
 
 def test_a_second_sigterm_exits_at_once(crawler: Crawler):
@@ -476,7 +482,7 @@ def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Pat
 
 def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
     store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.loops=8", "--set", "keyframe.jpeg_quality=100")
+    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.loops=3", *EVERY_FRAME)
     end = time.monotonic() + 20
     while "make room" not in crawler.text():
         assert time.monotonic() < end, crawler.text()
@@ -488,11 +494,9 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
 
 
 def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
-    write_recording(tmp_path / "survey.y4m", 200, rate=200)
+    write_recording(tmp_path / "survey.y4m", 120, rate=60)
     store = Store(crawler.port)
-    crawler.start(
-        *("--set", "spool.quota_mb=1", "--set", "camera.speed=recorded"), "--set", "keyframe.jpeg_quality=100"
-    )
+    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.speed=recorded", *EVERY_FRAME)
     end = time.monotonic() + 20
     while "survey ends" not in crawler.text():
         assert time.monotonic() < end, crawler.text()
