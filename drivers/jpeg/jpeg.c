@@ -129,14 +129,13 @@ const char *pf_jpeg_error(const pf_jpeg *jpeg)
     return jpeg->failure.text;
 }
 
-/* The frame with its outside black: the caller's own pixels if there is no circle. */
-static pf_status mask(pf_jpeg *jpeg, const pf_image *image, pf_image *masked)
+/* Turns a view of the caller's frame into one of a copy with its outside black; leaves it if there is no circle. */
+static pf_status mask(pf_jpeg *jpeg, pf_image *image)
 {
     uint32_t width = jpeg->config.width, height = jpeg->config.height;
     if (image->data == NULL || image->width != width || image->height != height || image->stride < width)
         return pf_fail(&jpeg->failure, PF_ERR_ARGUMENT, "a frame of %u x %u for a JPEG encoder of %u x %u",
                        image->width, image->height, width, height);
-    *masked = *image;
     if (jpeg->masked == NULL)
         return PF_OK;
     for (uint32_t y = 0; y < height; y++) {
@@ -144,8 +143,8 @@ static pf_status mask(pf_jpeg *jpeg, const pf_image *image, pf_image *masked)
         memcpy(jpeg->masked + (size_t)y * width + s.begin, image->data + (size_t)y * image->stride + s.begin,
                s.end - s.begin);
     }
-    masked->data = jpeg->masked;
-    masked->stride = width;
+    image->data = jpeg->masked;
+    image->stride = width;
     return PF_OK;
 }
 
@@ -162,8 +161,8 @@ static pf_status compress(pf_jpeg *jpeg, const pf_image *image, uint32_t quality
 
 pf_status pf_jpeg_encode(pf_jpeg *jpeg, const pf_image *image, const uint8_t **bytes, size_t *n)
 {
-    pf_image masked;
-    pf_status status = mask(jpeg, image, &masked);
+    pf_image masked = *image;
+    pf_status status = mask(jpeg, &masked);
     if (status != PF_OK)
         return status;
     return compress(jpeg, &masked, jpeg->config.quality, jpeg->out, jpeg->out_size, bytes, n);
@@ -191,8 +190,8 @@ static void shrink(const pf_image *from, uint32_t width, uint32_t height, uint8_
 
 pf_status pf_jpeg_encode_preview(pf_jpeg *jpeg, const pf_image *image, const uint8_t **bytes, size_t *n)
 {
-    pf_image masked;
-    pf_status status = mask(jpeg, image, &masked);
+    pf_image masked = *image;
+    pf_status status = mask(jpeg, &masked);
     if (status != PF_OK)
         return status;
     pf_image preview = {jpeg->preview, jpeg->preview_width, jpeg->preview_height, jpeg->preview_width};

@@ -200,12 +200,15 @@ def run_status(args: argparse.Namespace) -> Result:
 
 
 def run_simulate(args: argparse.Namespace) -> Result:
-    from pipefish.simulate import presets, simulate
+    from pipefish.simulate import simulate
 
-    if args.preset not in presets():
-        raise PipefishError(f"there is no preset '{args.preset}'; choose one of {', '.join(sorted(presets()))}")
-    document = simulate(args.preset, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
-    return document, table(document.items())
+    document = simulate(args.scene, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
+    rows = [
+        ("frames", f"{document['frames']} of {document['width']} x {document['height']} pixels"),
+        ("driven", f"{document['driven_m']:.2f} m"),
+        *(("written", file) for file in document["files"]),
+    ]
+    return document, table(rows)
 
 
 def load_profile(path: Path) -> Any:
@@ -339,10 +342,10 @@ def build_parser() -> argparse.ArgumentParser:
         "Simulate a camera in a pipe: recorded frames, telemetry, and the truth about both.",
         "pipefish simulate demo -o /tmp/pipe",
     )
-    p.add_argument("preset", metavar="PRESET", help="what to simulate; a wrong name lists them")
+    p.add_argument("scene", metavar="SCENE", help="demo, straight, tiny, or a JSON file (docs/simulator.md)")
     p.add_argument("-o", "--output", required=True, metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
     p.add_argument("--frames", type=positive, help="stop after so many frames")
-    p.add_argument("--seed", type=int, help="of texture and noise [the preset's]")
+    p.add_argument("--seed", type=int, help="of texture and noise [the scene's]")
 
     p = add_command(
         commands,

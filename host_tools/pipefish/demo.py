@@ -117,7 +117,7 @@ def config_text(recording: Recording, profile: Path, run: Path) -> str:
     """pipefishd's configuration for the demo: as fast as the link takes it, nothing dropped."""
     truth = json.loads(recording.truth.read_text())
     sections: dict[str, dict[str, Any]] = {
-        "survey": {"name": "demo pipe", "nominal_diameter_mm": round(truth["pipe"]["diameter_m"] * 1000)},
+        "survey": {"name": "demo pipe", "nominal_diameter_mm": round(truth["scene"]["diameter"] * 1000)},
         "camera": {
             "driver": "replay",
             "path": recording.video.resolve(),
@@ -125,7 +125,7 @@ def config_text(recording: Recording, profile: Path, run: Path) -> str:
             "speed": "fast",
             "profile": profile.resolve(),
         },
-        "encoder": {"metres_per_count": repr(truth["encoder"]["metres_per_count"])},
+        "encoder": {"metres_per_count": repr(truth["scene"]["motion"]["metres_per_count"])},
         "link": {"transport": "serial", "device": (run / "crawler").absolute(), "baud": BAUD},
         "spool": {"path": (run / "spool.db").absolute()},
     }

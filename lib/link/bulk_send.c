@@ -293,7 +293,7 @@ static void arrived(pf_send_slot *slot, uint32_t index)
 }
 
 /* Takes over what the peer has. An old acknowledgement (base behind ours) still tells the truth about its fragments. */
-static void apply(pf_link *link, pf_send_slot *slot, uint32_t base, const uint8_t *bitmap, size_t bytes)
+static void apply(pf_send_slot *slot, uint32_t base, const uint8_t *bitmap, size_t bytes)
 {
     if (base > slot->base) {
         for (uint32_t i = slot->base; i < base && i - slot->base < PF_LINK_REACH; i++) {
@@ -310,7 +310,6 @@ static void apply(pf_link *link, pf_send_slot *slot, uint32_t base, const uint8_
         if (pf_bit(bitmap, i) && index > slot->base && index - slot->base < PF_LINK_REACH)
             arrived(slot, index);
     }
-    link->sender.progress_at = link->now;
 }
 
 /* Closes the flights of a slot that have arrived, and those that must be lost since `seen` has. */
@@ -392,7 +391,7 @@ bool pf_sender_receive_ack(pf_link *link, const uint8_t *frame, size_t size)
         if (slot->state == PF_SEND_OFFERED && slot->count <= PF_LINK_COUNT_MAX)
             accepted(slot);
         if (slot->state == PF_SEND_SENDING) {
-            apply(link, slot, base, frame + PF_SIZE_ACK, size - PF_SIZE_ACK);
+            apply(slot, base, frame + PF_SIZE_ACK, size - PF_SIZE_ACK);
             settle(link, slot, seen);
         }
         break;

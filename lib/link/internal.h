@@ -222,10 +222,9 @@ struct pf_link {
     pf_latest latest;
     pf_sender sender;
     pf_receiver receiver;
-    int32_t credit;     /* bytes of bulk sent since, less those of latest: above zero it is the turn of latest */
-    bool delimiter_due; /* a leading zero ends whatever half frame the peer holds */
-    bool overlong;      /* more bytes than any frame has: wait for the delimiter */
-    uint32_t in_size;
+    int32_t credit;          /* bytes of bulk sent since, less those of latest: above zero it is the turn of latest */
+    bool delimiter_due;      /* a leading zero ends whatever half frame the peer holds */
+    uint32_t in_size;        /* a full buffer is more than any frame has */
     pf_link_event events[4]; /* a frame raises one at most, and input waits until it is taken; DOWN may join it */
     uint32_t event_head, event_count;
     uint8_t in[PF_LINK_FRAME_MAX];

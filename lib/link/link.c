@@ -123,7 +123,6 @@ void pf_link_reset(pf_link *link, uint64_t now_ns)
 {
     set_now(link, now_ns);
     link->in_size = 0;
-    link->overlong = false;
     link->delimiter_due = true;
     pf_session_down(link);
 }
@@ -192,12 +191,11 @@ static void receive_frame(pf_link *link)
 {
     uint8_t *frame = link->in;
     size_t size = link->in_size;
-    bool overlong = link->overlong;
     link->in_size = 0;
-    link->overlong = false;
     if (size == 0)
         return;
-    if (overlong || pf_cobs_decode(frame, size, frame, &size) != PF_OK || size < PF_LINK_HEADER + PF_LINK_CRC ||
+    if (size == sizeof link->in || pf_cobs_decode(frame, size, frame, &size) != PF_OK ||
+        size < PF_LINK_HEADER + PF_LINK_CRC ||
         pf_crc32c(0, frame, size - PF_LINK_CRC) != pf_get32(frame + size - PF_LINK_CRC)) {
         link->stats.crc_errors++;
         return;
@@ -229,8 +227,6 @@ size_t pf_link_input(pf_link *link, const uint8_t *bytes, size_t n, uint64_t now
             receive_frame(link);
         else if (link->in_size < sizeof link->in)
             link->in[link->in_size++] = byte;
-        else
-            link->overlong = true;
     }
     link->stats.bytes_in += i;
     return i;
