@@ -548,7 +548,9 @@ def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path,
     check_everything_arrived_once(store, kills)
 
 
-def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(tmp_path: Path, crawler: Crawler):
+def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(
+    tmp_path: Path, crawler: Crawler
+):
     # What the host has stored but the daemon had not yet removed is offered again and answered from the store: it does
     # not arrive twice. Every second time the host dies as well, in the middle of whatever was under way.
     write_recording(tmp_path / "survey.y4m", 120)
