@@ -1,4 +1,4 @@
-"""The demo, short: simulator, daemon, emulated cable, reception, evaluation, page. Needs the programs of `make build`."""
+"""The demo, short: simulator, daemon, emulated cable, reception, evaluation, page. Needs what `make build` builds."""
 
 from __future__ import annotations
 
@@ -59,12 +59,26 @@ def test_a_daemon_that_fails_shows_its_log(folder, monkeypatch):
 
 
 @needs_programs
-def test_the_same_recording_is_used_again(folder):
+def test_the_same_recording_is_used_again_and_only_that(folder, monkeypatch):
+    import pipefish.simulate
     from pipefish.demo import simulated
 
-    first = simulated(folder / "recording", 16, fresh=False, quiet=True).key()
-    assert simulated(folder / "recording", 16, fresh=False, quiet=True).key() == first
-    assert simulated(folder / "recording", 2, fresh=False, quiet=True).key() != first
+    class Simulated(Exception):
+        pass
+
+    def simulate(*_, **__):
+        raise Simulated
+
+    monkeypatch.setattr(pipefish.simulate, "simulate", simulate)
+    recording = simulated(folder / "recording", 16, fresh=False, quiet=True)
+    stamp = (folder / "recording" / "stamp.json").read_text()
+    for frames, fresh in ((15, False), (16, True)):
+        with pytest.raises(Simulated):
+            simulated(folder / "recording", frames, fresh=fresh, quiet=True)
+        (folder / "recording" / "stamp.json").write_text(stamp)
+    recording.csv.write_text("changed")
+    with pytest.raises(Simulated):
+        simulated(folder / "recording", 16, fresh=False, quiet=True)
 
 
 def test_missing_programs_are_named(tmp_path):
