@@ -307,7 +307,7 @@ class Camera:
         temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         try:
             with open(temporary, "w", encoding="utf-8") as file:
-                file.write(self._to_json())
+                file.write(self.to_json())
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, target)
@@ -336,7 +336,8 @@ class Camera:
             values |= _parse_covariance(values["covariance"])
         return cls(**values)
 
-    def _to_json(self) -> str:
+    def to_json(self) -> str:
+        """The JSON form that people read, as `save` writes it."""
         document: dict[str, Any] = {"format": _FORMAT, "version": _VERSION}
         for key in (*_TEXTS, "source"):
             document[key] = getattr(self, key)

@@ -28,9 +28,9 @@ def run_program(path: Path) -> list[dict]:
 
 def bench_sim() -> list[dict]:
     """sim.fps: frames of the demo scene rendered per second of wall time, on all cores, noise and lens included."""
-    from pipefish.simulate import load_scene
+    from pipefish.simulate import Scene
 
-    scene = load_scene("demo")
+    scene = Scene.load("demo")
     scene.render(0)
     count, start = 0, time.perf_counter()
     while time.perf_counter() - start < 5.0:

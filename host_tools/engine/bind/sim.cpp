@@ -1,0 +1,388 @@
+// The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in the fields() below, with its
+// range, and serves reading, checking and writing back.
+#include "sim/scene.hpp"
+
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <cmath>
+#include <string>
+
+namespace nb = nanobind;
+using namespace pipefish::sim;
+
+void bind_sim(nb::module_ &m);
+
+namespace
+{
+
+constexpr double kTurn = 2 * M_PI;
+constexpr double kMaxSeed = 9007199254740992.0; // 2^53: JSON numbers are exact to there
+
+template <typename F> void fields(F &f, Piece &p)
+{
+    f("length", p.length, 0, 1000);
+    f("angle", p.angle, 0, M_PI);
+    f("radius", p.radius, 0, 1000);
+    f("clock", p.clock, -kTurn, kTurn);
+}
+
+template <typename F> void fields(F &f, OvalStretch &o)
+{
+    f("start", o.start, -1000, 1000);
+    f("end", o.end, -1000, 1000);
+    f("ramp", o.ramp, 0, 1000);
+    f("ovality", o.ovality, 0, 0.5);
+    f("clock", o.clock, -kTurn, kTurn);
+}
+
+template <typename F> void fields(F &f, Marker &m)
+{
+    f("s", m.s, -1000, 1000);
+    f("phi", m.phi, -kTurn, kTurn);
+    f("radius", m.radius, 0, 1);
+}
+
+template <typename F> void fields(F &f, TextureSpec &t)
+{
+    f("seed", t.seed, 0, kMaxSeed);
+    f("contrast", t.contrast, 0, 3);
+    f("joint_spacing", t.joint_spacing, 0, 100);
+    f("texel", t.texel, 0.0002, 0.01);
+}
+
+template <typename F> void fields(F &f, LensSpec &l)
+{
+    f("width", l.width, 64, 8192);
+    f("height", l.height, 64, 8192);
+    f("focal_px", l.focal_px, 10, 10000);
+    f("equisolid", l.equisolid, 0, 1);
+    f("theta_max", l.theta_max, 0.1, 2.4);
+    f("c_u", l.c_u, -8192, 16384);
+    f("c_v", l.c_v, -8192, 16384);
+    f("pupil_mm", l.pupil_mm, -10, 10);
+    f("vignetting", l.vignetting, 0, 1);
+}
+
+template <typename F> void fields(F &f, LampSpec &l)
+{
+    f("side", l.side, 0, 10);
+    f("forward", l.forward, 0, 10);
+    f("exposure", l.exposure, 0, 1e5);
+}
+
+template <typename F> void fields(F &f, SensorSpec &s)
+{
+    f("seed", s.seed, 0, kMaxSeed);
+    f("blur_px", s.blur_px, 0, 5);
+    f("read_noise", s.read_noise, 0, 50);
+    f("shot_noise", s.shot_noise, 0, 5);
+}
+
+template <typename F> void fields(F &f, MotionSpec &m)
+{
+    f("seed", m.seed, 0, kMaxSeed);
+    f("frames", m.frames, 1, 1e6);
+    f("frame_rate", m.frame_rate, 0.1, 1000);
+    f("start", m.start, -100, 1000);
+    f("speed", m.speed, 0, 10);
+    f("below_axis", m.below_axis, -1, 1);
+    f("wobble_m", m.wobble_m, 0, 0.1);
+    f("wobble_rad", m.wobble_rad, 0, 0.5);
+    f("metres_per_count", m.metres_per_count, 1e-6, 1);
+    f("encoder_bias", m.encoder_bias, -0.5, 0.5);
+    f("encoder_slip", m.encoder_slip, 0, 0.1);
+    f("attitude_sigma", m.attitude_sigma, 0, 0.5);
+}
+
+template <typename F> void fields(F &f, SceneSpec &s)
+{
+    f("diameter", s.diameter, 0.02, 10);
+    f("pieces", s.pieces);
+    f("ovals", s.ovals);
+    f("markers", s.markers);
+    f("texture", s.texture);
+    f("lens", s.lens);
+    f("lamp", s.lamp);
+    f("sensor", s.sensor);
+    f("motion", s.motion);
+}
+
+// Reads one dict into a struct; a key that nobody asked for is an error that lists those allowed.
+class Reader
+{
+public:
+    Reader(nb::handle source, std::string path) : path_(std::move(path))
+    {
+        if (!nb::isinstance<nb::dict>(source))
+            fail(path_, "must be an object");
+        source_ = nb::borrow<nb::dict>(source);
+    }
+
+    template <typename T> void operator()(const char *name, T &value, double least, double most)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        double number = 0;
+        if (nb::isinstance<nb::bool_>(item) || !nb::try_cast<double>(item, number))
+            fail(path_ + name, "must be a number");
+        if (std::is_integral_v<T> && number != std::floor(number))
+            fail(path_ + name, "must be a whole number");
+        if (!(number >= least && number <= most))
+            fail(path_ + name, "must be within " + text(least) + " and " + text(most) + ", not " + text(number));
+        value = static_cast<T>(number);
+    }
+
+    template <typename T> void operator()(const char *name, std::vector<T> &list)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        if (!nb::isinstance<nb::list>(item))
+            fail(path_ + name, "must be a list");
+        list.clear();
+        for (nb::handle entry : nb::borrow<nb::list>(item)) {
+            Reader reader(entry, path_ + name + "[" + std::to_string(list.size()) + "].");
+            fields(reader, list.emplace_back());
+            reader.finish();
+        }
+    }
+
+    template <typename T> void operator()(const char *name, T &part)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        Reader reader(item, path_ + name + ".");
+        fields(reader, part);
+        reader.finish();
+    }
+
+    void finish() const
+    {
+        for (auto [key, value] : source_) {
+            const std::string name = nb::cast<std::string>(nb::str(key));
+            if (known_.find(" " + name + ",") == std::string::npos)
+                fail(path_ + name, "unknown; known are" + known_.substr(0, known_.size() - 1));
+        }
+    }
+
+    [[noreturn]] static void fail(const std::string &where, const std::string &what)
+    {
+        throw nb::value_error((where + ": " + what).c_str());
+    }
+
+private:
+    nb::dict source_;
+    std::string path_, known_;
+
+    nb::handle take(const char *name)
+    {
+        known_ += std::string(" ") + name + ",";
+        return source_.contains(name) ? nb::handle(PyDict_GetItemString(source_.ptr(), name)) : nb::handle();
+    }
+
+    static std::string text(double v) { return nb::cast<std::string>(nb::str(nb::float_(v))); }
+};
+
+class Writer
+{
+public:
+    nb::dict out;
+
+    template <typename T> void operator()(const char *name, T &value, double, double) { out[name] = value; }
+
+    template <typename T> void operator()(const char *name, std::vector<T> &list)
+    {
+        nb::list items;
+        for (T &entry : list) {
+            Writer writer;
+            fields(writer, entry);
+            items.append(writer.out);
+        }
+        out[name] = items;
+    }
+
+    template <typename T> void operator()(const char *name, T &part)
+    {
+        Writer writer;
+        fields(writer, part);
+        out[name] = writer.out;
+    }
+};
+
+// What single ranges cannot say.
+void check_together(const SceneSpec &s)
+{
+    if (s.pieces.empty())
+        Reader::fail("pieces", "needs at least one");
+    for (size_t i = 0; i < s.pieces.size(); i++) {
+        const Piece &p = s.pieces[i];
+        const std::string where = "pieces[" + std::to_string(i) + "]";
+        if (p.angle == 0 && !(p.length > 0))
+            Reader::fail(where, "a straight run needs a length, a bend an angle and a radius");
+        if (p.angle != 0 && !(p.radius > 0.75 * s.diameter))
+            Reader::fail(where + ".radius", "must be above 0.75 diameters, or the wall meets itself");
+    }
+    for (size_t i = 0; i < s.ovals.size(); i++)
+        if (!(s.ovals[i].end > s.ovals[i].start))
+            Reader::fail("ovals[" + std::to_string(i) + "].end", "must lie behind start");
+    const double ride = std::abs(s.motion.below_axis) + 2 * s.motion.wobble_m;
+    if (ride > 0.4 * s.diameter)
+        Reader::fail("motion.below_axis", "the camera would leave the pipe");
+    const double end = s.motion.start + s.motion.speed * s.motion.frames / s.motion.frame_rate;
+    double length = 0;
+    for (const Piece &p : s.pieces)
+        length += p.angle != 0 ? p.angle * p.radius : p.length;
+    if (s.motion.start < -0.4 || end > length + 0.4)
+        Reader::fail("motion", "the camera would drive out of the pipe's " + std::to_string(length) + " m");
+}
+
+SceneSpec read_scene(const nb::dict &source)
+{
+    SceneSpec spec;
+    Reader reader(source, "");
+    fields(reader, spec);
+    reader.finish();
+    check_together(spec);
+    return spec;
+}
+
+using Points2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Points3 = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+
+template <typename T> auto to_numpy(std::vector<T> &&values, std::initializer_list<size_t> shape)
+{
+    auto *kept = new std::vector<T>(std::move(values));
+    nb::capsule owner(kept, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
+    return nb::ndarray<nb::numpy, T>(kept->data(), shape, owner);
+}
+
+nb::object ok_mask(std::vector<uint8_t> &&ok)
+{
+    const size_t n = ok.size();
+    return nb::cast(to_numpy<uint8_t>(std::move(ok), {n})).attr("astype")("bool");
+}
+
+int checked_frame(const Scene &scene, int frame)
+{
+    if (frame < 0 || frame >= scene.spec().motion.frames)
+        throw nb::index_error("no such frame");
+    return frame;
+}
+
+} // namespace
+
+void bind_sim(nb::module_ &m)
+{
+    nb::class_<Scene>(m, "Scene", "A simulated pipe with a camera driving through it; docs/simulator.md.")
+        .def(
+            "__init__", [](Scene *self, const nb::dict &source) { new (self) Scene(read_scene(source)); },
+            nb::arg("scene"))
+        .def_prop_ro("spec",
+                     [](const Scene &s) {
+                         SceneSpec spec = s.spec();
+                         Writer writer;
+                         fields(writer, spec);
+                         return writer.out;
+                     })
+        .def(
+            "render",
+            [](Scene &s, int frame, unsigned threads) {
+                checked_frame(s, frame);
+                std::vector<uint8_t> image;
+                {
+                    nb::gil_scoped_release release;
+                    image = s.render(frame, threads);
+                }
+                const auto &l = s.spec().lens;
+                return to_numpy<uint8_t>(std::move(image),
+                                         {static_cast<size_t>(l.height), static_cast<size_t>(l.width)});
+            },
+            nb::arg("frame"), nb::arg("threads"), "(height, width) uint8.")
+        .def(
+            "pose",
+            [](const Scene &s, int frame) {
+                const Pose &p = s.motion().pose(checked_frame(s, frame));
+                Eigen::Matrix<double, 3, 4, Eigen::RowMajor> out;
+                out << p.rotation, -p.rotation * p.centre;
+                return out;
+            },
+            nb::arg("frame"), "cam_from_world, (3, 4).")
+        .def("arc_length", [](const Scene &s, int frame) { return s.motion().pose(checked_frame(s, frame)).s; })
+        .def(
+            "telemetry",
+            [](const Scene &s, int frame) {
+                const Telemetry &t = s.motion().telemetry(checked_frame(s, frame));
+                return std::make_tuple(t.time_ns, t.encoder_count, t.roll, t.pitch);
+            },
+            nb::arg("frame"), "(time_ns, encoder_count, roll, pitch) as the sensors say.")
+        .def(
+            "cast",
+            [](const Scene &s, int frame, const Points2 &px) {
+                checked_frame(s, frame);
+                const size_t n = px.shape(0);
+                std::vector<double> out(3 * n, NAN);
+                std::vector<uint8_t> ok(n, 0);
+                for (size_t i = 0; i < n; i++) {
+                    const auto hit = s.cast(frame, Vec2(px(i, 0), px(i, 1)));
+                    if (!hit)
+                        continue;
+                    ok[i] = 1;
+                    Eigen::Map<Vec3>(out.data() + 3 * i) = hit->point;
+                }
+                return nb::make_tuple(to_numpy<double>(std::move(out), {n, 3}), ok_mask(std::move(ok)));
+            },
+            nb::arg("frame"), nb::arg("px"), "(N, 2) pixels -> wall points (N, 3) in metres, ok (N,).")
+        .def(
+            "project",
+            [](const Scene &s, int frame, const Points3 &points) {
+                checked_frame(s, frame);
+                const size_t n = points.shape(0);
+                std::vector<double> out(2 * n, NAN);
+                std::vector<uint8_t> ok(n, 0);
+                for (size_t i = 0; i < n; i++) {
+                    const auto px = s.project(frame, Vec3(points(i, 0), points(i, 1), points(i, 2)));
+                    if (!px)
+                        continue;
+                    ok[i] = 1;
+                    Eigen::Map<Vec2>(out.data() + 2 * i) = *px;
+                }
+                return nb::make_tuple(to_numpy<double>(std::move(out), {n, 2}), ok_mask(std::move(ok)));
+            },
+            nb::arg("frame"), nb::arg("points"), "World points (N, 3) -> pixels (N, 2), ok (N,).")
+        .def(
+            "locate",
+            [](const Scene &s, const Points3 &points) {
+                const size_t n = points.shape(0);
+                std::vector<double> out(3 * n);
+                for (size_t i = 0; i < n; i++) {
+                    const TubePoint at = s.tube().locate(Vec3(points(i, 0), points(i, 1), points(i, 2)));
+                    out[3 * i] = at.s;
+                    out[3 * i + 1] = at.rho;
+                    out[3 * i + 2] = at.phi;
+                }
+                return to_numpy<double>(std::move(out), {n, 3});
+            },
+            nb::arg("points"), "World points (N, 3) -> arc length, distance from the axis, clock angle (N, 3).")
+        .def(
+            "wall", [](const Scene &s, double at, double phi) { return s.tube().wall(at, phi); }, nb::arg("s"),
+            nb::arg("phi"), "The wall point at arc length s and clock angle phi, (3,).")
+        .def(
+            "section",
+            [](const Scene &s, double at) {
+                const Section x = s.tube().section(at);
+                return std::make_tuple(2 * x.a, 2 * x.b, x.clock);
+            },
+            nb::arg("s"), "(D_max, D_min, clock angle of D_max) at arc length s.")
+        .def(
+            "lens_radius", [](const Scene &s, double theta) { return s.lens().radius(theta); }, nb::arg("theta"))
+        .def_prop_ro("circle_radius", [](const Scene &s) { return s.lens().circle_radius(); })
+        .def_prop_ro("length", [](const Scene &s) { return s.tube().length(); });
+}
