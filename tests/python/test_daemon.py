@@ -193,6 +193,14 @@ def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
         client.step(0.02)
 
 
+def wait_for_log(crawler: Crawler, text: str) -> None:
+    """Until the daemon has logged `text`."""
+    end = time.monotonic() + 20
+    while text not in crawler.text():
+        assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+
+
 def receive_all(crawler: Crawler, store: Store) -> int:
     """Serves the daemon until it exits; returns its exit code."""
     with store.client() as client:
@@ -280,6 +288,7 @@ def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_p
     assert str(crawler.port) in done.stderr
     crawler.start("--set", "camera.loops=0")
     with Store(crawler.port).client():
+        wait_for_log(crawler, "begins")
         done = run("--config", crawler.config, "--set", f"link.port={free_port()}")
     assert done.returncode == 1
     assert "spool.db" in done.stderr
@@ -450,10 +459,7 @@ def test_a_second_sigterm_exits_at_once(crawler: Crawler):
     crawler.start("--set", "camera.loops=0")
     with Store(crawler.port).client():
         crawler.terminate()
-        end = time.monotonic() + 10
-        while "survey ends" not in crawler.text():
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        wait_for_log(crawler, "survey ends")
         assert crawler.process.poll() is None  # nobody takes the objects: it drains
         crawler.terminate()
         assert crawler.wait(5) == 1
@@ -526,10 +532,7 @@ def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Pat
 def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
     store = Store(crawler.port)
     crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
-    end = time.monotonic() + 20
-    while "make room" not in crawler.text():
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
+    wait_for_log(crawler, "make room")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
@@ -540,10 +543,7 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
     write_recording(tmp_path / "survey.y4m", 40, rate=20)
     store = Store(crawler.port)
     crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
-    end = time.monotonic() + 20
-    while "survey ends" not in crawler.text():
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
+    wait_for_log(crawler, "survey ends")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     lost, got = set(end_message.lost_index), {k.index for k in store.keyframes}
