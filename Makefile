@@ -14,9 +14,9 @@ PY := $(VENV)/bin/python
 STAMP := build/stamp
 UNITY_DIR = $(abspath $(wildcard $(VENV)/lib/python3*/site-packages/vyperling/c))
 ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type f)
-C_FILES = $(shell git ls-files '*.c' '*.h' '*.cpp' '*.hpp' '*.cc')
+C_FILES = $(shell find lib drivers firmware host_tools/engine tests -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-smoke cross pytest
+.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross pytest
 
 build: native $(STAMP)/python
 
@@ -56,9 +56,11 @@ lint: packages-test $(STAMP)/venv
 	@$(VENV)/bin/ruff check --quiet . && $(VENV)/bin/ruff format --check --quiet .
 
 # Every parser and state machine for a fixed number of inputs, under clang with sanitizers; `make accept` runs longer.
-fuzz-smoke: packages-test
+fuzz-build: packages-test
 	@test -f build/clang/build.ninja || cmake --preset clang
 	@cmake --build --preset clang
+
+fuzz-smoke: fuzz-build
 	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
 	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
 
@@ -73,7 +75,7 @@ pytest: build
 bench: build
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-accept: build unit
+accept: build unit fuzz-build
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv
