@@ -115,7 +115,14 @@ def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):
     path = tmp_path / "a.mcap"
     with Device(survey_objects(5)[:-1], SURVEY) as device:  # the survey has not ended: receive would wait
         command = [sys.executable, "-m", "pipefish", "receive", device.address, "-o", str(path)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # A shell's background job ignores SIGINT, and so would what it starts.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
         while device.spool:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
