@@ -1,252 +1,430 @@
-// Python's door to the simulator. pipefish/simulate.py validates scene files and calls this with complete dictionaries.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-
-#include <memory>
-#include <stdexcept>
-#include <string>
-#include <thread>
-
+// The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in the fields() below, with its
+// range, and serves reading, checking and writing back.
 #include "sim/scene.hpp"
 
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
 namespace nb = nanobind;
-using namespace pipefish;
+using namespace pipefish::sim;
+
+void bind_sim(nb::module_ &m);
 
 namespace
 {
 
+constexpr double kTurn = 2 * M_PI;
+constexpr double kMaxSeed = 9007199254740992.0; // 2^53: JSON numbers are exact to there
+
+template <typename F> void fields(F &f, Piece &p)
+{
+    f("length", p.length, 0, 1000);
+    f("angle", p.angle, 0, M_PI);
+    f("radius", p.radius, 0, 1000);
+    f("clock", p.clock, -kTurn, kTurn);
+}
+
+template <typename F> void fields(F &f, OvalStretch &o)
+{
+    f("start", o.start, -1000, 1000);
+    f("end", o.end, -1000, 1000);
+    f("ramp", o.ramp, 0.001, 1000);
+    f("ovality", o.ovality, 0, 0.5);
+    f("clock", o.clock, -kTurn, kTurn);
+}
+
+template <typename F> void fields(F &f, Marker &m)
+{
+    f("s", m.s, -1000, 1000);
+    f("phi", m.phi, -kTurn, kTurn);
+    f("radius", m.radius, 0, 1);
+}
+
+template <typename F> void fields(F &f, TextureSpec &t)
+{
+    f("seed", t.seed, 0, kMaxSeed);
+    f("contrast", t.contrast, 0, 3);
+    f("joint_spacing", t.joint_spacing, 0, 100);
+}
+
+template <typename F> void fields(F &f, LensNode &n)
+{
+    f("theta", n.theta, 0, 3);
+    f("radius_px", n.radius_px, 0, 20000);
+    f("pupil_m", n.pupil_m, -0.1, 0.1);
+}
+
+template <typename F> void fields(F &f, LensSpec &l)
+{
+    f("width", l.width, 64, 8192);
+    f("height", l.height, 64, 8192);
+    f("c_u", l.c_u, -8192, 16384);
+    f("c_v", l.c_v, -8192, 16384);
+    f("theta_max", l.theta_max, 0.1, 3);
+    f("circle_radius", l.circle_radius, 10, 10000);
+    f("pupil_scale", l.pupil_scale, 0, 10);
+    f("vignetting", l.vignetting, 0, 1);
+    f("table", l.table);
+}
+
+template <typename F> void fields(F &f, LampSpec &l)
+{
+    f("lamps", l.lamps, 1, 64);
+    f("ring_radius", l.ring_radius, 0, 1);
+    f("side", l.side, 0, 10);
+    f("forward", l.forward, 0, 10);
+    f("exposure", l.exposure, 0, 1e5);
+}
+
+template <typename F> void fields(F &f, SensorSpec &s)
+{
+    f("seed", s.seed, 0, kMaxSeed);
+    f("blur_px", s.blur_px, 0, 5);
+    f("read_noise", s.read_noise, 0, 50);
+    f("shot_noise", s.shot_noise, 0, 5);
+}
+
+template <typename F> void fields(F &f, MotionSpec &m)
+{
+    f("seed", m.seed, 0, kMaxSeed);
+    f("frames", m.frames, 1, 1e6);
+    f("frame_rate", m.frame_rate, 0.1, 1000);
+    f("start", m.start, -100, 1000);
+    f("speed", m.speed, 0, 10);
+    f("ramp", m.ramp, 0, 1000);
+    f("below_axis", m.below_axis, -1, 1);
+    f("lookahead", m.lookahead, 0.01, 10);
+    f("wobble_m", m.wobble_m, 0, 0.1);
+    f("wobble_rad", m.wobble_rad, 0, 0.5);
+    f("metres_per_count", m.metres_per_count, 1e-6, 1);
+    f("encoder_bias", m.encoder_bias, -0.5, 0.5);
+    f("encoder_slip", m.encoder_slip, 0, 0.1);
+    f("attitude_sigma", m.attitude_sigma, 0, 0.5);
+}
+
+template <typename F> void fields(F &f, SceneSpec &s)
+{
+    f("diameter", s.diameter, 0.02, 10);
+    f("pieces", s.pieces);
+    f("ovals", s.ovals);
+    f("markers", s.markers);
+    f("texture", s.texture);
+    f("lens", s.lens);
+    f("lamp", s.lamp);
+    f("sensor", s.sensor);
+    f("motion", s.motion);
+}
+
+// Reads one dict into a struct; a key that nobody asked for is an error that lists those allowed.
+class Reader
+{
+public:
+    Reader(nb::handle source, std::string path) : path_(std::move(path))
+    {
+        if (!nb::isinstance<nb::dict>(source))
+            fail(path_, "must be an object");
+        source_ = nb::borrow<nb::dict>(source);
+    }
+
+    template <typename T> void operator()(const char *name, T &value, double least, double most)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        double number = 0;
+        if (nb::isinstance<nb::bool_>(item) || !nb::try_cast<double>(item, number))
+            fail(path_ + name, "must be a number");
+        if (std::is_integral_v<T> && number != std::floor(number))
+            fail(path_ + name, "must be a whole number");
+        if (!(number >= least && number <= most))
+            fail(path_ + name, "must be within " + text(least) + " and " + text(most) + ", not " + text(number));
+        value = static_cast<T>(number);
+    }
+
+    template <typename T> void operator()(const char *name, std::vector<T> &list)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        if (!nb::isinstance<nb::list>(item))
+            fail(path_ + name, "must be a list");
+        list.clear();
+        for (nb::handle entry : nb::borrow<nb::list>(item)) {
+            Reader reader(entry, path_ + name + "[" + std::to_string(list.size()) + "].");
+            fields(reader, list.emplace_back());
+            reader.finish();
+        }
+    }
+
+    template <typename T> void operator()(const char *name, T &part)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        Reader reader(item, path_ + name + ".");
+        fields(reader, part);
+        reader.finish();
+    }
+
+    void finish() const
+    {
+        for (auto [key, value] : source_) {
+            const std::string name = nb::cast<std::string>(nb::str(key));
+            if (known_.find(" " + name + ",") == std::string::npos)
+                fail(path_ + name, "unknown; known are" + known_.substr(0, known_.size() - 1));
+        }
+    }
+
+    [[noreturn]] static void fail(const std::string &where, const std::string &what)
+    {
+        throw nb::value_error((where + ": " + what).c_str());
+    }
+
+private:
+    nb::dict source_;
+    std::string path_, known_;
+
+    nb::handle take(const char *name)
+    {
+        known_ += std::string(" ") + name + ",";
+        return source_.contains(name) ? nb::handle(PyDict_GetItemString(source_.ptr(), name)) : nb::handle();
+    }
+
+    static std::string text(double v) { return nb::cast<std::string>(nb::str(nb::float_(v))); }
+};
+
+class Writer
+{
+public:
+    nb::dict out;
+
+    template <typename T> void operator()(const char *name, T &value, double, double) { out[name] = value; }
+
+    template <typename T> void operator()(const char *name, std::vector<T> &list)
+    {
+        nb::list items;
+        for (T &entry : list) {
+            Writer writer;
+            fields(writer, entry);
+            items.append(writer.out);
+        }
+        out[name] = items;
+    }
+
+    template <typename T> void operator()(const char *name, T &part)
+    {
+        Writer writer;
+        fields(writer, part);
+        out[name] = writer.out;
+    }
+};
+
+// What single ranges cannot say.
+void check_together(const SceneSpec &s)
+{
+    if (s.pieces.empty())
+        Reader::fail("pieces", "needs at least one");
+    for (size_t i = 0; i < s.pieces.size(); i++) {
+        const Piece &p = s.pieces[i];
+        const std::string where = "pieces[" + std::to_string(i) + "]";
+        if (p.angle == 0 && !(p.length > 0))
+            Reader::fail(where, "a straight run needs a length, a bend an angle and a radius");
+        if (p.angle != 0 && !(p.radius > 0.8 * s.diameter))
+            Reader::fail(where + ".radius", "must be above 0.8 diameters, or the wall meets itself");
+    }
+    double ovality = 0;
+    for (size_t i = 0; i < s.ovals.size(); i++) {
+        const std::string where = "ovals[" + std::to_string(i) + "]";
+        if (!(s.ovals[i].end > s.ovals[i].start))
+            Reader::fail(where + ".end", "must lie behind start");
+        if (!(s.ovals[i].start + 2 * s.ovals[i].ramp <= s.ovals[i].end))
+            Reader::fail(where + ".ramp", "must be at most half the stretch");
+        ovality += s.ovals[i].ovality;
+        if (ovality > 0.5)
+            Reader::fail(where + ".ovality", "all stretches together must be at most 0.5");
+    }
+    if (s.lamp.ring_radius > 0.25 * s.diameter)
+        Reader::fail("lamp.ring_radius", "must be at most a quarter of the pipe's diameter");
+    const double ride = std::abs(s.motion.below_axis) + 2 * s.motion.wobble_m;
+    if (ride > 0.4 * s.diameter)
+        Reader::fail("motion.below_axis", "the camera would leave the pipe");
+    const double end = s.motion.start + s.motion.speed * (s.motion.frames - 1) / s.motion.frame_rate;
+    double length = 0;
+    for (const Piece &p : s.pieces)
+        length += p.angle != 0 ? p.angle * p.radius : p.length;
+    if (s.motion.start < -0.4 || end > length + 0.4)
+        Reader::fail("motion", "the camera would drive out of the pipe's " + std::to_string(length) + " m");
+}
+
+SceneSpec read_scene(const nb::dict &source)
+{
+    SceneSpec spec;
+    Reader reader(source, "");
+    fields(reader, spec);
+    reader.finish();
+    check_together(spec);
+    return spec;
+}
+
 using Points2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using Points3 = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-template <typename T> T get(nb::handle dict, const char *key)
+template <typename T> auto to_numpy(std::vector<T> &&values, std::initializer_list<size_t> shape)
 {
-    const nb::object value = nb::borrow<nb::dict>(dict)[key];
-    try {
-        return nb::cast<T>(value);
-    } catch (const nb::cast_error &) {
-        throw std::invalid_argument(std::string(key) + " has the wrong type");
-    }
+    auto *kept = new std::vector<T>(std::move(values));
+    nb::capsule owner(kept, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
+    return nb::ndarray<nb::numpy, T>(kept->data(), shape, owner);
 }
 
-// A new array of the given shape, owning its memory.
-template <typename T> nb::ndarray<nb::numpy, T> make_array(std::initializer_list<size_t> shape)
+nb::object ok_mask(std::vector<uint8_t> &&ok)
 {
-    size_t size = 1;
-    for (const size_t n : shape) {
-        size *= n;
-    }
-    T *const data = new T[size]();
-    const nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(data, shape.size(), shape.begin(), owner);
+    const size_t n = ok.size();
+    return nb::cast(to_numpy<uint8_t>(std::move(ok), {n})).attr("astype")("bool");
 }
 
-template <typename T, typename Each> nb::ndarray<nb::numpy, T> frame_array(const sim::Scene &scene, const Each &each)
+int checked_frame(const Scene &scene, int frame)
 {
-    auto out = make_array<T>({scene.frames().size()});
-    for (size_t i = 0; i < scene.frames().size(); i++) {
-        out.data()[i] = each(scene.frames()[i]);
-    }
-    return out;
+    if (frame < 0 || frame >= scene.spec().motion.frames)
+        throw nb::index_error("no such frame");
+    return frame;
 }
 
-std::vector<double> numbers(nb::handle dict, const char *key)
+const FrameState &state(const Scene &scene, int frame)
 {
-    std::vector<double> out;
-    for (const nb::handle x : nb::borrow<nb::dict>(dict)[key]) {
-        out.push_back(nb::cast<double>(x));
-    }
-    return out;
+    return scene.frames()[static_cast<size_t>(checked_frame(scene, frame))];
 }
 
-sim::LensTable lens_of(nb::handle camera)
+// Applies map(frame, in, out) -> ok to each row of the points; rows where it fails are NaN.
+template <size_t In, size_t Out, typename Points, typename Map>
+nb::tuple map_points(int frame, const Points &points, const Map &map)
 {
-    const nb::object lens = nb::borrow<nb::dict>(camera)["lens"];
-    if (get<std::string>(lens, "kind") == "traced") {
-        return sim::trace_fisheye(get<double>(lens, "theta_max"), get<double>(lens, "circle_radius_px"),
-                                  get<double>(lens, "pupil_scale"));
-    }
-    return {numbers(lens, "theta"), numbers(lens, "radius_px"), numbers(lens, "pupil")};
-}
-
-sim::SurfaceConfig surface_of(nb::handle pipe, uint64_t seed)
-{
-    const nb::object surface = nb::borrow<nb::dict>(pipe)["surface"], joints = nb::borrow<nb::dict>(pipe)["joints"];
-    sim::SurfaceConfig out{get<std::string>(surface, "kind") == "concrete",
-                           get<double>(surface, "albedo"),
-                           get<double>(surface, "contrast"),
-                           {get<double>(joints, "spacing"), get<double>(joints, "first"), get<double>(joints, "width"),
-                            get<double>(joints, "darkness")},
-                           {},
-                           seed};
-    for (const nb::handle m : nb::borrow<nb::dict>(pipe)["markers"]) {
-        out.markers.push_back(
-            {get<double>(m, "s"), get<double>(m, "clock"), get<double>(m, "radius"), get<double>(m, "albedo")});
-    }
-    return out;
-}
-
-sim::SceneConfig config_of(const nb::dict &d)
-{
-    const nb::object pipe = d["pipe"], camera = d["camera"], light = d["light"], motion = d["motion"];
-    const nb::object encoder = d["encoder"], inclinometer = d["inclinometer"];
-    sim::SceneConfig c{};
-    c.seed = nb::cast<uint64_t>(d["seed"]);
-    c.radius = 0.5 * get<double>(pipe, "diameter");
-    for (const nb::handle r : nb::borrow<nb::dict>(pipe)["runs"]) {
-        c.runs.push_back({get<double>(r, "length"), get<double>(r, "bend_radius"), get<double>(r, "bend_clock")});
-    }
-    for (const nb::handle o : nb::borrow<nb::dict>(pipe)["ovals"]) {
-        c.ovals.push_back({get<double>(o, "from"), get<double>(o, "to"), get<double>(o, "ramp"),
-                           get<double>(o, "ratio"), get<double>(o, "clock")});
-    }
-    c.surface = surface_of(pipe, c.seed);
-    c.light = {get<std::string>(light, "kind") == "ring", get<int>(light, "lamps"), get<double>(light, "radius"),
-               get<double>(light, "rim_grey")};
-    c.camera = {get<int>(camera, "width"),         get<int>(camera, "height"),        get<double>(camera, "c_u"),
-                get<double>(camera, "c_v"),        get<double>(camera, "vignetting"), get<double>(camera, "blur"),
-                get<double>(camera, "read_noise"), get<double>(camera, "shot_noise"), get<double>(camera, "gamma")};
-    c.lens = lens_of(camera);
-    c.motion = {get<double>(motion, "start"),     get<double>(motion, "end"),     get<double>(motion, "speed"),
-                get<double>(motion, "ramp"),      get<double>(motion, "fps"),     get<double>(motion, "drop"),
-                get<double>(motion, "lookahead"), get<double>(motion, "lateral"), get<double>(motion, "roll"),
-                get<double>(motion, "pitch"),     get<double>(motion, "yaw")};
-    c.sensors = {get<double>(encoder, "metres_per_count"), get<double>(encoder, "scale_bias"),
-                 get<double>(encoder, "slip"), get<double>(inclinometer, "sigma")};
-    return c;
-}
-
-int check_frame(const sim::Scene &scene, int64_t frame)
-{
-    if (frame < 0 || frame >= static_cast<int64_t>(scene.frames().size())) {
-        throw nb::index_error(
-            ("frame " + std::to_string(frame) + " of " + std::to_string(scene.frames().size())).c_str());
-    }
-    return static_cast<int>(frame);
-}
-
-nb::object render(sim::Scene &scene, int64_t frame, int threads)
-{
-    const int index = check_frame(scene, frame);
-    auto out = make_array<uint8_t>(
-        {static_cast<size_t>(scene.config().camera.height), static_cast<size_t>(scene.config().camera.width)});
-    {
-        const nb::gil_scoped_release release;
-        scene.render(index, threads > 0 ? threads : static_cast<int>(std::thread::hardware_concurrency()), out.data());
-    }
-    return nb::cast(out);
-}
-
-// Applies `map(in, out) -> ok` to n points of `in_dim` coordinates; results are NaN where it fails.
-template <typename Map> nb::tuple map_points(size_t n, size_t in_dim, size_t out_dim, const double *in, const Map &map)
-{
-    auto out = make_array<double>({n, out_dim});
-    auto ok = make_array<bool>({n});
+    const size_t n = points.shape(0);
+    std::vector<double> out(Out * n, NAN);
+    std::vector<uint8_t> ok(n, 0);
     for (size_t i = 0; i < n; i++) {
-        double *const item = out.data() + i * out_dim;
-        ok.data()[i] = map(in + i * in_dim, item);
-        for (size_t k = 0; k < out_dim && !ok.data()[i]; k++) {
-            item[k] = std::numeric_limits<double>::quiet_NaN();
-        }
+        double item[Out];
+        ok[i] = map(frame, points.data() + In * i, item);
+        if (ok[i])
+            std::copy(item, item + Out, out.data() + Out * i);
     }
-    return nb::make_tuple(out, ok);
-}
-
-nb::object poses(const sim::Scene &scene)
-{
-    auto out = make_array<double>({scene.frames().size(), 3, 4});
-    for (size_t i = 0; i < scene.frames().size(); i++) {
-        const sim::FrameState &f = scene.frames()[i];
-        const Eigen::Matrix3d r = f.world_from_cam.transpose();
-        const Eigen::Vector3d t = -(r * f.centre);
-        for (int row = 0; row < 3; row++) {
-            for (int col = 0; col < 4; col++) {
-                out.data()[i * 12 + static_cast<size_t>(row * 4 + col)] = col < 3 ? r(row, col) : t(row);
-            }
-        }
-    }
-    return nb::cast(out);
-}
-
-nb::dict telemetry(const sim::Scene &scene)
-{
-    using F = sim::FrameState;
-    nb::dict out;
-    out["time_ns"] = frame_array<int64_t>(scene, [](const F &f) { return f.time_ns; });
-    out["s"] = frame_array<double>(scene, [](const F &f) { return f.s; });
-    out["arc"] = frame_array<double>(scene, [](const F &f) { return f.arc; });
-    out["roll"] = frame_array<double>(scene, [](const F &f) { return f.roll; });
-    out["pitch"] = frame_array<double>(scene, [](const F &f) { return f.pitch; });
-    out["encoder_count"] = frame_array<int64_t>(scene, [](const F &f) { return f.encoder_count; });
-    out["measured_roll"] = frame_array<double>(scene, [](const F &f) { return f.measured_roll; });
-    out["measured_pitch"] = frame_array<double>(scene, [](const F &f) { return f.measured_pitch; });
-    return out;
-}
-
-nb::object sections(const sim::Scene &scene, const Vector &s)
-{
-    auto out = make_array<double>({s.shape(0), 3});
-    for (size_t i = 0; i < s.shape(0); i++) {
-        const sim::Section sec = scene.tube().section(s.data()[i]);
-        const double e = std::hypot(sec.e_c, sec.e_s), clock = e > 0.0 ? 0.5 * std::atan2(sec.e_s, sec.e_c) : 0.0;
-        double *const item = out.data() + 3 * i;
-        item[0] = 2.0 * (sec.rho + e);
-        item[1] = 2.0 * (sec.rho - e);
-        item[2] = clock < 0.0 ? clock + std::numbers::pi : clock;
-    }
-    return nb::cast(out);
-}
-
-nb::tuple lens_table(const sim::Scene &scene)
-{
-    const sim::LensTable &table = scene.lens().table();
-    const auto copy = [](const std::vector<double> &v) {
-        auto out = make_array<double>({v.size()});
-        std::copy(v.begin(), v.end(), out.data());
-        return out;
-    };
-    return nb::make_tuple(copy(table.theta), copy(table.radius), copy(table.pupil));
+    return nb::make_tuple(to_numpy<double>(std::move(out), {n, Out}), ok_mask(std::move(ok)));
 }
 
 } // namespace
 
 void bind_sim(nb::module_ &m)
 {
-    nb::class_<sim::Scene>(m, "SimScene", "A simulated recording; see pipefish.simulate.Scene")
-        .def("__init__", [](sim::Scene *self, const nb::dict &config) { new (self) sim::Scene(config_of(config)); })
-        .def("render", &render, nb::arg("frame"), nb::arg("threads") = 0)
-        .def("poses", &poses)
-        .def("telemetry", &telemetry)
-        .def("sections", &sections, nb::arg("s"))
-        .def("lens_table", &lens_table)
-        .def("cast",
-             [](const sim::Scene &scene, int64_t frame, const Points2 &px) {
-                 const int index = check_frame(scene, frame);
-                 return map_points(px.shape(0), 2, 3, px.data(),
-                                   [&](const double *in, double *out) { return scene.cast(index, in, out); });
-             })
-        .def("project",
-             [](const sim::Scene &scene, int64_t frame, const Points3 &points) {
-                 const int index = check_frame(scene, frame);
-                 return map_points(points.shape(0), 3, 2, points.data(),
-                                   [&](const double *in, double *out) { return scene.project(index, in, out); });
-             })
-        .def("wall",
-             [](const sim::Scene &scene, const Points2 &s_clock) {
-                 return map_points(s_clock.shape(0), 2, 3, s_clock.data(), [&](const double *in, double *out) {
-                     Eigen::Map<Eigen::Vector3d>(out, 3) = scene.tube().wall(in[0], in[1]);
-                     return true;
-                 });
-             })
-        .def("locate", [](const sim::Scene &scene, const Points3 &points) {
-            return map_points(points.shape(0), 3, 3, points.data(), [&](const double *in, double *out) {
-                sim::WallPoint at{};
-                const bool ok = scene.tube().locate(Eigen::Map<const Eigen::Vector3d>(in), at);
-                out[0] = at.s;
-                out[1] = at.clock;
-                out[2] = at.distance;
-                return ok;
-            });
-        });
+    nb::class_<Scene>(m, "Scene", "A simulated pipe with a camera driving through it; docs/simulator.md.")
+        .def(
+            "__init__",
+            [](Scene *self, const nb::dict &source) {
+                const SceneSpec spec = read_scene(source);
+                try {
+                    new (self) Scene(spec);
+                } catch (const std::invalid_argument &error) { // what only the lens knows; the rest is checked above
+                    Reader::fail("lens", error.what());
+                }
+            },
+            nb::arg("scene"))
+        .def_prop_ro("spec",
+                     [](const Scene &s) {
+                         SceneSpec spec = s.spec();
+                         Writer writer;
+                         fields(writer, spec);
+                         return writer.out;
+                     })
+        .def(
+            "render",
+            [](Scene &s, int frame, int threads) {
+                checked_frame(s, frame);
+                const size_t height = static_cast<size_t>(s.spec().lens.height);
+                const size_t width = static_cast<size_t>(s.spec().lens.width);
+                std::vector<uint8_t> image(height * width);
+                {
+                    nb::gil_scoped_release release;
+                    s.render(frame, threads, image.data());
+                }
+                return to_numpy<uint8_t>(std::move(image), {height, width});
+            },
+            nb::arg("frame"), nb::arg("threads"), "(height, width) uint8.")
+        .def(
+            "pose",
+            [](const Scene &s, int frame) {
+                const FrameState &f = state(s, frame);
+                const Eigen::Matrix3d rotation = f.world_from_cam.transpose();
+                Eigen::Matrix<double, 3, 4, Eigen::RowMajor> out;
+                out << rotation, -rotation * f.centre;
+                return out;
+            },
+            nb::arg("frame"), "cam_from_world, (3, 4).")
+        .def(
+            "arc_length", [](const Scene &s, int frame) { return state(s, frame).s; }, nb::arg("frame"),
+            "Of the camera's place along the pipe, metres.")
+        .def(
+            "driven", [](const Scene &s, int frame) { return state(s, frame).arc; }, nb::arg("frame"),
+            "What the crawler has driven since frame 0, metres.")
+        .def(
+            "telemetry",
+            [](const Scene &s, int frame) {
+                const FrameState &f = state(s, frame);
+                return std::make_tuple(f.time_ns, f.encoder_count, f.measured_roll, f.measured_pitch);
+            },
+            nb::arg("frame"), "(time_ns, encoder_count, roll, pitch) as the sensors say.")
+        .def(
+            "cast",
+            [](const Scene &s, int frame, const Points2 &px) {
+                return map_points<2, 3>(checked_frame(s, frame), px,
+                                        [&s](int f, const double *in, double *out) { return s.cast(f, in, out); });
+            },
+            nb::arg("frame"), nb::arg("px"), "(N, 2) pixels -> wall points (N, 3) in metres, ok (N,).")
+        .def(
+            "project",
+            [](const Scene &s, int frame, const Points3 &points) {
+                return map_points<3, 2>(checked_frame(s, frame), points,
+                                        [&s](int f, const double *in, double *out) { return s.project(f, in, out); });
+            },
+            nb::arg("frame"), nb::arg("points"), "World points (N, 3) -> pixels (N, 2), ok (N,).")
+        .def(
+            "locate",
+            [](const Scene &s, const Points3 &points) {
+                return map_points<3, 3>(0, points, [&s](int, const double *in, double *out) {
+                    WallPoint at{};
+                    const bool ok = s.tube().locate(Eigen::Map<const Eigen::Vector3d>(in), at);
+                    out[0] = at.s;
+                    out[1] = at.distance;
+                    out[2] = at.clock;
+                    return ok;
+                });
+            },
+            nb::arg("points"),
+            "World points (N, 3) -> arc length, distance from the axis, clock angle (N, 3), ok (N,).")
+        .def(
+            "wall", [](const Scene &s, double at, double phi) { return s.tube().wall(at, phi); }, nb::arg("s"),
+            nb::arg("phi"), "The wall point at arc length s and clock angle phi, (3,).")
+        .def(
+            "section",
+            [](const Scene &s, double at) {
+                const Section x = s.tube().section(at);
+                const double e = std::hypot(x.e_c, x.e_s), clock = e > 0 ? 0.5 * std::atan2(x.e_s, x.e_c) : 0.0;
+                return std::make_tuple(2 * (x.rho + e), 2 * (x.rho - e), clock < 0 ? clock + M_PI : clock);
+            },
+            nb::arg("s"), "(D_max, D_min, clock angle of D_max in [0, pi)) at arc length s.")
+        .def(
+            "lens",
+            [](const Scene &s, double theta) { return std::make_pair(s.lens().radius(theta), s.lens().pupil(theta)); },
+            nb::arg("theta"), "(image radius in pixels, pupil shift in metres) of a field angle.")
+        .def_prop_ro(
+            "lens_nodes", [](const Scene &s) { return s.lens().table().theta; }, "The table's angles.")
+        .def_prop_ro("circle_radius", [](const Scene &s) { return s.lens().circle_radius(); })
+        .def_prop_ro("length", [](const Scene &s) { return s.tube().length(); });
 }

@@ -10,6 +10,20 @@
 namespace pipefish::sim
 {
 
+struct LensNode {
+    double theta = 0.0, radius_px = 0.0, pupil_m = 0.0;
+};
+
+struct LensSpec {
+    int width = 1280, height = 800;  // pixels
+    double c_u = 643.2, c_v = 397.6; // principal point = centre of the image circle
+    double theta_max = 1.6144;       // radians: the field's edge, 92.5 degrees
+    double circle_radius = 395.0;    // pixels, at theta_max
+    double pupil_scale = 1.0;        // size of the traced lens; 0 = a central camera
+    double vignetting = 0.25;        // share of the light lost at the edge, grows with theta^4
+    std::vector<LensNode> table;     // if not empty: the lens, instead of the traced one
+};
+
 struct LensTable {
     std::vector<double>
         theta; // radians, starts at 0, increasing, below pi; at least 4 nodes; the last is the field's edge

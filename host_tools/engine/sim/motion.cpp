@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
-#include <stdexcept>
 
 namespace pipefish::sim
 {
@@ -15,33 +14,21 @@ namespace pipefish::sim
 namespace
 {
 
-// Unit variance: three waves of 0.35 to 2.5 m with random phases.
+// Within -1..1: three waves of the distance with random phases.
 double wobble(uint64_t seed, uint64_t axis, double distance)
 {
-    constexpr double SHORTEST[] = {1.2, 0.6, 0.35}, LONGEST[] = {2.5, 1.2, 0.6}, WEIGHT[] = {0.80, 0.50, 0.33};
+    constexpr double WAVES[] = {1.7, 0.61, 0.23}, WEIGHTS[] = {0.55, 0.3, 0.15}; // metres
     double sum = 0.0;
     for (uint64_t k = 0; k < 3; k++) {
-        const double phase = uniform_of(hash64(seed, STREAM_WOBBLE, axis, 2 * k));
-        const double draw = uniform_of(hash64(seed, STREAM_WOBBLE, axis, 2 * k + 1));
-        const double wavelength = SHORTEST[k] + (LONGEST[k] - SHORTEST[k]) * draw;
-        sum += WEIGHT[k] * std::sqrt(2.0) * std::sin(2.0 * std::numbers::pi * (phase + distance / wavelength));
+        const double phase = uniform_of(hash64(seed, STREAM_WOBBLE, axis, k));
+        sum += WEIGHTS[k] * std::sin(2.0 * std::numbers::pi * (phase + distance / WAVES[k]));
     }
     return sum;
 }
 
-// Distance driven `t` seconds after the start.
-double distance_at(const MotionConfig &m, double length, double peak, double t)
+double distance_at(const MotionSpec &spec, double t)
 {
-    const double ramp = m.ramp * peak / m.speed; // a drive too short for the full speed turns round half-way
-    const double total = length / peak + ramp, rate = ramp > 0.0 ? peak / ramp : 0.0;
-    if (t < ramp) {
-        return 0.5 * rate * t * t;
-    }
-    if (t > total - ramp) {
-        const double left = std::max(0.0, total - t);
-        return length - 0.5 * rate * left * left;
-    }
-    return peak * (t - 0.5 * ramp);
+    return t < spec.ramp ? 0.5 * spec.speed * t * t / spec.ramp : spec.speed * (t - 0.5 * spec.ramp);
 }
 
 Eigen::Vector3d nominal(const Tube &tube, double drop, double s)
@@ -59,55 +46,47 @@ void attitude(const Eigen::Matrix3d &world_from_cam, double &roll, double &pitch
     pitch = std::asin(std::clamp(-down.z(), -1.0, 1.0));
 }
 
-std::vector<FrameState> drive(const Tube &tube, const MotionConfig &motion, const SensorConfig &sensors, uint64_t seed)
+std::vector<FrameState> drive(const Tube &tube, const MotionSpec &spec)
 {
-    constexpr int ARC_STEPS = 8;       // chords a frame: 1e-8 relative in a 3 D bend at 10 mm a frame
-    constexpr double SLIP_OVER = 0.05; // metres that `slip` refers to
-    const double length = motion.end - motion.start;
-    const double peak =
-        motion.ramp > 0.0 ? std::min(motion.speed, std::sqrt(length * motion.speed / motion.ramp)) : motion.speed;
-    const double total = length / peak + motion.ramp * peak / motion.speed;
-    if (!(length > 0.0) || !(total * motion.fps < 1e7)) {
-        throw std::invalid_argument("a drive must go forward and have fewer than ten million frames");
-    }
+    constexpr int ARC_STEPS = 8; // chords a frame: 1e-8 relative in a 3 D bend at 10 mm a frame
     std::vector<FrameState> frames;
-    double arc = 0.0, slip = 0.0, previous = motion.start;
-    const int count = static_cast<int>(std::floor(total * motion.fps + 1e-9)) + 1;
-    for (int i = 0; i < count; i++) {
+    double arc = 0.0, slip = 0.0, previous = spec.start;
+    for (int i = 0; i < spec.frames; i++) {
         FrameState f{};
-        const double t = i / motion.fps, d = distance_at(motion, length, peak, t);
+        const double t = i / spec.frame_rate, d = distance_at(spec, t);
         f.time_ns = std::llround(t * 1e9);
-        f.s = motion.start + d;
+        f.s = spec.start + d;
         const double arc_before = arc;
-        for (int k = 0; k < ARC_STEPS && i > 0; k++) {
-            const double a = previous + (f.s - previous) * k / ARC_STEPS,
-                         b = previous + (f.s - previous) * (k + 1) / ARC_STEPS;
-            arc += (nominal(tube, motion.drop, b) - nominal(tube, motion.drop, a)).norm();
+        for (int k = 0; k < ARC_STEPS; k++) {
+            const double a = previous + (f.s - previous) * k / ARC_STEPS;
+            const double b = previous + (f.s - previous) * (k + 1) / ARC_STEPS;
+            arc += (nominal(tube, spec.below_axis, b) - nominal(tube, spec.below_axis, a)).norm();
         }
         previous = f.s;
         f.arc = arc;
 
-        const Eigen::Vector3d here = nominal(tube, motion.drop, f.s);
+        const Eigen::Vector3d here = nominal(tube, spec.below_axis, f.s);
         const Eigen::Matrix3d section = tube.frame(f.s).world_from_frame;
-        const Eigen::Vector3d z = (nominal(tube, motion.drop, f.s + motion.lookahead) - here).normalized();
+        const Eigen::Vector3d z = (nominal(tube, spec.below_axis, f.s + spec.lookahead) - here).normalized();
         const Eigen::Vector3d y = z.cross(section.col(0)).normalized();
         Eigen::Matrix3d look;
         look << y.cross(z), y, z;
-        const auto turn = [&](uint64_t axis, double sigma, const Eigen::Vector3d &about) {
-            return Eigen::AngleAxisd(sigma * wobble(seed, axis, d), about).toRotationMatrix();
+        const auto turn = [&](uint64_t axis, double most, const Eigen::Vector3d &about) {
+            return Eigen::AngleAxisd(most * wobble(spec.seed, axis, d), about).toRotationMatrix();
         };
-        f.world_from_cam = look * turn(0, motion.yaw, Eigen::Vector3d::UnitY()) *
-                           turn(1, motion.pitch, Eigen::Vector3d::UnitX()) *
-                           turn(2, motion.roll, Eigen::Vector3d::UnitZ());
-        f.centre = here + motion.lateral * (wobble(seed, 3, d) * section.col(0) + wobble(seed, 4, d) * section.col(1));
+        f.world_from_cam = look * turn(0, spec.wobble_rad, Eigen::Vector3d::UnitY()) *
+                           turn(1, spec.wobble_rad, Eigen::Vector3d::UnitX()) *
+                           turn(2, 2.0 * spec.wobble_rad, Eigen::Vector3d::UnitZ());
+        f.centre = here + spec.wobble_m * (wobble(spec.seed, 3, d) * section.col(0) +
+                                           wobble(spec.seed, 4, d) / 3.0 * section.col(1));
 
-        attitude(f.world_from_cam, f.roll, f.pitch);
         const uint64_t n = static_cast<uint64_t>(i);
-        slip += sensors.slip * std::sqrt((arc - arc_before) / SLIP_OVER) * normal(seed, STREAM_SLIP, n);
+        attitude(f.world_from_cam, f.roll, f.pitch);
+        f.measured_roll = f.roll + spec.attitude_sigma * normal(spec.seed, STREAM_ROLL, n);
+        f.measured_pitch = f.pitch + spec.attitude_sigma * normal(spec.seed, STREAM_PITCH, n);
+        slip += spec.encoder_slip * std::sqrt(arc - arc_before) * normal(spec.seed, STREAM_SLIP, n);
         f.encoder_count =
-            static_cast<int64_t>(std::floor((arc * (1.0 + sensors.scale_bias) + slip) / sensors.metres_per_count));
-        f.measured_roll = f.roll + sensors.attitude_sigma * normal(seed, STREAM_ROLL, n);
-        f.measured_pitch = f.pitch + sensors.attitude_sigma * normal(seed, STREAM_PITCH, n);
+            static_cast<int64_t>(std::floor((arc * (1.0 + spec.encoder_bias) + slip) / spec.metres_per_count));
         frames.push_back(f);
     }
     return frames;

@@ -1,8 +1,8 @@
 // The crawler: where the camera is in every frame, and what the wheel encoder and the inclinometer say about it.
 //
-// The crawler drives along the centreline at constant speed with a ramp at both ends. The camera sits `drop` below the
-// centreline and looks at where it will be `lookahead` further on, so in a bend it lags the tangent as a rigid vehicle
-// does. Wobble is a smooth function of the distance driven: it stops when the crawler stops.
+// The crawler drives along the centreline at constant speed after a ramp. The camera sits below the centreline and
+// looks at where it will be `lookahead` further on, so in a bend it turns ahead of the tangent as a vehicle with a
+// front axle does. Wobble is a smooth function of the distance driven.
 #pragma once
 
 #include "sim/tube.hpp"
@@ -13,20 +13,20 @@
 namespace pipefish::sim
 {
 
-struct MotionConfig {
-    double start, end;  // metres along the centreline, start < end
-    double speed, ramp; // m/s; seconds from standstill to speed, and back
-    double fps;
-    double drop, lookahead;  // metres
-    double lateral;          // metres, standard deviation of the sideways and of the vertical wobble
-    double roll, pitch, yaw; // radians, standard deviations of the angular wobble
-};
-
-struct SensorConfig {
-    double metres_per_count; // > 0
-    double scale_bias;       // the encoder counts (1 + bias) times the distance
-    double slip;             // metres, standard deviation of the encoder's random walk over 5 cm
-    double attitude_sigma;   // radians, of the inclinometer's roll and pitch
+struct MotionSpec {
+    uint64_t seed = 1; // of wobble, slip and the sensors' noise
+    int frames = 600;
+    double frame_rate = 20.0;         // a second
+    double start = 0.3;               // metres along the centreline, at frame 0
+    double speed = 0.2, ramp = 1.0;   // m/s; seconds from standstill to speed
+    double below_axis = 0.012;        // metres, camera under the centreline
+    double lookahead = 0.15;          // metres
+    double wobble_m = 0.003;          // largest sideways sway; a third of it up and down
+    double wobble_rad = 0.012;        // largest yaw and pitch; roll twice as much
+    double metres_per_count = 0.0005; // of the encoder
+    double encoder_bias = 0.004;      // it counts (1 + bias) times the distance
+    double encoder_slip = 0.00224;    // its random walk, metres per square root of a metre (0.5 mm in 50 mm)
+    double attitude_sigma = 0.0035;   // radians, of the inclinometer's roll and pitch
 };
 
 struct FrameState {
@@ -42,7 +42,7 @@ struct FrameState {
 // Roll (clockwise seen along the view, in (-pi, pi]) and pitch (axis above the horizontal) from gravity = world +y.
 void attitude(const Eigen::Matrix3d &world_from_cam, double &roll, double &pitch);
 
-// All frames of the drive. Throws std::invalid_argument for a drive that has no frame.
-std::vector<FrameState> drive(const Tube &tube, const MotionConfig &motion, const SensorConfig &sensors, uint64_t seed);
+// All frames of the drive.
+std::vector<FrameState> drive(const Tube &tube, const MotionSpec &spec);
 
 } // namespace pipefish::sim

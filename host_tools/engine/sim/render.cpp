@@ -25,8 +25,8 @@ struct RowLight {
     explicit RowLight(size_t n) : x(n), y(n), z(n), nx(n), ny(n), nz(n), sum(n, 0.0f) {}
 };
 
-// Adds a small isotropic lamp at (lx, ly, 0): Lambert's cosine over the squared distance.
-void add_lamp(RowLight &row, float lx, float ly)
+// Adds a small lamp at (lx, ly, 0): its intensity towards the wall point, Lambert's cosine, over the squared distance.
+void add_lamp(RowLight &row, float lx, float ly, float side, float forward)
 {
     const size_t n = row.sum.size();
     const float *const x = row.x.data(), *const y = row.y.data(), *const z = row.z.data();
@@ -34,9 +34,9 @@ void add_lamp(RowLight &row, float lx, float ly)
     float *const sum = row.sum.data();
     for (size_t i = 0; i < n; i++) {
         const float dx = lx - x[i], dy = ly - y[i], dz = -z[i];
-        const float d2 = dx * dx + dy * dy + dz * dz;
+        const float d2 = dx * dx + dy * dy + dz * dz, ahead = std::max(z[i], 0.0f);
         const float along = dx * nx[i] + dy * ny[i] + dz * nz[i];
-        sum[i] += std::max(along, 0.0f) / (d2 * std::sqrt(d2));
+        sum[i] += (side + forward * ahead * ahead / d2) * std::max(along, 0.0f) / (d2 * std::sqrt(d2));
     }
 }
 
@@ -63,16 +63,19 @@ float pixel_noise(uint32_t pixel, uint32_t key_a, uint32_t key_b)
 void Scene::render(int frame, int threads, uint8_t *out)
 {
     const std::lock_guard<std::mutex> guard(rendering_);
+    if (!buffers_) {
+        prepare();
+    }
     const FrameState &f = frames_[static_cast<size_t>(frame)];
-    const int bands = (config_.camera.height + BAND - 1) / BAND;
+    const int bands = (spec_.lens.height + BAND - 1) / BAND;
     const auto each_row = [&](const auto &body) {
         parallel_for(bands, threads, [&](int band) {
-            for (int y = band * BAND; y < std::min(config_.camera.height, (band + 1) * BAND); y++) {
+            for (int y = band * BAND; y < std::min(spec_.lens.height, (band + 1) * BAND); y++) {
                 body(y);
             }
         });
     };
-    surface_.prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
+    surface_->prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
     const Tube::View view(tube_, f.world_from_cam, f.centre);
     each_row([&](int y) { cast_row(view, y, *buffers_); });
     each_row([&](int y) { shade_row(y, *buffers_); });
@@ -83,9 +86,9 @@ void Scene::cast_row(const Tube::View &view, int row, Buffers &buffers) const
 {
     const size_t first = row_offset_[static_cast<size_t>(row)];
     const size_t n = static_cast<size_t>(row_to_[static_cast<size_t>(row)] - row_from_[static_cast<size_t>(row)]);
-    const double texels_a_metre = 1.0 / surface_.texel(), base = surface_.base();
-    const double texels_a_radian = surface_.around() / (2.0 * std::numbers::pi);
-    const LightConfig &light = config_.light;
+    const double texels_a_metre = 1.0 / surface_->texel(), base = surface_->base();
+    const double texels_a_radian = surface_->around() / (2.0 * std::numbers::pi);
+    const LampSpec &lamp = spec_.lamp;
     RowLight lit(n);
     for (size_t i = 0; i < n; i++) {
         const PixelRay &r = rays_[first + i];
@@ -105,20 +108,14 @@ void Scene::cast_row(const Tube::View &view, int row, Buffers &buffers) const
         lit.ny[i] = static_cast<float>(hit.normal.y());
         lit.nz[i] = static_cast<float>(hit.normal.z());
     }
-    if (light.ring) {
-        for (int k = 0; k < light.lamps; k++) {
-            const double angle = 2.0 * std::numbers::pi * k / light.lamps;
-            add_lamp(lit, static_cast<float>(light.radius * std::sin(angle)),
-                     static_cast<float>(-light.radius * std::cos(angle)));
-        }
-    } else {
-        for (size_t i = 0; i < n; i++) {
-            const bool hit = lit.nx[i] != 0.0f || lit.ny[i] != 0.0f || lit.nz[i] != 0.0f;
-            lit.sum[i] = hit ? static_cast<float>(light.lamps / (config_.radius * config_.radius)) : 0.0f;
-        }
+    for (int k = 0; k < lamp.lamps; k++) {
+        const double angle = 2.0 * std::numbers::pi * k / lamp.lamps;
+        add_lamp(lit, static_cast<float>(lamp.ring_radius * std::sin(angle)),
+                 static_cast<float>(-lamp.ring_radius * std::cos(angle)), static_cast<float>(lamp.side),
+                 static_cast<float>(lamp.forward));
     }
-    const float exposure =
-        static_cast<float>(light.rim_grey * config_.radius * config_.radius / config_.surface.albedo / light.lamps);
+    const double radius = 0.5 * spec_.diameter;
+    const float exposure = static_cast<float>(lamp.exposure * radius * radius / lamp.lamps);
     for (size_t i = 0; i < n; i++) {
         buffers.light[first + i] = exposure * lit.sum[i] * vignette_[first + i];
     }
@@ -126,8 +123,8 @@ void Scene::cast_row(const Tube::View &view, int row, Buffers &buffers) const
 
 void Scene::shade_row(int row, Buffers &buffers) const
 {
-    const int width = config_.camera.width, height = config_.camera.height;
-    const float around = static_cast<float>(surface_.around());
+    const int width = spec_.lens.width, height = spec_.lens.height;
+    const float around = static_cast<float>(surface_->around());
     std::vector<float> line(static_cast<size_t>(width), 0.0f);
     // Index of the lit pixel (x, y), or of (x, row) itself where (x, y) is dark.
     const auto lit_or = [&](int x, int y, size_t own) {
@@ -155,7 +152,7 @@ void Scene::shade_row(int row, Buffers &buffers) const
         spread(below, above, static_cast<float>((below != own) + (above != own)), along, across);
         line[static_cast<size_t>(x)] =
             buffers.light[own] *
-            surface_.sample(buffers.texel_row[own], buffers.texel_column[own], std::sqrt(along), std::sqrt(across));
+            surface_->sample(buffers.texel_row[own], buffers.texel_column[own], std::sqrt(along), std::sqrt(across));
     }
     const int reach = static_cast<int>(blur_.size()) - 1;
     float *const out = buffers.image.data() + at * static_cast<size_t>(width);
@@ -173,11 +170,11 @@ void Scene::shade_row(int row, Buffers &buffers) const
 
 void Scene::develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const
 {
-    const CameraConfig &camera = config_.camera;
-    const int width = camera.width, reach = static_cast<int>(blur_.size()) - 1;
+    const SensorSpec &sensor = spec_.sensor;
+    const int width = spec_.lens.width, height = spec_.lens.height, reach = static_cast<int>(blur_.size()) - 1;
     std::vector<float> line(static_cast<size_t>(width), 0.0f);
     for (int k = -reach; k <= reach; k++) {
-        if (row + k < 0 || row + k >= camera.height) {
+        if (row + k < 0 || row + k >= height) {
             continue;
         }
         const float weight = blur_[static_cast<size_t>(std::abs(k))];
@@ -186,21 +183,17 @@ void Scene::develop_row(int frame, int row, const Buffers &buffers, uint8_t *out
             line[static_cast<size_t>(x)] += weight * in[x];
         }
     }
-    const uint64_t key = hash64(config_.seed, STREAM_PIXEL, static_cast<uint64_t>(frame));
+    const uint64_t key = hash64(sensor.seed, STREAM_PIXEL, static_cast<uint64_t>(frame));
     const uint32_t key_a = static_cast<uint32_t>(key), key_b = static_cast<uint32_t>(key >> 32);
-    const float read = static_cast<float>(camera.read_noise * camera.read_noise),
-                shot = static_cast<float>(camera.shot_noise);
+    const float read = static_cast<float>(sensor.read_noise * sensor.read_noise),
+                shot = static_cast<float>(sensor.shot_noise);
     const uint32_t first = static_cast<uint32_t>(row) * static_cast<uint32_t>(width);
     uint8_t *const pixels = out + first;
-    constexpr float TOP = 255.0f * RESPONSE_STEPS;
     for (int x = 0; x < width; x++) {
         const float signal = line[static_cast<size_t>(x)];
         const float noise = pixel_noise(first + static_cast<uint32_t>(x), key_a, key_b);
-        line[static_cast<size_t>(x)] =
-            std::min(std::max((signal + std::sqrt(read + shot * signal) * noise) * RESPONSE_STEPS, 0.0f), TOP);
-    }
-    for (int x = 0; x < width; x++) {
-        pixels[x] = response_[static_cast<size_t>(line[static_cast<size_t>(x)] + 0.5f)];
+        const float grey = signal + std::sqrt(read + shot * signal) * noise + 0.5f;
+        pixels[x] = static_cast<uint8_t>(std::min(std::max(grey, 0.0f), 255.0f));
     }
 }
 

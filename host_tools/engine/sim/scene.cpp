@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
-#include <stdexcept>
 
 namespace pipefish::sim
 {
@@ -25,54 +24,54 @@ int texels_around(const Lens &lens)
     return around;
 }
 
-const SceneConfig &checked(const SceneConfig &c)
+LensTable lens_table(const LensSpec &spec)
 {
-    const auto require = [](bool holds, const char *what) {
-        if (!holds) {
-            throw std::invalid_argument(what);
-        }
-    };
-    require(c.radius > 0.0 && c.radius <= 10.0, "the pipe's radius must be above 0 and at most 10 metres");
-    require(c.camera.width >= 16 && c.camera.width <= 16384 && c.camera.height >= 16 && c.camera.height <= 16384,
-            "the image must be 16 to 16384 pixels wide and high");
-    require(c.camera.blur >= 0.0 && c.camera.blur <= 10.0, "the blur must be 0 to 10 pixels");
-    require(c.camera.gamma >= 0.2 && c.camera.gamma <= 5.0, "gamma must be 0.2 to 5");
-    require(c.light.lamps >= 1 && c.light.lamps <= 64, "a ring has 1 to 64 lamps");
-    require(c.light.radius >= 0.0 && c.light.radius <= 0.5 * c.radius,
-            "the lamp ring must be at most half the pipe wide");
-    require(c.motion.drop >= -0.5 * c.radius && c.motion.drop <= 0.5 * c.radius && c.motion.lateral <= 0.05 * c.radius,
-            "the camera's drop must stay within half, its wobble within a twentieth of the pipe's radius");
-    require(c.motion.speed > 0.0 && c.motion.fps > 0.0 && c.motion.ramp >= 0.0 && c.motion.lookahead > 0.0,
-            "speed, frame rate and look-ahead must be positive, the ramp not negative");
-    require(c.sensors.metres_per_count > 0.0, "metres per count must be positive");
-    return c;
+    if (spec.table.empty()) {
+        return trace_fisheye(spec.theta_max, spec.circle_radius, spec.pupil_scale);
+    }
+    LensTable table;
+    for (const LensNode &node : spec.table) {
+        table.theta.push_back(node.theta);
+        table.radius.push_back(node.radius_px);
+        table.pupil.push_back(node.pupil_m);
+    }
+    return table;
 }
 
 } // namespace
 
-// Ahead as far as the lamp lights the wall to a tenth of a grey level: the light falls with (radius / distance)^3.
-Scene::Reach Scene::lit_reach(const SceneConfig &config)
+// Ahead as far as the lamps light the wall to a tenth of a grey level: the light falls with (radius / distance)^3.
+Scene::Reach Scene::lit_reach(const SceneSpec &spec)
 {
-    return {2.0 * config.radius, 1.2 * config.radius * std::cbrt(std::max(config.light.rim_grey, 1.0) / 0.1)};
+    const double brightest =
+        spec.lamp.exposure * (spec.lamp.side + spec.lamp.forward) * static_cast<double>(Surface::MEAN);
+    const double radii = std::clamp(std::cbrt(brightest / 0.1), 4.0, 30.0);
+    return {spec.diameter, 0.5 * spec.diameter * radii};
 }
 
-Scene::Scene(const SceneConfig &config)
-    : config_(checked(config)), tube_(config.radius, config.runs, config.ovals), lens_(config.lens),
-      frames_(drive(tube_, config.motion, config.sensors, config.seed)), reach_(lit_reach(config)),
-      surface_(config.surface, config.radius, texels_around(lens_), reach_.behind + reach_.ahead)
+Scene::Scene(const SceneSpec &spec)
+    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(lens_table(spec.lens)),
+      frames_(drive(tube_, spec.motion)), reach_(lit_reach(spec))
 {
-    make_pixel_table();
-    make_blur_kernel();
-    make_response();
-    buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(config_.camera.width) *
-                                                           static_cast<size_t>(config_.camera.height));
+    spec_.lens.theta_max = lens_.theta_max();
+    spec_.lens.circle_radius = lens_.circle_radius();
 }
 
 Scene::~Scene() = default;
 
+void Scene::prepare()
+{
+    surface_.emplace(spec_.texture, spec_.markers, 0.5 * spec_.diameter, texels_around(lens_),
+                     reach_.behind + reach_.ahead);
+    make_pixel_table();
+    make_blur_kernel();
+    buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width) *
+                                                           static_cast<size_t>(spec_.lens.height));
+}
+
 void Scene::make_pixel_table()
 {
-    const CameraConfig &camera = config_.camera;
+    const LensSpec &camera = spec_.lens;
     for (int y = 0; y < camera.height; y++) {
         row_offset_.push_back(rays_.size());
         int from = camera.width, to = 0;
@@ -91,14 +90,11 @@ void Scene::make_pixel_table()
         row_from_.push_back(std::min(from, to));
         row_to_.push_back(to);
     }
-    if (rays_.empty()) {
-        throw std::invalid_argument("the image circle does not touch the image");
-    }
 }
 
 void Scene::make_blur_kernel()
 {
-    const double sigma = config_.camera.blur;
+    const double sigma = spec_.sensor.blur_px;
     const int reach = static_cast<int>(std::ceil(3.5 * sigma));
     double sum = 0.0;
     for (int k = -reach; k <= reach; k++) {
@@ -109,24 +105,14 @@ void Scene::make_blur_kernel()
     }
 }
 
-void Scene::make_response()
-{
-    for (int i = 0; i <= 255 * RESPONSE_STEPS; i++) {
-        const double encoded =
-            255.0 * std::pow(static_cast<double>(i) / (255.0 * RESPONSE_STEPS), 1.0 / config_.camera.gamma);
-        response_.push_back(static_cast<uint8_t>(std::lround(encoded)));
-    }
-}
-
 bool Scene::on_sensor(const double px[2]) const
 {
-    return px[0] >= -0.5 && px[1] >= -0.5 && px[0] <= config_.camera.width - 0.5 &&
-           px[1] <= config_.camera.height - 0.5;
+    return px[0] >= -0.5 && px[1] >= -0.5 && px[0] <= spec_.lens.width - 0.5 && px[1] <= spec_.lens.height - 0.5;
 }
 
 bool Scene::ray(const double px[2], PixelRay &ray) const
 {
-    const double u = px[0] - config_.camera.c_u, v = px[1] - config_.camera.c_v, r = std::hypot(u, v);
+    const double u = px[0] - spec_.lens.c_u, v = px[1] - spec_.lens.c_v, r = std::hypot(u, v);
     double theta = 0.0;
     if (!on_sensor(px) || !lens_.theta_of_radius(r, theta)) {
         return false;
@@ -160,7 +146,7 @@ bool Scene::project(int frame, const double world[3], double px[2]) const
         return false;
     }
     const double scale = rho > 0.0 ? lens_.radius(theta) / rho : 0.0;
-    const double found[2] = {config_.camera.c_u + scale * p.x(), config_.camera.c_v + scale * p.y()};
+    const double found[2] = {spec_.lens.c_u + scale * p.x(), spec_.lens.c_v + scale * p.y()};
     if (!on_sensor(found)) {
         return false;
     }

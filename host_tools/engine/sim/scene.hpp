@@ -1,5 +1,5 @@
 // A scene: everything that the simulator needs for a recording, and the recording itself. Frames are pure functions of
-// the configuration: any order, any number of threads, the same bits.
+// the description: any order, any number of threads, the same bits.
 #pragma once
 
 #include "sim/lens.hpp"
@@ -9,49 +9,49 @@
 
 #include <memory>
 #include <mutex>
+#include <optional>
 
 namespace pipefish::sim
 {
 
-struct CameraConfig {
-    int width, height; // pixels
-    double c_u, c_v;   // principal point = centre of the image circle
-    double vignetting; // share of the light lost at the edge of the field, grows with theta^4
-    double blur;       // pixels, standard deviation of the optics' Gaussian blur; 0 = none
-    double read_noise; // grey levels, standard deviation
-    double shot_noise; // variance a grey level of signal
-    double gamma;      // encoded = 255 (linear / 255)^(1 / gamma)
+// A ring of small lamps around the lens, in the plane of the camera centre. Each shines with the intensity
+// side + forward cos^2 a at the angle a from the optical axis, and with `side` alone behind it; the ring's mean counts.
+struct LampSpec {
+    int lamps = 8;
+    double ring_radius = 0.03; // metres; 0 = one lamp at the camera centre
+    double side = 0.12, forward = 1.0;
+    double exposure =
+        1150.0; // linear grey level of a white wall, square to a lamp of unit intensity at the pipe's radius
 };
 
-struct LightConfig {
-    bool ring;       // false: even light from everywhere, for tests of geometry
-    int lamps;       // of the ring, 1..64
-    double radius;   // of the ring around the optical axis, metres; 0 = one lamp at the camera centre
-    double rim_grey; // exposure: linear grey level of the mean albedo, lit squarely by one lamp of the ring's power at
-                     // the distance of the pipe's radius
+struct SensorSpec {
+    uint64_t seed = 1;
+    double blur_px = 0.55;     // pixels, standard deviation of the optics' Gaussian blur
+    double read_noise = 1.2;   // grey levels, standard deviation
+    double shot_noise = 0.025; // variance a grey level of signal
 };
 
-struct SceneConfig {
-    uint64_t seed;
-    double radius; // of the pipe, metres
-    std::vector<Run> runs;
+struct SceneSpec {
+    double diameter = 0.3; // metres
+    std::vector<Piece> pieces;
     std::vector<OvalStretch> ovals;
-    SurfaceConfig surface;
-    LightConfig light;
-    CameraConfig camera;
-    LensTable lens;
-    MotionConfig motion;
-    SensorConfig sensors;
+    std::vector<Marker> markers;
+    TextureSpec texture;
+    LensSpec lens;
+    LampSpec lamp;
+    SensorSpec sensor;
+    MotionSpec motion;
 };
 
 class Scene
 {
 public:
-    // Throws std::invalid_argument saying what is wrong with the configuration.
-    explicit Scene(const SceneConfig &config);
+    // Ranges are checked where the description is read (bind/sim.cpp). Throws std::invalid_argument for what only the
+    // parts know: a lens table that does not rise, a bend that meets itself.
+    explicit Scene(const SceneSpec &spec);
     ~Scene();
 
-    const SceneConfig &config() const { return config_; }
+    const SceneSpec &spec() const { return spec_; }
     const Tube &tube() const { return tube_; }
     const Lens &lens() const { return lens_; }
     const std::vector<FrameState> &frames() const { return frames_; }
@@ -72,30 +72,27 @@ private:
     struct Reach {
         double behind, ahead; // metres of wall that the surface is made for, around the camera
     };
-    static constexpr int RESPONSE_STEPS = 64; // a grey level
-
-    static Reach lit_reach(const SceneConfig &config);
+    static Reach lit_reach(const SceneSpec &spec);
     bool ray(const double px[2], PixelRay &ray) const;
     bool on_sensor(const double px[2]) const;
+    void prepare(); // what only drawing needs, at the first frame
     void make_pixel_table();
     void make_blur_kernel();
-    void make_response();
     void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
     void shade_row(int row, Buffers &buffers) const;
     void develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const;
 
-    SceneConfig config_;
+    SceneSpec spec_;
     Tube tube_;
     Lens lens_;
     std::vector<FrameState> frames_;
     Reach reach_;
-    Surface surface_;
+    std::optional<Surface> surface_;
     std::vector<PixelRay> rays_;         // of the lit pixels, row by row
     std::vector<float> vignette_;        // of the same
     std::vector<int> row_from_, row_to_; // lit pixels of a row: columns [from, to)
     std::vector<size_t> row_offset_;     // of a row in rays_
     std::vector<float> blur_;            // half kernel: weights of 0, 1, 2, ... pixels
-    std::vector<uint8_t> response_;      // linear grey times RESPONSE_STEPS to the encoded grey
     std::unique_ptr<Buffers> buffers_;
     std::mutex rendering_;
 };

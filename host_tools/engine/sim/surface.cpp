@@ -15,6 +15,8 @@ namespace
 {
 
 constexpr double PI = std::numbers::pi;
+constexpr double JOINT_HALF_WIDTH = 0.004; // metres
+constexpr double JOINT_DARKNESS = 0.75;    // share of the albedo lost in it
 
 // Smooth value noise of one scale. Cells along the pipe have the size `cell`; around it a whole number of them fits.
 struct Noise {
@@ -24,7 +26,7 @@ struct Noise {
 
 // Stains, mottling, sand. The finest ones fall away where the texels cannot carry them.
 constexpr Noise NOISES[] = {
-    {0.410, 0.110}, {0.170, 0.090}, {0.063, 0.080}, {0.024, 0.070}, {0.0087, 0.075}, {0.0034, 0.090}, {0.0015, 0.080},
+    {0.410, 0.15}, {0.170, 0.13}, {0.063, 0.11}, {0.024, 0.10}, {0.0087, 0.11}, {0.0034, 0.12}, {0.0015, 0.10},
 };
 
 // Scattered soft-edged ellipses: at most one a cell, more of them where the erosion noise is high.
@@ -35,8 +37,8 @@ struct Grains {
 };
 
 constexpr Grains GRAINS[] = {
-    {0.021, 0.0025, 0.0065, 0.30, -0.30, 0.32},  // coarse aggregate
-    {0.0085, 0.0010, 0.0030, 0.45, -0.30, 0.35}, // fine aggregate
+    {0.021, 0.0025, 0.0065, 0.40, -0.35, 0.38},  // coarse aggregate
+    {0.0085, 0.0010, 0.0030, 0.55, -0.40, 0.42}, // fine aggregate
     {0.0060, 0.0004, 0.0011, 0.35, -0.55, -0.2}, // pores
     {0.047, 0.0012, 0.0045, 0.35, -0.65, -0.35}, // bug holes
 };
@@ -179,9 +181,9 @@ void add_grains(const Grains &g, const Lattice &lattice, const Lattice &erosion,
 
 } // namespace
 
-Surface::Surface(const SurfaceConfig &config, double radius, int around, double reach)
-    : config_(config), radius_(radius), texel_(2.0 * PI * radius / around), around_(around), chunks_(1),
-      mean_(static_cast<float>(config.albedo)), levels_(static_cast<size_t>(AROUND_LEVELS) * ALONG_LEVELS)
+Surface::Surface(const TextureSpec &spec, const std::vector<Marker> &markers, double radius, int around, double reach)
+    : spec_(spec), markers_(markers), radius_(radius), texel_(2.0 * PI * radius / around), around_(around), chunks_(1),
+      levels_(static_cast<size_t>(AROUND_LEVELS) * ALONG_LEVELS)
 {
     if (around < 64 || around > 16384 || (around & (around - 1)) != 0) {
         throw std::invalid_argument("texels around the pipe must be a power of two from 64 to 16384");
@@ -215,41 +217,46 @@ void Surface::prepare(double s_from, double s_to, int threads)
 void Surface::paint(int64_t row0, std::vector<float> &albedo) const
 {
     const double s0 = static_cast<double>(row0) * texel_;
-    if (config_.concrete) {
-        const Lattice erosion = make_lattice(0.23, radius_, config_.seed, STREAM_SURFACE);
+    if (spec_.contrast > 0.0) {
+        const Lattice erosion = make_lattice(0.23, radius_, spec_.seed, STREAM_SURFACE);
         uint64_t stream = STREAM_SURFACE + 1;
         for (const Noise &n : NOISES) {
-            const Lattice lattice = make_lattice(n.cell, radius_, config_.seed, stream++);
+            const Lattice lattice = make_lattice(n.cell, radius_, spec_.seed, stream++);
             if (n.cell >= 2.0 * texel_) {
                 add_noise(lattice, static_cast<float>(n.amplitude), s0, texel_, CHUNK, around_, albedo);
             }
         }
         for (const Grains &g : GRAINS) {
-            const Lattice lattice = make_lattice(g.cell, radius_, config_.seed, stream++);
+            const Lattice lattice = make_lattice(g.cell, radius_, spec_.seed, stream++);
             add_grains(g, lattice, erosion, radius_, s0, texel_, CHUNK, around_, albedo);
         }
     }
-    const float mean = mean_, contrast = static_cast<float>(config_.contrast);
+    const float contrast = static_cast<float>(spec_.contrast);
     for (float &x : albedo) {
-        x = mean * (1.0f + contrast * x);
+        x = MEAN * (1.0f + contrast * x);
     }
-    if (config_.joints.width > 0.0) {
-        const Joints &joint = config_.joints;
+    if (spec_.joint_spacing > 0.0) {
+        std::vector<float> ragged(albedo.size(), 0.0f);
+        add_noise(make_lattice(0.02, radius_, spec_.seed, STREAM_SURFACE + 100), 0.0015f, s0, texel_, CHUNK, around_,
+                  ragged);
         for (int i = 0; i < CHUNK; i++) {
-            const double s = s0 + (i + 0.5) * texel_ - joint.first;
-            const double off = std::abs(s - joint.spacing * std::round(s / joint.spacing)) - 0.5 * joint.width;
-            const double cover = std::clamp(0.5 - off / (1.5 * texel_), 0.0, 1.0);
-            const float keep = static_cast<float>(1.0 - joint.darkness * cover);
-            float *const line = albedo.data() + static_cast<size_t>(i) * static_cast<size_t>(around_);
-            for (int j = 0; cover > 0.0 && j < around_; j++) {
-                line[j] *= keep;
+            const double s = s0 + (i + 0.5) * texel_;
+            const double off =
+                std::abs(s - spec_.joint_spacing * std::round(s / spec_.joint_spacing)) - JOINT_HALF_WIDTH;
+            if (off > 0.01) {
+                continue;
+            }
+            const size_t line = static_cast<size_t>(i) * static_cast<size_t>(around_);
+            for (size_t j = line; j < line + static_cast<size_t>(around_); j++) {
+                const double cover =
+                    std::clamp(0.5 - (off - static_cast<double>(ragged[j])) / (1.5 * texel_), 0.0, 1.0);
+                albedo[j] *= static_cast<float>(1.0 - JOINT_DARKNESS * cover);
             }
         }
     }
-    for (const Marker &m : config_.markers) {
-        const float value = static_cast<float>(m.albedo);
-        draw({m.s, m.clock * radius_, m.radius, m.radius, 1.0, 0.0}, s0, texel_, CHUNK, around_, albedo,
-             [=](float under, float cover) { return under + cover * (value - under); });
+    for (const Marker &m : markers_) {
+        draw({m.s, m.phi * radius_, m.radius, m.radius, 1.0, 0.0}, s0, texel_, CHUNK, around_, albedo,
+             [](float under, float cover) { return under + cover * (1.0f - under); });
     }
 }
 
@@ -298,7 +305,7 @@ float Surface::sample(float row, float column, float width_row, float width_colu
 {
     const float rows = static_cast<float>((last_chunk_ - first_chunk_ + 1) * CHUNK);
     if (!(row >= 0.0f && row < rows)) {
-        return mean_;
+        return MEAN;
     }
     const auto level_of = [](float width, int levels) {
         return std::clamp(std::log2(std::max(width, 1.0f)), 0.0f, static_cast<float>(levels - 1));

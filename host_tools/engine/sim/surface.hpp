@@ -10,34 +10,27 @@
 namespace pipefish::sim
 {
 
-struct Joints {
-    double spacing, first, width; // metres; width 0 = none. Rings at first + k spacing
-    double darkness;              // 0..1: share of the albedo lost in the ring
+struct TextureSpec {
+    uint64_t seed = 1;
+    double contrast = 1.0;      // of aggregate, pores and stains; 0 = even
+    double joint_spacing = 1.0; // metres between dark rings; 0 = none
 };
 
-struct Marker { // a uniform disc on the surface (radius measured in arc length and in nominal radius times clock angle)
-    double s, clock, radius, albedo;
-};
-
-struct SurfaceConfig {
-    bool concrete;   // false: uniform albedo
-    double albedo;   // mean, 0..1
-    double contrast; // 1 = as designed
-    Joints joints;
-    std::vector<Marker> markers;
-    uint64_t seed;
+struct Marker { // a white disc on the surface: radius in metres of arc length, and of nominal radius times clock angle
+    double s = 0.0, phi = 0.0, radius = 0.0;
 };
 
 class Surface
 {
 public:
+    static constexpr float MEAN = 0.45f;   // albedo
     static constexpr int ALONG_LEVELS = 9; // rows halve 8 times: one chunk of rows becomes one row
     static constexpr int AROUND_LEVELS = 6;
     static constexpr int CHUNK = 1 << (ALONG_LEVELS - 1);
 
     // `around`: texels around the pipe, a power of two, 64..16384; square texels at the nominal radius (metres).
     // `reach`: metres of wall that must fit in the ring at once.
-    Surface(const SurfaceConfig &config, double radius, int around, double reach);
+    Surface(const TextureSpec &spec, const std::vector<Marker> &markers, double radius, int around, double reach);
 
     double texel() const { return texel_; }
     int around() const { return around_; }
@@ -61,12 +54,12 @@ private:
         return levels_[static_cast<size_t>(around * ALONG_LEVELS + along)].data();
     }
 
-    SurfaceConfig config_;
+    TextureSpec spec_;
+    std::vector<Marker> markers_;
     double radius_, texel_;
     int around_, chunks_;                       // ring: chunks_ chunks of CHUNK rows
     int64_t first_chunk_ = 0, last_chunk_ = -1; // prepared
-    float mean_;
-    std::vector<std::vector<uint8_t>> levels_; // [around][along]: (chunks_ CHUNK >> along) rows of (around_ >> around)
+    std::vector<std::vector<uint8_t>> levels_;  // [around][along]: (chunks_ CHUNK >> along) rows of (around_ >> around)
 };
 
 } // namespace pipefish::sim

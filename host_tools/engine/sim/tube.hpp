@@ -14,16 +14,19 @@
 namespace pipefish::sim
 {
 
-struct Run {
-    double length;      // metres along the centreline, > 0
-    double bend_radius; // metres; 0 = straight
-    double bend_clock;  // radians: towards where the bend turns
+struct Piece {           // a straight run (length) or a bend (the rest)
+    double length = 0.0; // metres
+    double angle = 0.0;  // radians; 0 = straight
+    double radius = 0.0; // metres, of the centreline
+    double clock = 0.0;  // radians: towards where the bend turns
 };
 
-// D_max - D_min = ratio * D_mean between from + ramp and to - ramp, blending to round at both ends (quintic).
+// D_max - D_min = ovality * D_mean between start + ramp and end - ramp, blending to round at both ends (quintic).
 struct OvalStretch {
-    double from, to, ramp; // metres along the centreline, ramp > 0, from + 2 ramp <= to
-    double ratio, clock;   // clock: of the largest diameter, radians
+    double start = 0.0, end = 1.0; // metres along the centreline
+    double ramp = 0.25;            // metres, > 0, at most half the stretch
+    double ovality = 0.0;
+    double clock = 0.0; // of the largest diameter, radians
 };
 
 // The section {A u : |u| = 1} with A = [rho - e_c, -e_s; -e_s, rho + e_c] in (right, down): semi-axes rho +- |e|, the
@@ -53,7 +56,7 @@ class Tube
 public:
     // Throws std::invalid_argument: no runs, a bend first or last, a bend tighter than the wall, sections that overlap
     // to more than 50 %.
-    Tube(double radius, const std::vector<Run> &runs, const std::vector<OvalStretch> &ovals);
+    Tube(double radius, const std::vector<Piece> &pieces, const std::vector<OvalStretch> &ovals);
 
     double radius() const { return radius_; }
     double length() const { return length_; }
@@ -74,7 +77,7 @@ public:
 
     private:
         struct Local {
-            Eigen::Matrix3d rotation; // piece from camera
+            Eigen::Matrix3d rotation; // segment from camera
             Eigen::Vector3d offset;
         };
         const Tube &tube_;
@@ -83,7 +86,7 @@ public:
     };
 
 private:
-    struct Piece {
+    struct Segment {
         double s0, length;
         double bend_radius, bend_angle; // 0 = straight
         double nx, ny;                  // unit vector to the bend's centre, in (right, down)
@@ -95,17 +98,17 @@ private:
         double curvature_radius;        // bend_radius less the largest semi-axis: the tightest line in the bend
         Frame3 frame;                   // at s0
     };
-    struct PieceRay;
+    struct SegmentRay;
 
-    void add_pieces(const Run &run, double &s, Frame3 &frame);
-    void set_section_bounds(Piece &piece) const;
-    int piece_at(double s) const;
-    static Frame3 advance(const Frame3 &frame, const Piece &piece, double along);
-    static WallPoint to_section(const Piece &piece, const Eigen::Vector3d &p);
+    void add_segments(const Piece &piece, double &s, Frame3 &frame);
+    void set_section_bounds(Segment &segment) const;
+    int segment_at(double s) const;
+    static Frame3 advance(const Frame3 &frame, const Segment &segment, double along);
+    static WallPoint to_section(const Segment &segment, const Eigen::Vector3d &p);
 
     double radius_, length_;
     std::vector<OvalStretch> ovals_;
-    std::vector<Piece> pieces_;
+    std::vector<Segment> segments_;
 };
 
 } // namespace pipefish::sim

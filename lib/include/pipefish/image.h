@@ -23,6 +23,9 @@ typedef struct pf_image {
 typedef struct pf_pyramid {
     uint32_t levels;
     pf_image level[PF_PYRAMID_LEVELS_MAX];
+    /* private: where the caller's block is written */
+    uint8_t *store[PF_PYRAMID_LEVELS_MAX];
+    uint16_t *row;
 } pf_pyramid;
 
 /* Bytes that pf_pyramid_init needs for frames of this size; 0 if the arguments are out of range. */

@@ -13,6 +13,9 @@ extern "C" {
 
 #define PF_TRACKS_MAX 2048u
 
+/* Added to both variances of a position: (1/64 px)^2, for what interpolation and rounding leave. */
+#define PF_TRACK_COV_FLOOR_Q20 256
+
 typedef enum pf_track_status {
     PF_TRACK_NEW = 1,     /* detected in this frame */
     PF_TRACK_TRACKED = 2, /* found again in this frame: .pos and .cov are valid */
@@ -27,7 +30,8 @@ typedef enum pf_track_reason {
     PF_TRACK_RESIDUAL = 4,  /* the patch no longer looks the same */
     PF_TRACK_BACKWARD = 5,  /* forward-backward check failed */
     PF_TRACK_CROWDED = 6,   /* ran into an older track */
-    PF_TRACK_DRIFT = 7,     /* no longer looks like where it was first seen */
+    PF_TRACK_DRIFT = 7,     /* no longer looks like its template (first sight, renewed as its shape changes), or lies
+                             * elsewhere than the template says */
 } pf_track_reason;
 
 typedef struct pf_point_q16 {
@@ -37,7 +41,10 @@ typedef struct pf_point_q16 {
 typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
     pf_point_q16 pos; /* in the current frame; last known where lost */
-    uint32_t cov_xx_q20, cov_yy_q20; /* Q12.20 px^2: variance of the position from patch and noise, saturating */
+    /* Q12.20 px^2, saturating: covariance of the position against the track's template. With noise sigma in both
+     * patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of (sum J J^T)^-1, J the derivatives
+     * of the template by position and affine warp with gain and bias eliminated; plus the floor. New tracks: g = 1. */
+    uint32_t cov_xx_q20, cov_yy_q20;
     int32_t cov_xy_q20;
     uint32_t age;     /* frames since detection; 0 = new */
     uint8_t status;   /* pf_track_status */
@@ -45,7 +52,7 @@ typedef struct pf_track {
     uint16_t quality; /* similarity with the previous frame's patch, Q0.15 ZNCC (32767 = identical); 0 when new */
 } pf_track;
 
-/* Zero means the default in brackets. Bounds are checked by pf_tracker_init. */
+/* Zero means the default in brackets; width and height have none. Bounds are checked by pf_tracker_init. */
 typedef struct pf_tracker_config {
     uint32_t width, height;        /* frame size, 64..16384 */
     uint32_t max_tracks;           /* 8..2048 [400] */
@@ -53,12 +60,14 @@ typedef struct pf_tracker_config {
     uint32_t window;               /* KLT window side in pixels, odd, 7..31 [21] */
     uint32_t iterations;           /* most iterations a level, 1..30 [10] */
     uint32_t cell;                 /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
-    uint32_t min_eigen;            /* detection: least smaller eigenvalue of the mean structure tensor, grey^2 [30] */
-    uint32_t fb_q16;               /* most forward-backward distance, Q16.16 px [0.5] */
-    uint32_t min_zncc_q15;         /* least similarity to the previous patch, Q0.15 [0.8] */
-    uint32_t noise_q8;             /* image noise sigma, grey levels Q8.8, for covariances [2.0] */
-    pf_point_q16 circle;           /* centre of the image circle, Q16.16 px */
-    uint32_t circle_radius_q16;    /* its radius; 0 = the whole image is used */
+    uint32_t min_eigen;            /* detection: least smaller eigenvalue of the mean structure tensor (11 x 11), grey^2,
+                                    * up to 16384 [8; noise of sigma 2 alone gives 2] */
+    uint32_t fb_q16;               /* most forward-backward distance, Q16.16 px, up to 16 [0.5] */
+    uint32_t min_zncc_q15;         /* least similarity to the previous patch, Q0.15, up to 32767 [0.8]; to the template
+                                    * it is 0.1 less */
+    uint32_t noise_q8;             /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
+    pf_point_q16 circle;           /* centre of the image circle, Q16.16 px, each within +-16384 */
+    uint32_t circle_radius_q16;    /* its radius, up to 16384; 0 = the whole image is used */
 } pf_tracker_config;
 
 typedef struct pf_tracker_stats { /* of the last frame */
@@ -70,7 +79,7 @@ typedef struct pf_tracker_stats { /* of the last frame */
 /* Opaque; lives in the caller's workspace. */
 typedef struct pf_tracker pf_tracker;
 
-/* Bytes of workspace for this configuration; 0 if it is out of range. */
+/* Bytes of workspace for this configuration; 0 if it is out of range. 1280x800 with the defaults: 1.2 MB. */
 size_t pf_tracker_workspace_size(const pf_tracker_config *config);
 
 /* Returns PF_OK and *tracker (inside `workspace`); PF_ERR_ARGUMENT (a bound is violated; nothing written);
@@ -92,7 +101,8 @@ typedef enum pf_tracker_stage {
  * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
 pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
 
-/* The table after the last frame: live tracks and those lost in it, by ascending id. Valid until the next call. */
+/* The table after the last frame: live tracks (max_tracks at most) and those lost in it (as many again at most), by
+ * ascending id. Valid until the next call. */
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
 const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 
@@ -121,12 +131,13 @@ typedef enum pf_keyframe_cause {
 typedef struct pf_keyframe_config { /* zero = default in brackets */
     uint32_t step_counts;     /* encoder counts between keyframes; 0 = do not use the encoder */
     uint32_t parallax_urad;   /* micro-radians [174533 = 10 degrees] */
-    uint32_t min_common;      /* forced below so many common tracks [100]; compared with what the last keyframe had */
+    uint32_t min_common;      /* forced below so many common tracks [100], or below half of what the last keyframe had
+                               * where that is less: weak texture alone must not force one at every frame */
     uint32_t min_interval;    /* frames, at least so many between keyframes [2] */
 } pf_keyframe_config;
 
 typedef struct pf_keyframe_state { /* private; zero-initialise */
-    uint32_t n;                     /* tracks of the last keyframe; ids ascending */
+    uint32_t n;                     /* live tracks of the last keyframe; ids ascending */
     uint32_t frames_since;
     bool have_encoder, started;
     int64_t encoder;

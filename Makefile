@@ -1,0 +1,84 @@
+# A thin door: CMake (CMakePresets.json) builds C and C++, pip builds the Python package, the tests run themselves.
+#
+#   make demo     a whole survey, simulated, through the daemon and the link, to build/demo/index.html
+#   make test     everything that needs no special data
+#   make build    pipefishd and friends in build/release, the `pipefish` command in build/venv/bin
+#   make bench    figures into build/bench.json (ONLY=track for some of them)
+#   make accept   the long tests, resumable, into build/accept.json
+#   make format   lays the code out;  make clean   removes build/
+
+SHELL := /bin/sh
+MAKEFLAGS += --no-print-directory
+VENV := build/venv
+PY := $(VENV)/bin/python
+STAMP := build/stamp
+UNITY_DIR = $(abspath $(wildcard $(VENV)/lib/python3*/site-packages/vyperling/c))
+ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type f)
+C_FILES = $(shell git ls-files '*.c' '*.h' '*.cpp' '*.hpp' '*.cc')
+
+.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-smoke cross pytest
+
+build: native $(STAMP)/python
+
+demo: build
+	@$(VENV)/bin/pipefish demo --out build/demo
+
+test: build lint unit fuzz-smoke cross pytest
+	@echo "all tests passed"
+
+packages-build:
+	@tools/install-packages build
+
+packages-test:
+	@tools/install-packages build test
+
+native: packages-build
+	@test -f build/release/build.ninja || cmake --preset release
+	@cmake --build --preset release
+
+# The virtual environment; made anew when what goes into it changes.
+$(STAMP)/venv: pyproject.toml tools/requirements.txt tools/make-venv | packages-build
+	@tools/make-venv $(VENV)
+	@mkdir -p $(STAMP) && touch $@
+
+# The package is installed in place: only a change of C, C++ or CMake builds it again.
+$(STAMP)/python: $(STAMP)/venv $(ENGINE_SOURCES) pyproject.toml
+	@$(PY) -m pip install --quiet --no-build-isolation --no-deps -e .
+	@touch $@
+
+unit: packages-test $(STAMP)/venv
+	@test -f build/debug/build.ninja || cmake --preset debug -DUNITY_DIR=$(UNITY_DIR)
+	@cmake --build --preset debug
+	@ctest --preset debug
+
+lint: packages-test $(STAMP)/venv
+	@clang-format --dry-run --Werror $(C_FILES)
+	@$(VENV)/bin/ruff check --quiet . && $(VENV)/bin/ruff format --check --quiet .
+
+# Every parser and state machine for a fixed number of inputs, under clang with sanitizers; `make accept` runs longer.
+fuzz-smoke: packages-test
+	@test -f build/clang/build.ninja || cmake --preset clang
+	@cmake --build --preset clang
+	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
+	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
+
+cross: packages-test $(STAMP)/venv
+	@for p in aarch64 cortex-m; do \
+	    test -f build/$$p/build.ninja || cmake --preset $$p -DUNITY_DIR=$(UNITY_DIR) || exit 1; \
+	    cmake --build --preset $$p || exit 1; ctest --preset $$p || exit 1; done
+
+pytest: build
+	@$(PY) -m pytest -q
+
+bench: build
+	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
+
+accept: build unit
+	@$(PY) tests/accept.py --out build/accept.json
+
+format: packages-test $(STAMP)/venv
+	@clang-format -i $(C_FILES)
+	@$(VENV)/bin/ruff check --quiet --fix . ; $(VENV)/bin/ruff format --quiet .
+
+clean:
+	@rm -rf build

@@ -1,0 +1,89 @@
+/* What every camera driver offers: recorded frames, V4L2 and libcamera alike. A driver is a struct of pointers to
+ * functions and a `self`; the daemon knows nothing else of it. All calls of one camera come from one thread.
+ */
+#ifndef PIPEFISH_DRIVERS_CAMERA_H
+#define PIPEFISH_DRIVERS_CAMERA_H
+
+#include "pipefish/image.h"
+
+/* The other sensors' readings that came with a frame. A reading counts only if its has_ flag is set. */
+typedef struct pf_telemetry {
+    bool has_encoder, has_attitude, has_exposure, has_gain, has_lamp;
+    int64_t encoder_count;
+    double roll_rad, pitch_rad;
+    double attitude_sigma_rad; /* 0 = not stated */
+    uint32_t exposure_us;
+    double gain;
+    double lamp; /* 0..1 */
+} pf_telemetry;
+
+typedef struct pf_frame {
+    pf_image image;    /* the driver's memory: valid until release */
+    uint64_t sequence; /* the sensor's own count: a gap means dropped frames */
+    uint64_t time_ns;  /* monotonic clock, middle of the exposure. A recording's own time when replayed */
+    pf_telemetry telemetry;
+    bool has_sha256; /* a recording states the hash of the pixels; the driver has checked it */
+    uint8_t sha256[32];
+    void *handle; /* the driver's own */
+} pf_frame;
+
+typedef struct pf_camera_info {
+    uint32_t width, height;
+    double frame_rate; /* nominal; 0 = unknown */
+    uint64_t frames;   /* how many there will be; 0 = unknown */
+    char source[256];  /* "replay demo.y4m" */
+} pf_camera_info;
+
+typedef struct pf_camera_source {
+    void *self;
+    const struct pf_camera_source_ops *ops;
+} pf_camera_source;
+
+typedef struct pf_camera_source_ops {
+    /* Valid from opening on. */
+    const pf_camera_info *(*info)(void *self);
+
+    /* Starts capture; frames are due from now on. A recording goes on where it was stopped. PF_OK, PF_ERR_IO. */
+    pf_status (*start)(void *self);
+
+    /* Waits up to timeout_ms for the next frame. At most two frames are held at a time (the tracker keeps the last one
+     * as its reference).
+     * PF_OK; PF_ERR_AGAIN (none yet); PF_ERR_END (a recording is over); PF_ERR_CLOSED (unplugged); PF_ERR_IO;
+     * PF_ERR_FORMAT, PF_ERR_TRUNCATED, PF_ERR_CHECKSUM (a recording is damaged): error() says what and where, and the
+     * next call goes on with the frame after it; PF_ERR_ARGUMENT (not started, two frames are held already). */
+    pf_status (*next)(void *self, uint32_t timeout_ms, pf_frame *frame);
+
+    /* Gives a frame back. */
+    void (*release)(void *self, pf_frame *frame);
+
+    pf_status (*stop)(void *self);
+
+    /* The last failure in words, with file and position; "" if there was none. */
+    const char *(*error)(void *self);
+
+    void (*close)(void *self); /* frees everything, self included */
+} pf_camera_source_ops;
+
+/* Recorded frames: a Y4M file with a telemetry CSV beside it, or a folder of PNG, JPEG or PGM images
+ * (docs/recording.md). */
+typedef enum pf_replay_speed {
+    PF_REPLAY_RECORDED = 0, /* frames come when they came then, however slow the rest is: one that is over a period late
+                               is skipped once the next is due, and leaves a gap in the sequence */
+    PF_REPLAY_FAST = 1,     /* the next frame as soon as it is asked for */
+} pf_replay_speed;
+
+typedef struct pf_replay_config {
+    const char *path; /* .y4m, or a folder */
+    const char *csv;  /* telemetry; NULL = path with .csv for .y4m (may be absent), telemetry.csv in a folder */
+    pf_replay_speed speed;
+    uint32_t loops;    /* play it so often; 0 = for ever. Sequence and time go on rising, the encoder starts again */
+    double frame_rate; /* of a recording without times; 0 = 10 */
+    bool restamp;      /* true: times are those of now (as a live camera's); false: the recording's */
+} pf_replay_config;
+
+/* Opens and checks a recording (every header, the whole CSV, the first frame). On failure *source is untouched and
+ * error[n] says what and where. PF_OK, PF_ERR_IO, PF_ERR_FORMAT, PF_ERR_TRUNCATED, PF_ERR_UNSUPPORTED, PF_ERR_ARGUMENT.
+ */
+pf_status pf_replay_open(pf_camera_source *source, const pf_replay_config *config, char *error, size_t n);
+
+#endif

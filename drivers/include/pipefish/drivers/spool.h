@@ -1,0 +1,60 @@
+/* The spool: what must not be lost until the host says that it has it. Survives power cuts and kill -9. */
+#ifndef PIPEFISH_DRIVERS_SPOOL_H
+#define PIPEFISH_DRIVERS_SPOOL_H
+
+#include "pipefish/base.h"
+
+typedef struct pf_spool {
+    void *self;
+    const struct pf_spool_ops *ops;
+} pf_spool;
+
+typedef struct pf_spool_item {
+    uint64_t row;     /* order of storing; what remove() takes */
+    uint32_t kind;    /* pf_object_kind */
+    uint8_t name[32]; /* SHA-256 of the bytes */
+    uint32_t size;
+} pf_spool_item;
+
+typedef struct pf_spool_stats {
+    uint64_t objects, bytes;                        /* waiting now */
+    uint64_t stored, acknowledged, evicted, errors; /* since opening */
+} pf_spool_stats;
+
+typedef struct pf_spool_ops {
+    /* Stores durably: on PF_OK the object outlives a power cut. The same name twice is stored once (PF_OK).
+     * PF_ERR_SPACE (quota or disk full, after evicting what may be), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes). */
+    pf_status (*put)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n);
+
+    /* The first item with row > after, oldest first. PF_OK, PF_ERR_END (no more), PF_ERR_IO. */
+    pf_status (*next)(void *self, uint64_t after, pf_spool_item *item);
+
+    /* Reads an item's bytes into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone), PF_ERR_IO,
+     * PF_ERR_CHECKSUM (the medium has damaged it: only remove() is left). */
+    pf_status (*read)(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n);
+
+    /* Removes what the host has acknowledged. PF_OK (also if it is gone already), PF_ERR_IO. */
+    pf_status (*remove)(void *self, uint64_t row);
+
+    /* Small durable values that belong to the survey (its id, counters). get: PF_OK, PF_ERR_END (no such key).
+     * set with n = 0 deletes. put_and_set stores an object and a value in one transaction. */
+    pf_status (*get)(void *self, const char *key, void *bytes, size_t capacity, size_t *n);
+    pf_status (*set)(void *self, const char *key, const void *bytes, size_t n);
+    pf_status (*put_and_set)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
+                             const char *key, const void *value, size_t value_n);
+
+    void (*stats)(void *self, pf_spool_stats *stats);
+    const char *(*error)(void *self); /* last failure in words; valid until this thread asks again */
+    void (*close)(void *self);
+} pf_spool_ops;
+
+typedef struct pf_spool_config {
+    const char *path; /* SQLite file; its folder must exist */
+    uint64_t quota;   /* most bytes of objects; 0 = no limit */
+} pf_spool_config;
+
+/* Opens or creates. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool), PF_ERR_VERSION.
+ */
+pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
+
+#endif

@@ -1,0 +1,61 @@
+/* A byte stream to the other end: serial line, TCP. Never blocks; the daemon's loop polls fd. */
+#ifndef PIPEFISH_DRIVERS_TRANSPORT_H
+#define PIPEFISH_DRIVERS_TRANSPORT_H
+
+#include "pipefish/base.h"
+
+#define PF_TRANSPORT_RETRY_MS 250u
+
+typedef struct pf_transport {
+    void *self;
+    const struct pf_transport_ops *ops;
+} pf_transport;
+
+typedef struct pf_transport_ops {
+    /* Descriptor to poll now: the listener (POLLIN) while nobody is connected, then the connection (POLLIN, and POLLOUT
+     * while something waits and room() > 0). -1 = nothing to poll (unplugged: call service again after
+     * PF_TRANSPORT_RETRY_MS). It changes only in service, read and write. */
+    int (*fd)(void *self);
+
+    /* Accepts or reopens as needed. PF_OK = a stream is there; *fresh is set (else cleared) when it is a new one
+     * (pf_link_reset is due); PF_ERR_AGAIN = nobody there yet, or not to be opened yet (error() says why); PF_ERR_IO =
+     * it failed now, and may be tried again. */
+    pf_status (*service)(void *self, bool *fresh);
+
+    /* *done bytes were moved. PF_OK (maybe fewer than asked, maybe 0), PF_ERR_CLOSED (the stream is over; service). */
+    pf_status (*read)(void *self, uint8_t *bytes, size_t capacity, size_t *done);
+    pf_status (*write)(void *self, const uint8_t *bytes, size_t n, size_t *done);
+
+    /* Bytes that may be written now without queueing more than a few milliseconds in front of urgent frames: 0, or at
+     * least PF_LINK_FRAME_MAX. No descriptor tells when it rises: ask again after a millisecond or so.
+     * Serial: one frame more than 5 ms at the baud rate are queued at most; a pseudo-terminal, which does not tell how
+     * much it holds, counts as a line of that rate. TCP: 64 KiB. */
+    size_t (*room)(void *self);
+
+    const char *(*name)(void *self);  /* "serial /dev/ttyS0 3000000", "tcp 127.0.0.1:7447" */
+    const char *(*error)(void *self); /* last failure in words */
+    void (*close)(void *self);
+} pf_transport_ops;
+
+typedef struct pf_serial_config {
+    const char *device; /* /dev/tty..., or a pty */
+    uint32_t baud;      /* 9600..4000000; one the driver cannot set is an error that names those near it */
+    bool rtscts;
+} pf_serial_config;
+
+/* On failure *transport is untouched and error[n] says what. Once open, the device may vanish and come back: service()
+ * opens it again under the same path. PF_OK; PF_ERR_IO (no such device, in use); PF_ERR_ARGUMENT; PF_ERR_UNSUPPORTED
+ * (not a terminal, or not at this rate). */
+pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config, char *error, size_t n);
+
+/* Listens; one client at a time, the next waits. Without TLS (a later issue) only loopback addresses are accepted. */
+typedef struct pf_tcp_config {
+    const char *address; /* "127.0.0.1", "::1" */
+    uint16_t port;       /* 0 = any; name() tells which */
+} pf_tcp_config;
+
+/* On failure *transport is untouched and error[n] says what. PF_OK; PF_ERR_IO (port taken); PF_ERR_ARGUMENT (not a
+ * numeric address); PF_ERR_UNSUPPORTED (not a loopback address). */
+pf_status pf_tcp_listen(pf_transport *transport, const pf_tcp_config *config, char *error, size_t n);
+
+#endif

@@ -1,0 +1,395 @@
+#include "config.h"
+
+#include <errno.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "ini.h"
+#include "utf8.h"
+
+typedef enum kind { TEXT, NUMBER, INTEGER, SWITCH, CHOICE } kind;
+
+typedef struct setting {
+    const char *section, *key;
+    kind kind;
+    size_t offset;
+    const char *unit, *fallback;
+    double min, max;
+    const char *choices; /* "a|b": the value is the index */
+    const char *help;
+} setting;
+
+#define AT(member) offsetof(pf_config, member)
+
+static const setting settings[] = {
+    {"survey", "name", TEXT, AT(survey.name), "", "", 0, 0, NULL, "what the operator calls this survey"},
+    {"survey", "nominal_diameter_mm", NUMBER, AT(survey.nominal_diameter_mm), "mm", "0", 0, 20000, NULL,
+     "of the pipe; 0 = unknown"},
+
+    {"camera", "driver", CHOICE, AT(camera.driver), "", "replay", 0, 0, "replay",
+     "where frames come from; replay plays a recording"},
+    {"camera", "path", TEXT, AT(camera.path), "", "", 0, 0, NULL,
+     "the recording: a .y4m file, or a folder of PNG, JPEG or PGM images; required"},
+    {"camera", "csv", TEXT, AT(camera.csv), "", "", 0, 0, NULL,
+     "its telemetry; empty = beside it (path with .csv, or telemetry.csv in the folder), if it is there"},
+    {"camera", "speed", CHOICE, AT(camera.speed), "", "recorded", 0, 0, "recorded|fast",
+     "recorded = as it happened, late frames are dropped; fast = as fast as possible, nothing is dropped"},
+    {"camera", "loops", INTEGER, AT(camera.loops), "", "1", 0, 1000000, NULL, "play it so often; 0 = for ever"},
+    {"camera", "frame_rate", NUMBER, AT(camera.frame_rate), "1/s", "0", 0, 10000, NULL,
+     "of a recording without times; 0 = 10"},
+    {"camera", "restamp", SWITCH, AT(camera.restamp), "", "false", 0, 0, NULL,
+     "true = frames get the time of now, as a live camera's; false = the recording's times are kept"},
+    {"camera", "profile", TEXT, AT(camera.profile), "", "", 0, 0, NULL,
+     "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
+
+    {"tracker", "max_tracks", INTEGER, AT(tracker.max_tracks), "", "400", 8, 2048, NULL, "tracks alive at once"},
+    {"tracker", "levels", INTEGER, AT(tracker.levels), "", "4", 1, 6, NULL, "pyramid levels; more = faster motion"},
+    {"tracker", "window", INTEGER, AT(tracker.window), "px", "21", 7, 31, NULL, "side of the patch, odd"},
+    {"tracker", "iterations", INTEGER, AT(tracker.iterations), "", "10", 1, 30, NULL, "most steps a level"},
+    {"tracker", "cell", INTEGER, AT(tracker.cell), "px", "0", 0, 256, NULL,
+     "side of a detection cell, 16..256; 0 = from max_tracks"},
+    {"tracker", "min_eigen", INTEGER, AT(tracker.min_eigen), "grey^2", "0", 0, 16384, NULL,
+     "least texture of a new corner; 0 = the tracker's own"},
+    {"tracker", "fb_px", NUMBER, AT(tracker.fb_px), "px", "0.5", 0.01, 16, NULL, "most forward-backward distance"},
+    {"tracker", "min_zncc", NUMBER, AT(tracker.min_zncc), "", "0.8", 0.01, 0.9999, NULL,
+     "least similarity to the patch of the frame before"},
+    {"tracker", "noise", NUMBER, AT(tracker.noise), "grey levels", "2", 0.01, 64, NULL,
+     "sigma of the image noise; scales the covariances"},
+    {"tracker", "circle_u", NUMBER, AT(tracker.circle_u), "px", "0", -16384, 16384, NULL,
+     "centre of the image circle, if circle_radius is set"},
+    {"tracker", "circle_v", NUMBER, AT(tracker.circle_v), "px", "0", -16384, 16384, NULL, "its other coordinate"},
+    {"tracker", "circle_radius", NUMBER, AT(tracker.circle_radius), "px", "0", 0, 16384, NULL,
+     "radius of the image circle; 0 = the profile's; without one the whole image is used"},
+    {"tracker", "reset_gap", INTEGER, AT(tracker.reset_gap), "frames", "5", 0, 1000000, NULL,
+     "after a gap of more missing frames than this all tracks begin anew: a marked break"},
+
+    {"keyframe", "step_mm", NUMBER, AT(keyframe.step_mm), "mm", "0", 0, 100000, NULL,
+     "distance between keyframes by the encoder; 0 = a quarter of the nominal radius"},
+    {"keyframe", "parallax_deg", NUMBER, AT(keyframe.parallax_deg), "deg", "10", 0.1, 90, NULL,
+     "without an encoder: median parallax between keyframes; needs a profile"},
+    {"keyframe", "min_common", INTEGER, AT(keyframe.min_common), "tracks", "100", 1, 2048, NULL,
+     "a keyframe is forced when fewer tracks are shared with the last one"},
+    {"keyframe", "min_interval", INTEGER, AT(keyframe.min_interval), "frames", "2", 1, 1000, NULL,
+     "at least so many frames between keyframes"},
+    {"keyframe", "jpeg_quality", INTEGER, AT(keyframe.jpeg_quality), "", "90", 1, 100, NULL, "of keyframe images"},
+    {"keyframe", "queue", INTEGER, AT(keyframe.queue), "", "4", 2, 64, NULL,
+     "keyframes that may wait for the disk in memory"},
+
+    {"encoder", "metres_per_count", NUMBER, AT(encoder.metres_per_count), "m", "0", -1, 1, NULL,
+     "of the wheel encoder; 0 = no encoder"},
+    {"encoder", "sigma", NUMBER, AT(encoder.sigma), "m", "0", 0, 1, NULL, "standard deviation of metres_per_count"},
+    {"encoder", "noise", NUMBER, AT(encoder.noise), "m/sqrt(m)", "0.005", 0, 1, NULL,
+     "random error of the distance over one metre"},
+
+    {"link", "transport", CHOICE, AT(link.transport), "", "tcp", 0, 0, "serial|tcp", "how the host is reached"},
+    {"link", "device", TEXT, AT(link.device), "", "", 0, 0, NULL, "serial: the device, as /dev/ttyS0; required"},
+    {"link", "baud", INTEGER, AT(link.baud), "baud", "921600", 9600, 4000000, NULL, "serial: the rate"},
+    {"link", "rtscts", SWITCH, AT(link.rtscts), "", "false", 0, 0, NULL, "serial: hardware flow control"},
+    {"link", "address", TEXT, AT(link.address), "", "127.0.0.1", 0, 0, NULL,
+     "tcp: the address to listen on; a loopback address until the link is encrypted"},
+    {"link", "port", INTEGER, AT(link.port), "", "7447", 0, 65535, NULL, "tcp: the port; 0 = any (the log tells)"},
+    {"link", "window", INTEGER, AT(link.window), "bytes", "65536", 1024, 1048576, NULL,
+     "most unacknowledged bytes under way"},
+    {"link", "send_slots", INTEGER, AT(link.send_slots), "", "4", 1, 16, NULL, "objects under way at once"},
+    {"link", "max_fragment", INTEGER, AT(link.max_fragment), "bytes", "1024", 64, 1024, NULL,
+     "of a frame on the wire; smaller = previews and replies wait less on a slow line"},
+    {"link", "keepalive_ms", INTEGER, AT(link.keepalive_ms), "ms", "1000", 10, 60000, NULL,
+     "ping interval; after four of them in silence the host counts as gone"},
+    {"link", "rto_min_ms", INTEGER, AT(link.rto_min_ms), "ms", "50", 1, 10000, NULL, "least time to a repetition"},
+
+    {"spool", "path", TEXT, AT(spool.path), "", "/var/lib/pipefish/spool.db", 0, 0, NULL,
+     "file that keeps what the host has not acknowledged; its folder must exist"},
+    {"spool", "quota_mb", INTEGER, AT(spool.quota_mb), "MB", "4096", 0, 4000000, NULL,
+     "most megabytes that may wait in it; 0 = no limit"},
+
+    {"status", "interval_ms", INTEGER, AT(status.interval_ms), "ms", "1000", 50, 3600000, NULL,
+     "between status messages, and of the status file"},
+    {"status", "preview_interval_ms", INTEGER, AT(status.preview_interval_ms), "ms", "1000", 0, 3600000, NULL,
+     "between previews; 0 = none"},
+    {"status", "preview_quality", INTEGER, AT(status.preview_quality), "", "50", 1, 100, NULL, "JPEG, of previews"},
+
+    {"daemon", "drain_s", INTEGER, AT(daemon.drain_s), "s", "60", 0, 1000000, NULL,
+     "how long to go on sending after the survey ended; what is left stays in the spool"},
+    {"daemon", "exit_when_done", SWITCH, AT(daemon.exit_when_done), "", "true", 0, 0, NULL,
+     "false = after the survey the daemon goes on serving the host until SIGTERM"},
+    {"daemon", "status_file", TEXT, AT(daemon.status_file), "", "", 0, 0, NULL,
+     "JSON file with the status message's figures, replaced at intervals and at the end; empty = none"},
+    {"daemon", "log_level", CHOICE, AT(daemon.log_level), "", "info", 0, 0, "error|warning|info|debug",
+     "what goes to standard error"},
+};
+
+#define SETTINGS (sizeof settings / sizeof settings[0])
+_Static_assert(SETTINGS <= PF_CONFIG_KEYS_MAX, "pf_config.line has a place for every key");
+
+uint32_t pf_config_keys(void)
+{
+    return (uint32_t)SETTINGS;
+}
+
+/* The index of a word in "a|b|c", or -1. */
+static int find_choice(const char *choices, const char *word)
+{
+    size_t n = strlen(word);
+    for (int i = 0; choices != NULL; i++) {
+        const char *bar = strchr(choices, '|');
+        size_t length = bar ? (size_t)(bar - choices) : strlen(choices);
+        if (length == n && memcmp(choices, word, n) == 0)
+            return i;
+        choices = bar ? bar + 1 : NULL;
+    }
+    return -1;
+}
+
+static void choice_text(const char *choices, uint32_t index, char *out, size_t n)
+{
+    for (; index > 0; index--)
+        choices = strchr(choices, '|') + 1;
+    (void)snprintf(out, n, "%.*s", (int)strcspn(choices, "|"), choices);
+}
+
+static bool parse_number(const setting *s, const char *value, double *number, char *error, size_t n)
+{
+    char *end;
+    errno = 0;
+    *number = strtod(value, &end);
+    if (*value == '\0' || *end != '\0' || errno != 0 || !isfinite(*number) || strpbrk(value, "xXpP") != NULL) {
+        (void)snprintf(error, n, "%s.%s = %.80s: not a number", s->section, s->key, value);
+        return false;
+    }
+    if (s->kind == INTEGER && *number != floor(*number)) {
+        (void)snprintf(error, n, "%s.%s = %.80s: not a whole number", s->section, s->key, value);
+        return false;
+    }
+    if (*number < s->min || *number > s->max) {
+        (void)snprintf(error, n, "%s.%s = %.80s: must be %.10g..%.10g%s%s", s->section, s->key, value, s->min, s->max,
+                       s->unit[0] ? " " : "", s->unit);
+        return false;
+    }
+    return true;
+}
+
+static bool set_value(pf_config *config, const setting *s, const char *value, char *error, size_t n)
+{
+    char *field = (char *)config + s->offset;
+    double number;
+    int choice;
+    switch (s->kind) {
+    case TEXT:
+        if (strlen(value) >= PF_CONFIG_TEXT_MAX) {
+            (void)snprintf(error, n, "%s.%s: longer than %u bytes", s->section, s->key, PF_CONFIG_TEXT_MAX - 1);
+            return false;
+        }
+        if (!pf_utf8_check(value)) {
+            (void)snprintf(error, n, "%s.%s: not UTF-8, or with control characters", s->section, s->key);
+            return false;
+        }
+        memcpy(field, value, strlen(value) + 1);
+        return true;
+    case NUMBER:
+        if (!parse_number(s, value, &number, error, n))
+            return false;
+        memcpy(field, &number, sizeof number);
+        return true;
+    case INTEGER:
+        if (!parse_number(s, value, &number, error, n))
+            return false;
+        memcpy(field, &(uint32_t){(uint32_t)number}, sizeof(uint32_t));
+        return true;
+    case SWITCH:
+        choice = find_choice("false|true", value);
+        if (choice < 0) {
+            (void)snprintf(error, n, "%s.%s = %.80s: must be true or false", s->section, s->key, value);
+            return false;
+        }
+        memcpy(field, &(bool){choice == 1}, sizeof(bool));
+        return true;
+    case CHOICE:
+        choice = find_choice(s->choices, value);
+        if (choice < 0) {
+            (void)snprintf(error, n, "%s.%s = %.80s: this build has: %s", s->section, s->key, value, s->choices);
+            return false;
+        }
+        memcpy(field, &(uint32_t){(uint32_t)choice}, sizeof(uint32_t));
+        return true;
+    }
+    return false;
+}
+
+void pf_config_defaults(pf_config *config)
+{
+    char error[256];
+    memset(config, 0, sizeof *config);
+    for (size_t i = 0; i < SETTINGS; i++)
+        if (!set_value(config, &settings[i], settings[i].fallback, error, sizeof error))
+            abort(); /* the table contradicts itself: tests/unit/test_ini.c */
+}
+
+static void append(char *text, size_t n, const char *more)
+{
+    size_t used = strlen(text);
+    (void)snprintf(text + used, n - used, "%s", more);
+}
+
+/* The setting's number, or -1 with a text that lists what there is. */
+static int find_setting(const char *section, const char *key, char *error, size_t n)
+{
+    bool have_section = false;
+    for (size_t i = 0; i < SETTINGS; i++) {
+        if (strcmp(settings[i].section, section) != 0)
+            continue;
+        have_section = true;
+        if (strcmp(settings[i].key, key) == 0)
+            return (int)i;
+    }
+    if (have_section)
+        (void)snprintf(error, n, "unknown key %.80s in [%s]; it has:", key, section);
+    else
+        (void)snprintf(error, n, "unknown section [%.80s]; there are:", section);
+    for (size_t i = 0; i < SETTINGS; i++) {
+        bool is_first = i == 0 || strcmp(settings[i].section, settings[i - 1].section) != 0;
+        if (have_section ? strcmp(settings[i].section, section) != 0 : !is_first)
+            continue;
+        append(error, n, " ");
+        append(error, n, have_section ? settings[i].key : settings[i].section);
+    }
+    return -1;
+}
+
+static bool take_item(void *user, const pf_ini_item *item, char *error, size_t n)
+{
+    pf_config *config = user;
+    int i = find_setting(item->section, item->key, error, n);
+    if (i < 0)
+        return false;
+    if (config->line[i] != 0) {
+        (void)snprintf(error, n, "%s.%s is set a second time; the first is in line %u", item->section, item->key,
+                       config->line[i]);
+        return false;
+    }
+    config->line[i] = item->line;
+    return set_value(config, &settings[i], item->value, error, n);
+}
+
+bool pf_config_parse(pf_config *config, const char *text, size_t text_n, const char *file, char *error, size_t n)
+{
+    return pf_ini_parse(text, text_n, file, take_item, config, error, n);
+}
+
+bool pf_config_load(pf_config *config, const char *file, char *error, size_t n)
+{
+    enum { LIMIT = 1 << 20 };
+    FILE *in = fopen(file, "rb");
+    char *text;
+    size_t size;
+    bool ok = false;
+    if (in == NULL) {
+        (void)snprintf(error, n, "%s: %s", file, strerror(errno));
+        return false;
+    }
+    text = malloc(LIMIT + 1);
+    size = text ? fread(text, 1, LIMIT + 1, in) : 0;
+    if (text == NULL)
+        (void)snprintf(error, n, "%s: no memory", file);
+    else if (ferror(in))
+        (void)snprintf(error, n, "%s: %s", file, strerror(errno));
+    else if (size > LIMIT)
+        (void)snprintf(error, n, "%s: larger than 1 MiB: not a configuration", file);
+    else
+        ok = pf_config_parse(config, text, size, file, error, n);
+    free(text);
+    (void)fclose(in);
+    return ok;
+}
+
+bool pf_config_override(pf_config *config, const char *assignment, char *error, size_t n)
+{
+    char name[128], why[1024] = "";
+    const char *dot = strchr(assignment, '.'), *equals = strchr(assignment, '=');
+    int i;
+    if (dot == NULL || equals == NULL || dot > equals || (size_t)(equals - assignment) >= sizeof name) {
+        (void)snprintf(error, n, "--set %.200s: must be section.key=value", assignment);
+        return false;
+    }
+    memcpy(name, assignment, (size_t)(equals - assignment));
+    name[equals - assignment] = '\0';
+    name[dot - assignment] = '\0';
+    i = find_setting(name, name + (dot - assignment) + 1, why, sizeof why);
+    if (i < 0 || !set_value(config, &settings[i], equals + 1, why, sizeof why)) {
+        (void)snprintf(error, n, "--set %.200s: %s", assignment, why);
+        return false;
+    }
+    return true;
+}
+
+bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n)
+{
+    const char *why = NULL;
+    if (c->camera.path[0] == '\0')
+        why = "camera.path: must be set: the recording to play";
+    else if (c->link.transport == PF_TRANSPORT_SERIAL && c->link.device[0] == '\0')
+        why = "link.device: must be set for link.transport = serial";
+    else if (c->link.transport == PF_TRANSPORT_TCP && c->link.address[0] == '\0')
+        why = "link.address: must be set for link.transport = tcp";
+    else if (c->spool.path[0] == '\0')
+        why = "spool.path: must be set";
+    else if (c->tracker.window % 2 == 0)
+        why = "tracker.window: must be odd";
+    else if (c->tracker.cell != 0 && c->tracker.cell < 16)
+        why = "tracker.cell: must be 0 or 16..256";
+    if (why != NULL)
+        (void)snprintf(error, n, "%s: %s", file, why);
+    return why == NULL;
+}
+
+size_t pf_config_line(const pf_config *config, uint32_t i, char *out, size_t n)
+{
+    const setting *s = &settings[i];
+    const char *field = (const char *)config + s->offset;
+    char value[PF_CONFIG_TEXT_MAX];
+    double number;
+    uint32_t integer;
+    bool is_on;
+    switch (s->kind) {
+    case TEXT:
+        memcpy(value, field, sizeof value);
+        break;
+    case NUMBER:
+        memcpy(&number, field, sizeof number);
+        (void)snprintf(value, sizeof value, "%.15g", number);
+        break;
+    case INTEGER:
+        memcpy(&integer, field, sizeof integer);
+        (void)snprintf(value, sizeof value, "%u", integer);
+        break;
+    case SWITCH:
+        memcpy(&is_on, field, sizeof is_on);
+        (void)snprintf(value, sizeof value, "%s", is_on ? "true" : "false");
+        break;
+    case CHOICE:
+        memcpy(&integer, field, sizeof integer);
+        choice_text(s->choices, integer, value, sizeof value);
+        break;
+    }
+    return (size_t)snprintf(out, n, "%s.%s = %s", s->section, s->key, value);
+}
+
+void pf_config_print_help(FILE *out)
+{
+    (void)fputs("# Settings of pipefishd, each with its default. `pipefishd --help-config` prints this file;\n"
+                "# `pipefishd --config FILE --check-config` checks one of yours.\n",
+                out);
+    for (size_t i = 0; i < SETTINGS; i++) {
+        const setting *s = &settings[i];
+        if (i == 0 || strcmp(s->section, settings[i - 1].section) != 0)
+            (void)fprintf(out, "\n[%s]\n", s->section);
+        (void)fprintf(out, "# %s", s->help);
+        if (s->kind == NUMBER || s->kind == INTEGER)
+            (void)fprintf(out, " (%s%s%.10g..%.10g)", s->unit, s->unit[0] ? ", " : "", s->min, s->max);
+        else if (s->kind == CHOICE)
+            (void)fprintf(out, " (%s)", s->choices);
+        else if (s->kind == SWITCH)
+            (void)fprintf(out, " (true|false)");
+        (void)fprintf(out, "\n%s =%s%s\n", s->key, s->fallback[0] ? " " : "", s->fallback);
+    }
+}

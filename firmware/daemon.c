@@ -1,0 +1,128 @@
+#include "daemon.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "clock.h"
+
+void pf_daemon_stop(pf_daemon *d, pf_stop stop)
+{
+    int expected = PF_STOP_NO;
+    if (!atomic_compare_exchange_strong(&d->stop, &expected, stop) && stop == PF_STOP_SHUTDOWN) {
+        expected = PF_STOP_OPERATOR;
+        (void)atomic_compare_exchange_strong(&d->stop, &expected, stop);
+    }
+    pf_store_hurry(d->store);
+}
+
+/* Mean microseconds. */
+static float mean_us(uint64_t sum_ns, uint64_t n)
+{
+    return n ? (float)((double)sum_ns / (double)n / 1e3) : 0.0f;
+}
+
+void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
+{
+    static const char *const states[] = {"surveying", "draining", "idle"};
+    pf_counters *c = &d->counters;
+    uint64_t now = pf_now();
+    pf_store_stats store;
+
+    pf_store_get_stats(d->store, &store);
+    pthread_mutex_lock(&c->mutex);
+    *status = (pf_msg_status){
+        .time = {d->boot_id, now},
+        .state = states[atomic_load(&d->state)],
+        .frames = c->frames,
+        .frames_dropped = c->frames_dropped,
+        .frames_skipped = 0, /* every frame taken is tracked: a driver drops those that come too fast */
+        .tracks_live = c->tracks_live,
+        .tracks_new = c->tracks_new,
+        .tracks_lost = c->tracks_lost,
+        .keyframes = c->keyframes,
+        .keyframes_dropped = store.keyframes_dropped,
+        .stage = {.capture = mean_us(c->capture_ns, c->frames),
+                  .pyramid = mean_us(c->stage_ns[PF_STAGE_PYRAMID], c->frames_tracked),
+                  .track = mean_us(c->stage_ns[PF_STAGE_TRACK], c->frames_tracked),
+                  .detect = mean_us(c->stage_ns[PF_STAGE_DETECT], c->frames_tracked),
+                  .keyframe = mean_us(c->keyframe_ns, c->keyframes),
+                  .store = mean_us(store.store_ns, store.stored),
+                  .frame_max = (float)((double)c->frame_max_ns / 1e3)},
+        .spool = {store.spool.objects, store.spool.bytes, store.spool.stored, store.spool.acknowledged,
+                  store.spool.evicted, store.spool.errors},
+        .link_up = c->link_up,
+        .link = c->link,
+        .telemetry = c->telemetry,
+        .uptime_ns = now - d->started_ns,
+        .has_clock = c->has_clock,
+        .clock = c->clock,
+    };
+    if (c->last_ns > c->first_ns)
+        status->fps = (double)c->frames_tracked * 1e9 / (double)(c->last_ns - c->first_ns);
+    pthread_mutex_unlock(&c->mutex);
+    memcpy(status->survey_id, d->survey_id, sizeof status->survey_id);
+}
+
+static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store)
+{
+    (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
+                  PF_SOFTWARE, s->time.boot_id);
+    for (size_t i = 0; i < sizeof s->survey_id; i++)
+        (void)fprintf(out, "%02x", s->survey_id[i]);
+    (void)fprintf(out, "\",\n  \"state\": \"%s\",\n  \"uptime_ns\": %" PRIu64 ",\n", s->state, s->uptime_ns);
+    (void)fprintf(out,
+                  "  \"frames\": %" PRIu64 ",\n  \"frames_dropped\": %" PRIu64 ",\n  \"frames_skipped\": %" PRIu64
+                  ",\n  \"tracks_live\": %u,\n  \"tracks_new\": %u,\n  \"tracks_lost\": %u,\n",
+                  s->frames, s->frames_dropped, s->frames_skipped, s->tracks_live, s->tracks_new, s->tracks_lost);
+    (void)fprintf(out, "  \"keyframes\": %" PRIu64 ",\n  \"keyframes_dropped\": %" PRIu64 ",\n  \"fps\": %.3f,\n",
+                  s->keyframes, s->keyframes_dropped, s->fps);
+    (void)fprintf(out,
+                  "  \"stage\": {\"capture\": %.1f, \"pyramid\": %.1f, \"track\": %.1f, \"detect\": %.1f, "
+                  "\"keyframe\": %.1f, \"store\": %.1f, \"frame_max\": %.1f},\n",
+                  (double)s->stage.capture, (double)s->stage.pyramid, (double)s->stage.track, (double)s->stage.detect,
+                  (double)s->stage.keyframe, (double)s->stage.store, (double)s->stage.frame_max);
+    (void)fprintf(out,
+                  "  \"spool\": {\"objects\": %" PRIu64 ", \"bytes\": %" PRIu64 ", \"stored\": %" PRIu64
+                  ", \"acknowledged\": %" PRIu64 ", \"evicted\": %" PRIu64 ", \"errors\": %" PRIu64
+                  ", \"refused\": %" PRIu64 "},\n",
+                  s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.evicted,
+                  s->spool.errors, store->refused);
+    (void)fprintf(out,
+                  "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
+                  ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64
+                  ", \"malformed\": %" PRIu64 ", \"fragments_sent\": %" PRIu64 ", \"fragments_resent\": %" PRIu64
+                  ", \"objects_sent\": %" PRIu64 ", \"sessions\": %" PRIu64 ", \"rtt_us\": %u}",
+                  s->link_up ? "true" : "false", s->link.bytes_out, s->link.bytes_in, s->link.frames_out,
+                  s->link.frames_in, s->link.crc_errors, s->link.malformed, s->link.fragments_sent,
+                  s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us);
+    if (s->telemetry.has_encoder)
+        (void)fprintf(out, ",\n  \"encoder_count\": %" PRId64, s->telemetry.encoder_count);
+    if (s->has_clock)
+        (void)fprintf(out, ",\n  \"clock\": {\"offset_ns\": %" PRId64 ", \"error_ns\": %" PRIu64 "}",
+                      s->clock.offset_ns, s->clock.error_ns);
+    (void)fputs("\n}\n", out);
+}
+
+bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t n)
+{
+    char draft[PF_CONFIG_TEXT_MAX + 8];
+    pf_msg_status status;
+    pf_store_stats store;
+    FILE *out;
+    bool ok;
+    (void)snprintf(draft, sizeof draft, "%s.new", path);
+    out = fopen(draft, "w");
+    if (out != NULL) {
+        pf_daemon_status(d, &status);
+        pf_store_get_stats(d->store, &store);
+        print_status(out, &status, &store);
+        ok = ferror(out) == 0;
+        ok = fclose(out) == 0 && ok;
+        if (ok && rename(draft, path) == 0)
+            return true;
+    }
+    (void)snprintf(error, n, "%s: %s", path, strerror(errno));
+    return false;
+}

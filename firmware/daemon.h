@@ -1,0 +1,76 @@
+/* What the daemon's threads share. Fields are set before the threads start and only read afterwards, unless said
+ * otherwise.
+ */
+#ifndef PIPEFISHD_DAEMON_H
+#define PIPEFISHD_DAEMON_H
+
+#include <pthread.h>
+#include <stdatomic.h>
+
+#include "config.h"
+#include "pipefish/drivers/camera.h"
+#include "pipefish/drivers/gpio.h"
+#include "pipefish/drivers/spool.h"
+#include "pipefish/drivers/transport.h"
+#include "pipefish/messages.h"
+#include "pipefish/profile.h"
+#include "store.h"
+
+#define PF_SOFTWARE "pipefishd 0.1.0"
+_Static_assert(PF_VERSION_MAJOR == 0 && PF_VERSION_MINOR == 1 && PF_VERSION_PATCH == 0, "PF_SOFTWARE says so");
+
+typedef enum pf_stop {
+    PF_STOP_NO = 0,
+    PF_STOP_OPERATOR,   /* stop_survey */
+    PF_STOP_SHUTDOWN,   /* shutdown: exit when the spool is empty, however long that takes */
+    PF_STOP_TERMINATED, /* SIGTERM, SIGINT */
+} pf_stop;
+
+typedef enum pf_state { PF_STATE_SURVEYING = 0, PF_STATE_DRAINING = 1, PF_STATE_IDLE = 2 } pf_state;
+
+/* Counters of the status message; behind the mutex. */
+typedef struct pf_counters {
+    pthread_mutex_t mutex;
+    uint64_t frames, frames_dropped, frames_tracked;
+    uint32_t tracks_live, tracks_new, tracks_lost;
+    uint64_t keyframes;
+    uint64_t capture_ns, stage_ns[PF_STAGES], keyframe_ns, frame_max_ns; /* sums; the slowest frame */
+    uint64_t first_ns, last_ns; /* when capture began, when the last frame was done */
+    pf_msg_telemetry telemetry;
+    bool link_up;
+    pf_link_stats link;
+    bool has_clock;
+    pf_msg_clock_sync clock;
+} pf_counters;
+
+typedef struct pf_daemon {
+    pf_config config;
+    uint64_t boot_id, started_ns;
+    uint8_t survey_id[16];
+    char source[256]; /* of the camera, UTF-8 */
+    pf_camera_source camera;
+    pf_gpio gpio;
+    pf_transport transport;
+    pf_spool spool;
+    bool has_profile;
+    pf_profile profile;
+    uint8_t profile_bytes[PF_PROFILE_BINARY_MAX];
+    size_t profile_size;
+    uint8_t profile_sha256[32];
+    pf_store *store;
+    int wake_fd;       /* eventfd: wakes the courier */
+    _Atomic int stop;  /* pf_stop; set once, by pf_daemon_stop */
+    _Atomic int state; /* pf_state */
+    pf_counters counters;
+} pf_daemon;
+
+/* Asks for the end of the survey; the first reason counts, but a shutdown also follows a stop by the operator. */
+void pf_daemon_stop(pf_daemon *daemon, pf_stop stop);
+
+/* The status message as of now. Any thread. */
+void pf_daemon_status(pf_daemon *daemon, pf_msg_status *status);
+
+/* The same as a JSON file, replaced as a whole. False: error[n] says why. */
+bool pf_daemon_write_status(pf_daemon *daemon, const char *path, char *error, size_t n);
+
+#endif

@@ -1,0 +1,351 @@
+/* pipefishd: reads its settings, opens what it needs, starts the threads, and waits for the end. */
+#include <errno.h>
+#include <getopt.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <sys/random.h>
+#include <sys/signalfd.h>
+#include <unistd.h>
+
+#include "clock.h"
+#include "courier.h"
+#include "log.h"
+#include "pipefish/drivers/sha256.h"
+#include "pipeline.h"
+#include "utf8.h"
+
+#define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
+#define TICK_MS        50
+#define OVERRIDES_MAX  128
+
+enum { DONE = 0, FAILED = 1, USAGE = 2 };
+
+static const char usage[] = "usage: pipefishd [--config FILE] [--set section.key=value]...\n"
+                            "\n"
+                            "  --config FILE            settings (default " DEFAULT_CONFIG ")\n"
+                            "  --set section.key=value  one setting, over the file's; may be repeated\n"
+                            "  --check-config           check the settings and the profile, start nothing\n"
+                            "  --help-config            print every setting with its meaning: an example file\n"
+                            "  --version                print the version\n"
+                            "\n"
+                            "example: pipefishd --config survey.ini --set camera.speed=fast\n"
+                            "exit codes: 0 done, 1 failed, 2 wrong usage\n";
+
+typedef struct options {
+    const char *config;
+    const char *override[OVERRIDES_MAX];
+    int overrides;
+    bool check;
+} options;
+
+/* -1 = go on, else the exit code. */
+static int parse_options(int argc, char **argv, options *o)
+{
+    static const struct option known[] = {{"config", required_argument, NULL, 'c'},
+                                          {"set", required_argument, NULL, 's'},
+                                          {"check-config", no_argument, NULL, 'k'},
+                                          {"help-config", no_argument, NULL, 'H'},
+                                          {"version", no_argument, NULL, 'V'},
+                                          {"help", no_argument, NULL, 'h'},
+                                          {NULL, 0, NULL, 0}};
+    int choice;
+    while ((choice = getopt_long(argc, argv, "h", known, NULL)) != -1) {
+        switch (choice) {
+        case 'c':
+            o->config = optarg;
+            break;
+        case 's':
+            if (o->overrides == OVERRIDES_MAX) {
+                (void)fprintf(stderr, "pipefishd: more than %d --set\n", OVERRIDES_MAX);
+                return USAGE;
+            }
+            o->override[o->overrides++] = optarg;
+            break;
+        case 'k':
+            o->check = true;
+            break;
+        case 'H':
+            pf_config_print_help(stdout);
+            return DONE;
+        case 'V':
+            (void)puts(PF_SOFTWARE);
+            return DONE;
+        case 'h':
+            (void)fputs(usage, stdout);
+            return DONE;
+        default:
+            (void)fputs(usage, stderr);
+            return USAGE;
+        }
+    }
+    if (optind < argc) {
+        (void)fprintf(stderr, "pipefishd: unexpected argument %s\n%s", argv[optind], usage);
+        return USAGE;
+    }
+    return -1;
+}
+
+static bool load_config(const options *o, pf_config *config, char *error, size_t n)
+{
+    pf_config_defaults(config);
+    if (!pf_config_load(config, o->config, error, n))
+        return false;
+    for (int i = 0; i < o->overrides; i++)
+        if (!pf_config_override(config, o->override[i], error, n))
+            return false;
+    return pf_config_check(config, o->config, error, n);
+}
+
+static bool load_profile(pf_daemon *d, char *error, size_t n)
+{
+    const char *path = d->config.camera.profile, *why = NULL;
+    uint8_t bytes[PF_PROFILE_BINARY_MAX + 1];
+    FILE *in;
+    bool is_read;
+    if (path[0] == '\0')
+        return true;
+    in = fopen(path, "rb");
+    if (in == NULL) {
+        (void)snprintf(error, n, "camera.profile: %s: %s", path, strerror(errno));
+        return false;
+    }
+    d->profile_size = fread(bytes, 1, sizeof bytes, in);
+    is_read = ferror(in) == 0;
+    (void)fclose(in);
+    if (!is_read || d->profile_size > PF_PROFILE_BINARY_MAX) {
+        (void)snprintf(error, n, "camera.profile: %s: %s", path,
+                       is_read ? "too large: not a binary profile" : "cannot be read");
+        return false;
+    }
+    if (pf_profile_decode(bytes, d->profile_size, &d->profile, &why) != PF_OK) {
+        (void)snprintf(error, n, "camera.profile: %s: %s", path, why);
+        return false;
+    }
+    memcpy(d->profile_bytes, bytes, d->profile_size);
+    d->has_profile = true;
+    return pf_sha256(bytes, d->profile_size, d->profile_sha256) == PF_OK;
+}
+
+static bool open_camera(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    const pf_camera_info *info;
+    pf_replay_config replay = {.path = c->camera.path,
+                               .csv = c->camera.csv[0] ? c->camera.csv : NULL,
+                               .speed = c->camera.speed == PF_SPEED_FAST ? PF_REPLAY_FAST : PF_REPLAY_RECORDED,
+                               .loops = c->camera.loops,
+                               .frame_rate = c->camera.frame_rate,
+                               .restamp = c->camera.restamp};
+    if (pf_replay_open(&d->camera, &replay, error, n) != PF_OK)
+        return false;
+    info = d->camera.ops->info(d->camera.self);
+    (void)snprintf(d->source, sizeof d->source, "%s", info->source);
+    pf_utf8_clean(d->source);
+    if (d->has_profile && (d->profile.camera.width != info->width || d->profile.camera.height != info->height)) {
+        (void)snprintf(error, n, "%s: the profile is for %u x %u, the camera gives %u x %u", c->camera.profile,
+                       d->profile.camera.width, d->profile.camera.height, info->width, info->height);
+        d->camera.ops->close(d->camera.self);
+        return false;
+    }
+    return true;
+}
+
+static bool open_transport(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    pf_status status;
+    if (c->link.transport == PF_TRANSPORT_SERIAL)
+        status =
+            pf_serial_open(&d->transport, &(pf_serial_config){c->link.device, c->link.baud, c->link.rtscts}, error, n);
+    else
+        status = pf_tcp_listen(&d->transport, &(pf_tcp_config){c->link.address, (uint16_t)c->link.port}, error, n);
+    return status == PF_OK;
+}
+
+static bool open_random(pf_daemon *d, char *error, size_t n)
+{
+    while (d->boot_id == 0) {
+        if (getrandom(&d->boot_id, sizeof d->boot_id, 0) != (ssize_t)sizeof d->boot_id) {
+            (void)snprintf(error, n, "no random numbers: %s", strerror(errno));
+            return false;
+        }
+    }
+    return true;
+}
+
+/* Writes the status file if it is due. */
+static void note_status(pf_daemon *d, uint64_t *due, bool is_last)
+{
+    char error[PF_CONFIG_TEXT_MAX + 128];
+    uint64_t now = pf_now();
+    if (d->config.daemon.status_file[0] == '\0' || (now < *due && !is_last))
+        return;
+    *due = now + (uint64_t)d->config.status.interval_ms * 1000000u;
+    if (!pf_daemon_write_status(d, d->config.daemon.status_file, error, sizeof error))
+        pf_log(PF_LOG_WARNING, "status file: %s", error);
+}
+
+/* The first signal ends the survey and drains; the second ends at once: what is stored is safe. */
+static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
+{
+    struct signalfd_siginfo info;
+    if (read(signals, &info, sizeof info) != (ssize_t)sizeof info)
+        return;
+    if (*is_terminated) {
+        pf_log(PF_LOG_WARNING, "second signal: exit at once");
+        _exit(FAILED);
+    }
+    *is_terminated = true;
+    pf_log(PF_LOG_INFO, "signal %u: the survey ends", info.ssi_signo);
+    pf_daemon_stop(d, PF_STOP_TERMINATED);
+}
+
+/* Returns when it is time to exit. */
+static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
+{
+    uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
+    bool is_terminated = false;
+    for (;;) {
+        struct pollfd fd = {.fd = signals, .events = POLLIN};
+        bool is_ended, is_drained, was_terminated = is_terminated;
+        if (poll(&fd, 1, TICK_MS) > 0)
+            take_signal(d, signals, &is_terminated);
+        note_status(d, &status_due, false);
+        if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
+            continue;
+        /* From the end of the survey, or from the signal if that comes later. */
+        if (drain_end == 0 || is_terminated != was_terminated)
+            drain_end = pf_now() + drain_ns;
+        is_ended = pf_pipeline_is_done(pipeline);
+        is_drained = is_ended && pf_store_is_drained(d->store);
+        if (is_drained)
+            atomic_store(&d->state, PF_STATE_IDLE);
+        if (!is_terminated && atomic_load(&d->stop) == PF_STOP_SHUTDOWN) {
+            if (is_drained)
+                return;
+            continue;
+        }
+        if (!is_terminated && !d->config.daemon.exit_when_done)
+            continue;
+        if (is_drained || pf_now() >= drain_end)
+            return;
+    }
+}
+
+static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
+{
+    const pf_config *c = &d->config;
+    char error[1024];
+    pf_courier *courier = NULL;
+    pf_pipeline *pipeline = NULL;
+    pf_store_stats stats;
+    pf_store_config store = {.jobs = c->keyframe.queue,
+                             .slots = c->link.send_slots,
+                             .capacity = pf_pipeline_object_max(d),
+                             .is_patient = c->camera.speed == PF_SPEED_FAST,
+                             .wake_fd = d->wake_fd};
+    uint64_t status_due = 0;
+    bool is_good = false;
+
+    if (!pf_store_open(&d->store, &d->spool, survey, &store, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return FAILED;
+    }
+    if (pf_courier_open(&courier, d, error, sizeof error) &&
+        pf_pipeline_open(&pipeline, d, courier, survey, error, sizeof error)) {
+        pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
+               d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
+               survey->boots, survey->is_resumed ? "goes on" : "begins");
+        is_good = pf_pipeline_start(pipeline, error, sizeof error);
+    }
+    if (is_good)
+        supervise(d, pipeline, signals);
+    else
+        pf_log(PF_LOG_ERROR, "%s", error);
+    pf_store_quit(d->store);
+    if (pipeline != NULL)
+        is_good = pf_pipeline_close(pipeline) && is_good;
+    if (courier != NULL)
+        pf_courier_close(courier);
+    note_status(d, &status_due, true);
+    pf_store_get_stats(d->store, &stats);
+    if (stats.spool.objects > 0)
+        pf_log(PF_LOG_WARNING, "%llu objects stay in the spool for the next start",
+               (unsigned long long)stats.spool.objects);
+    is_good = is_good && !stats.has_failed;
+    pf_store_close(d->store);
+    return is_good ? DONE : FAILED;
+}
+
+static int open_and_run(pf_daemon *d, int signals)
+{
+    const pf_config *c = &d->config;
+    char error[1024] = "";
+    pf_spool_config spool = {c->spool.path, (uint64_t)c->spool.quota_mb * 1000000u};
+    pf_survey survey;
+    int code = FAILED;
+
+    d->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    if (d->wake_fd < 0 || !open_random(d, error, sizeof error) || !open_camera(d, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return FAILED;
+    }
+    if (pf_gpio_none_open(&d->gpio) == PF_OK) {
+        if (open_transport(d, error, sizeof error)) {
+            if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
+                if (pf_survey_open(&survey, &d->spool, error, sizeof error)) {
+                    memcpy(d->survey_id, survey.id, sizeof d->survey_id);
+                    code = run_survey(d, &survey, signals);
+                    error[0] = '\0';
+                }
+                d->spool.ops->close(d->spool.self);
+            }
+            d->transport.ops->close(d->transport.self);
+        }
+        d->gpio.ops->close(d->gpio.self);
+    }
+    d->camera.ops->close(d->camera.self);
+    (void)close(d->wake_fd);
+    if (error[0] != '\0')
+        pf_log(PF_LOG_ERROR, "%s", error);
+    return code;
+}
+
+int main(int argc, char **argv)
+{
+    static pf_daemon d; /* 100 kB of settings and counters: not for the stack */
+    options o = {.config = DEFAULT_CONFIG};
+    char error[1536] = "";
+    sigset_t set;
+    int code = parse_options(argc, argv, &o), signals;
+
+    if (code >= 0)
+        return code;
+    d.started_ns = pf_now();
+    if (!load_config(&o, &d.config, error, sizeof error) || !load_profile(&d, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return FAILED;
+    }
+    if (o.check) {
+        (void)printf("%s: ok\n", o.config);
+        return DONE;
+    }
+    pf_log_set_level(d.config.daemon.log_level);
+    pthread_mutex_init(&d.counters.mutex, NULL);
+    (void)signal(SIGPIPE, SIG_IGN);
+    (void)sigemptyset(&set);
+    (void)sigaddset(&set, SIGTERM);
+    (void)sigaddset(&set, SIGINT);
+    (void)pthread_sigmask(SIG_BLOCK, &set, NULL); /* before the threads: only the descriptor gets them */
+    signals = signalfd(-1, &set, SFD_CLOEXEC | SFD_NONBLOCK);
+    if (signals < 0) {
+        pf_log(PF_LOG_ERROR, "signals: %s", strerror(errno));
+        return FAILED;
+    }
+    code = open_and_run(&d, signals);
+    (void)close(signals);
+    return code;
+}

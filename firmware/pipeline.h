@@ -1,0 +1,27 @@
+/* The capture thread: camera -> tracker -> keyframe choice -> JPEG -> message -> store. One thread: the frame rate is
+ * what one core can do, and nothing else of the daemon can stall it.
+ */
+#ifndef PIPEFISHD_PIPELINE_H
+#define PIPEFISHD_PIPELINE_H
+
+#include "courier.h"
+
+typedef struct pf_pipeline pf_pipeline;
+
+/* Most bytes of a keyframe message with this configuration and camera: what the store's jobs must hold. */
+size_t pf_pipeline_object_max(const pf_daemon *daemon);
+
+/* Takes all memory; hands the SurveyStart to the store. False: error[n] says what failed. */
+bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
+                      char *error, size_t n);
+
+/* Starts the thread: captures until the recording ends, the camera fails or the daemon is stopped, then stores the
+ * SurveyEnd and sets is_done. */
+bool pf_pipeline_start(pf_pipeline *pipeline, char *error, size_t n);
+bool pf_pipeline_is_done(pf_pipeline *pipeline);
+
+/* Joins the thread (pf_store_quit must have been called, or is_done be true) and frees all. False: the camera failed.
+ */
+bool pf_pipeline_close(pf_pipeline *pipeline);
+
+#endif

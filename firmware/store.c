@@ -1,0 +1,446 @@
+#include "store.h"
+
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "clock.h"
+#include "config.h"
+#include "log.h"
+#include "pipefish/drivers/sha256.h"
+#include "pipefish/link.h"
+
+enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
+
+struct pf_store {
+    pf_spool spool;
+    pf_store_config config;
+    pthread_t thread;
+    pthread_mutex_t mutex; /* guards all below; never held during a call of the spool */
+    pthread_cond_t work;   /* something for the thread */
+    pthread_cond_t change; /* something for those who wait on it */
+    pf_survey survey;
+    pf_job *jobs;      /* the memory of all jobs */
+    pf_job **free_job; /* stack */
+    uint32_t free_count;
+    pf_job **queue; /* ring, oldest first */
+    uint32_t queue_first, queue_count;
+    bool is_blocked; /* the oldest job waits for room in the spool */
+    bool has_more;   /* the spool may hold an object after `cursor` */
+    uint64_t cursor; /* row of the last object that went into a slot */
+    pf_slot *slots;
+    size_t slot_capacity;
+    bool is_hurried, is_quitting;
+    pf_store_stats stats;
+};
+
+/* ---- the thread's work: each is called without the mutex */
+
+static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey)
+{
+    uint8_t name[32], value[PF_SURVEY_BYTES];
+    size_t value_n = 0; /* of the survey's end: the value is deleted */
+    if (pf_sha256(job->bytes, job->n, name) != PF_OK)
+        return PF_ERR_IO;
+    if (job->kind != PF_OBJECT_SURVEY_END)
+        value_n = pf_survey_pack(survey, value);
+    return s->spool.ops->put_and_set(s->spool.self, job->kind, name, job->bytes, job->n, PF_SURVEY_KEY, value, value_n);
+}
+
+static bool is_keyframe(const pf_job *job)
+{
+    return job->kind == PF_OBJECT_KEYFRAME;
+}
+
+static void lose(pf_store *s, uint32_t index)
+{
+    s->stats.keyframes_dropped++;
+    pf_survey_lose(&s->survey, index);
+}
+
+static void free_job(pf_store *s, pf_job *job)
+{
+    s->free_job[s->free_count++] = job;
+    pthread_cond_broadcast(&s->change);
+}
+
+static void pop_job(pf_store *s)
+{
+    pf_job *job = s->queue[s->queue_first];
+    s->queue_first = (s->queue_first + 1) % s->config.jobs;
+    s->queue_count--;
+    free_job(s, job);
+}
+
+/* Stores the oldest job. Enters and leaves with the mutex. */
+static void do_job(pf_store *s)
+{
+    const pf_job *job = s->queue[s->queue_first];
+    pf_survey survey = s->survey;
+    uint64_t start = pf_now();
+    bool was_blocked = s->is_blocked;
+    pf_status status;
+
+    if (is_keyframe(job))
+        survey.next_index = job->index + 1;
+    pthread_mutex_unlock(&s->mutex);
+    status = store_object(s, job, &survey);
+    pthread_mutex_lock(&s->mutex);
+    s->is_blocked = false;
+    if (status == PF_OK) {
+        s->has_more = true;
+        s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
+        if (is_keyframe(job)) {
+            s->survey.next_index = job->index + 1;
+            s->stats.store_ns += pf_now() - start;
+            s->stats.stored++;
+        }
+    } else if (status == PF_ERR_SPACE && (s->config.is_patient || !is_keyframe(job))) {
+        if (!was_blocked)
+            pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
+        s->is_blocked = true;
+        return;
+    } else {
+        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self),
+               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
+        if (is_keyframe(job))
+            lose(s, job->index);
+        else
+            s->stats.has_failed = true;
+    }
+    pop_job(s);
+}
+
+/* Loads the next object into an empty slot. Enters and leaves with the mutex. */
+static void fill_slot(pf_store *s, pf_slot *slot)
+{
+    uint64_t after = s->cursor, one = 1;
+    size_t n = 0;
+    pf_status status;
+    /* Before the look: what is stored meanwhile sets it again. */
+    s->has_more = false;
+    pthread_mutex_unlock(&s->mutex);
+    status = s->spool.ops->next(s->spool.self, after, &slot->item);
+    if (status == PF_OK) {
+        status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
+        after = slot->item.row;
+        if (status == PF_ERR_CHECKSUM) { /* of no use to anyone, and never acknowledged */
+            pf_log(PF_LOG_ERROR, "%s: it is removed", s->spool.ops->error(s->spool.self));
+            (void)s->spool.ops->remove(s->spool.self, slot->item.row);
+        } else if (status != PF_OK) {
+            pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
+        }
+    } else if (status != PF_ERR_END) {
+        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+    }
+    pthread_mutex_lock(&s->mutex);
+    if (after != s->cursor)
+        s->has_more = true;
+    s->cursor = after;
+    if (status == PF_OK) {
+        slot->state = SLOT_READY;
+        if (write(s->config.wake_fd, &one, sizeof one) < 0)
+            pf_log(PF_LOG_ERROR, "cannot wake the courier");
+    }
+}
+
+static void empty_slot(pf_store *s, pf_slot *slot)
+{
+    uint64_t row = slot->item.row;
+    pthread_mutex_unlock(&s->mutex);
+    if (s->spool.ops->remove(s->spool.self, row) != PF_OK)
+        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+    pthread_mutex_lock(&s->mutex);
+    slot->state = SLOT_EMPTY;
+    s->is_blocked = false;
+}
+
+static void refresh_spool_stats(pf_store *s)
+{
+    pf_spool_stats stats;
+    pthread_mutex_unlock(&s->mutex);
+    s->spool.ops->stats(s->spool.self, &stats);
+    pthread_mutex_lock(&s->mutex);
+    s->stats.spool = stats;
+    pthread_cond_broadcast(&s->change);
+}
+
+/* One round: at most one job, and every slot once, so that neither starves the other. */
+static bool do_round(pf_store *s)
+{
+    bool is_busy = false;
+    if (s->queue_count > 0 && !s->is_blocked) {
+        do_job(s);
+        is_busy = true;
+    }
+    for (uint32_t i = 0; i < s->config.slots; i++) {
+        if (s->slots[i].state == SLOT_DONE) {
+            empty_slot(s, &s->slots[i]);
+            is_busy = true;
+        }
+        if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_quitting) {
+            fill_slot(s, &s->slots[i]);
+            is_busy = true;
+        }
+    }
+    return is_busy;
+}
+
+static void *run(void *argument)
+{
+    pf_store *s = argument;
+    pthread_mutex_lock(&s->mutex);
+    refresh_spool_stats(s);
+    for (;;) {
+        if (do_round(s)) {
+            refresh_spool_stats(s);
+            continue;
+        }
+        if (s->is_quitting)
+            break;
+        if (s->is_blocked) { /* room may come from elsewhere, too: a full disk that someone has cleaned up */
+            struct timespec until;
+            (void)clock_gettime(CLOCK_MONOTONIC, &until);
+            until.tv_sec += 1;
+            if (pthread_cond_timedwait(&s->work, &s->mutex, &until) != 0)
+                s->is_blocked = false;
+        } else {
+            pthread_cond_wait(&s->work, &s->mutex);
+        }
+    }
+    while (s->queue_count > 0) {
+        const pf_job *job = s->queue[s->queue_first];
+        pf_log(PF_LOG_ERROR, "no room in the spool: %s is lost",
+               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
+        if (is_keyframe(job))
+            lose(s, job->index);
+        else
+            s->stats.has_failed = true;
+        pop_job(s);
+    }
+    pthread_mutex_unlock(&s->mutex);
+    return NULL;
+}
+
+/* ---- opening and closing */
+
+static bool allocate(pf_store *s)
+{
+    uint32_t jobs = s->config.jobs;
+    s->jobs = calloc(jobs, sizeof *s->jobs);
+    s->free_job = calloc(jobs, sizeof(pf_job *));
+    s->queue = calloc(jobs, sizeof(pf_job *));
+    s->slots = calloc(s->config.slots, sizeof *s->slots);
+    if (!s->jobs || !s->free_job || !s->queue || !s->slots)
+        return false;
+    for (uint32_t i = 0; i < jobs; i++) {
+        s->jobs[i].bytes = malloc(s->config.capacity);
+        if (!s->jobs[i].bytes)
+            return false;
+        s->free_job[s->free_count++] = &s->jobs[i];
+    }
+    for (uint32_t i = 0; i < s->config.slots; i++) {
+        s->slots[i].bytes = malloc(s->slot_capacity);
+        if (!s->slots[i].bytes)
+            return false;
+    }
+    return true;
+}
+
+static void release(pf_store *s)
+{
+    for (uint32_t i = 0; s->jobs && i < s->config.jobs; i++)
+        free(s->jobs[i].bytes);
+    for (uint32_t i = 0; s->slots && i < s->config.slots; i++)
+        free(s->slots[i].bytes);
+    free(s->jobs);
+    free(s->free_job);
+    free(s->queue);
+    free(s->slots);
+    free(s);
+}
+
+/* An object of an earlier run, with a larger camera perhaps, must fit into a slot as well. */
+static bool measure_spool(pf_store *s, char *error, size_t n)
+{
+    pf_spool_item item = {0};
+    pf_status status;
+    s->slot_capacity = s->config.capacity;
+    while ((status = s->spool.ops->next(s->spool.self, item.row, &item)) == PF_OK)
+        if (item.size > s->slot_capacity)
+            s->slot_capacity = item.size;
+    if (status != PF_ERR_END)
+        (void)snprintf(error, n, "%s", s->spool.ops->error(s->spool.self));
+    return status == PF_ERR_END;
+}
+
+bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *survey, const pf_store_config *config,
+                   char *error, size_t n)
+{
+    pthread_condattr_t attributes;
+    pf_store *s = calloc(1, sizeof *s);
+    if (s == NULL) {
+        (void)snprintf(error, n, "no memory");
+        return false;
+    }
+    s->spool = *spool;
+    s->survey = *survey;
+    s->config = *config;
+    s->has_more = true;
+    if (!measure_spool(s, error, n)) {
+        release(s);
+        return false;
+    }
+    if (!allocate(s)) {
+        (void)snprintf(error, n, "no memory for %u + %u objects of %zu bytes", config->jobs, config->slots,
+                       s->slot_capacity);
+        release(s);
+        return false;
+    }
+    pthread_mutex_init(&s->mutex, NULL);
+    pthread_condattr_init(&attributes);
+    pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
+    pthread_cond_init(&s->work, &attributes);
+    pthread_cond_init(&s->change, &attributes);
+    pthread_condattr_destroy(&attributes);
+    if (pthread_create(&s->thread, NULL, run, s) != 0) {
+        (void)snprintf(error, n, "cannot start the store thread");
+        release(s);
+        return false;
+    }
+    *store = s;
+    return true;
+}
+
+void pf_store_quit(pf_store *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    s->is_quitting = true;
+    s->is_hurried = true;
+    pthread_cond_broadcast(&s->work);
+    pthread_cond_broadcast(&s->change);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+void pf_store_close(pf_store *s)
+{
+    (void)pthread_join(s->thread, NULL);
+    pthread_cond_destroy(&s->work);
+    pthread_cond_destroy(&s->change);
+    pthread_mutex_destroy(&s->mutex);
+    release(s);
+}
+
+/* ---- the producer's side */
+
+size_t pf_store_capacity(const pf_store *s)
+{
+    return s->config.capacity;
+}
+
+pf_job *pf_store_take(pf_store *s)
+{
+    pf_job *job = NULL;
+    pthread_mutex_lock(&s->mutex);
+    while (s->free_count == 0 && s->config.is_patient && !s->is_hurried)
+        pthread_cond_wait(&s->change, &s->mutex);
+    if (s->free_count > 0)
+        job = s->free_job[--s->free_count];
+    pthread_mutex_unlock(&s->mutex);
+    return job;
+}
+
+void pf_store_give(pf_store *s, pf_job *job)
+{
+    pthread_mutex_lock(&s->mutex);
+    s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
+    pthread_cond_signal(&s->work);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+void pf_store_give_back(pf_store *s, pf_job *job)
+{
+    pthread_mutex_lock(&s->mutex);
+    free_job(s, job);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+void pf_store_lose(pf_store *s, uint32_t index)
+{
+    pthread_mutex_lock(&s->mutex);
+    lose(s, index);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+void pf_store_hurry(pf_store *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    s->is_hurried = true;
+    pthread_cond_broadcast(&s->change);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+bool pf_store_settle(pf_store *s)
+{
+    bool is_settled;
+    pthread_mutex_lock(&s->mutex);
+    while (s->queue_count > 0 && !s->is_quitting)
+        pthread_cond_wait(&s->change, &s->mutex);
+    is_settled = s->queue_count == 0;
+    pthread_mutex_unlock(&s->mutex);
+    return is_settled;
+}
+
+/* ---- the courier's side */
+
+pf_slot *pf_store_next_slot(pf_store *s)
+{
+    pf_slot *next = NULL;
+    pthread_mutex_lock(&s->mutex);
+    for (uint32_t i = 0; i < s->config.slots; i++)
+        if (s->slots[i].state == SLOT_READY && (next == NULL || s->slots[i].item.row < next->item.row))
+            next = &s->slots[i];
+    if (next != NULL)
+        next->state = SLOT_SENDING;
+    pthread_mutex_unlock(&s->mutex);
+    return next;
+}
+
+void pf_store_release_slot(pf_store *s, const uint8_t name[32], bool is_refused)
+{
+    pthread_mutex_lock(&s->mutex);
+    for (uint32_t i = 0; i < s->config.slots; i++) {
+        if (s->slots[i].state == SLOT_SENDING && memcmp(s->slots[i].item.name, name, 32) == 0) {
+            s->slots[i].state = SLOT_DONE;
+            s->stats.refused += is_refused;
+        }
+    }
+    pthread_cond_signal(&s->work);
+    pthread_mutex_unlock(&s->mutex);
+}
+
+bool pf_store_is_drained(pf_store *s)
+{
+    bool is_drained;
+    pthread_mutex_lock(&s->mutex);
+    is_drained = s->queue_count == 0 && s->stats.spool.objects == 0;
+    pthread_mutex_unlock(&s->mutex);
+    return is_drained;
+}
+
+void pf_store_get_stats(pf_store *s, pf_store_stats *stats)
+{
+    pthread_mutex_lock(&s->mutex);
+    *stats = s->stats;
+    pthread_mutex_unlock(&s->mutex);
+}
+
+void pf_store_get_survey(pf_store *s, pf_survey *survey)
+{
+    pthread_mutex_lock(&s->mutex);
+    *survey = s->survey;
+    pthread_mutex_unlock(&s->mutex);
+}

@@ -1,0 +1,34 @@
+/* Which survey this is, and how far it has come. Kept in the spool's value "survey" until the survey's end is stored,
+ * so that a restart goes on with the same survey under a new boot id.
+ */
+#ifndef PIPEFISHD_SURVEY_H
+#define PIPEFISHD_SURVEY_H
+
+#include <stdbool.h>
+
+#include "pipefish/drivers/spool.h"
+
+#define PF_SURVEY_KEY      "survey"
+#define PF_SURVEY_LOST_MAX 1024u /* numbers of lost keyframes that are remembered; more are only counted */
+#define PF_SURVEY_BYTES    (1u + 16u + 3u * 4u + 4u * PF_SURVEY_LOST_MAX)
+
+typedef struct pf_survey {
+    uint8_t id[16];
+    uint32_t boots;      /* starts of the daemon so far, this one included */
+    uint32_t next_index; /* of the next keyframe */
+    uint32_t lost_count;
+    uint32_t lost[PF_SURVEY_LOST_MAX];
+    bool is_resumed; /* not the survey's first boot */
+} pf_survey;
+
+/* Goes on with the survey that the spool remembers, or begins one with a random id. False: error[n] says what failed.
+ */
+bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_t n);
+
+/* The survey as the spool keeps it; returns its bytes, PF_SURVEY_BYTES at most. */
+size_t pf_survey_pack(const pf_survey *survey, uint8_t *out);
+
+/* Remembers a keyframe that was made but cannot be delivered. */
+void pf_survey_lose(pf_survey *survey, uint32_t index);
+
+#endif

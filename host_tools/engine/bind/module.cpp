@@ -1,0 +1,15 @@
+// The Python module pipefish._engine: each room of the engine binds itself, here they meet.
+#include <nanobind/nanobind.h>
+
+namespace nb = nanobind;
+
+void bind_camera(nb::module_ &m);
+void bind_link(nb::module_ &m);
+void bind_sim(nb::module_ &m);
+
+NB_MODULE(_engine, m) {
+    m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
+    bind_camera(m);
+    bind_link(m);
+    bind_sim(m);
+}

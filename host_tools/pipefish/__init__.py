@@ -1,0 +1,36 @@
+"""Pipefish: measure pipes with one fisheye camera.
+
+Names are loaded when first used, so that `import pipefish` and `pipefish --help` are quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_LAZY = {
+    "Camera": "pipefish.camera",
+    "Scene": "pipefish.simulate",
+    "Survey": "pipefish.survey",
+    "Keyframe": "pipefish.survey",
+    "Tracks": "pipefish.survey",
+    "PARAMETERS": "pipefish.camera",
+    "ArgumentError": "pipefish.errors",
+    "PipefishError": "pipefish.errors",
+    "FormatError": "pipefish.errors",
+    "ProfileError": "pipefish.errors",
+}
+
+__all__ = ["__version__", *sorted(_LAZY)]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'pipefish' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

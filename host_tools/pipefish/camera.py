@@ -1,0 +1,425 @@
+"""The camera: Kannala and Brandt's generic model, evaluated by the C core, and its profile as JSON and as binary.
+
+docs/profile.md describes the parameters, the JSON form and the binary form.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import math
+import numbers
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _engine
+from .errors import ArgumentError, ProfileError
+
+_FORMAT = "pipefish-profile"
+_VERSION = 1
+_BYTES_MAX = 1 << 20  # a full profile is about 25 kB of JSON
+
+# In the order of pf_radial and pf_profile_source.
+_RADIAL = ("generic", "perspective", "stereographic", "equidistant", "equisolid", "orthographic", "unified")
+_SOURCE = ("unknown", "target", "selfcal", "imported", "simulated")
+
+_INTEGERS = ("width", "height")
+_SCALARS = ("f_u", "f_v", "skew", "c_u", "c_v", "k2", "k3", "k4", "k5", "mirror", "pupil_e1", "theta_max")
+_CIRCLE = ("circle_u", "circle_v", "circle_radius")
+_ARRAYS = {
+    "tilt": 2,
+    "asym_radial_theta": 3,
+    "asym_radial_phi": 4,
+    "asym_tangential_theta": 3,
+    "asym_tangential_phi": 4,
+    "cpoly": 14,
+}
+_TEXTS = ("name", "serial")
+_JSON_REQUIRED = ("width", "height", "f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "theta_max")
+
+
+def _indexed(name: str) -> list[str]:
+    return [f"{name}[{i}]" for i in range(_ARRAYS[name])]
+
+
+#: Names of the parameters that may be free, at their number in the binary form.
+PARAMETERS: tuple[str, ...] = (
+    *("f_u", "f_v", "skew", "c_u", "c_v", "k2", "k3", "k4", "k5"),
+    *_indexed("asym_radial_theta"),
+    *_indexed("asym_radial_phi"),
+    *_indexed("asym_tangential_theta"),
+    *_indexed("asym_tangential_phi"),
+    *_indexed("tilt"),
+    *("mirror", "pupil_e1"),
+    *_indexed("cpoly"),
+)
+
+
+def _number(key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise ProfileError(None, key, f"not a number: {value!r:.60}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise ProfileError(None, key, "not finite")
+    return result
+
+
+def _integer(key: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise ProfileError(None, key, f"not a whole number: {value!r:.60}")
+    if not 0 <= value < 1 << 32:
+        raise ProfileError(None, key, "out of range")
+    return int(value)
+
+
+def _numbers(key: str, value: object, count: int) -> tuple[float, ...]:
+    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str | bytes) or len(value) != count:
+        raise ProfileError(None, key, f"not a list of {count} numbers")
+    return tuple(_number(f"{key}[{i}]", item) for i, item in enumerate(value))
+
+
+def _choice(key: str, value: object, choices: Sequence[str]) -> int:
+    if not isinstance(value, str) or value not in choices:
+        raise ProfileError(None, key, f"{value!r:.60} is none of {', '.join(choices)}")
+    return choices.index(value)
+
+
+def _text(key: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise ProfileError(None, key, "not a text")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise ProfileError(None, key, "not UTF-8 text") from None
+    return value
+
+
+def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float64]:
+    """(N, columns) numbers as a contiguous float64 array, or ArgumentError."""
+    try:
+        given = np.asarray(array)
+    except ValueError:
+        raise ArgumentError(f"{what}: rows of different lengths; expected shape (N, {columns})") from None
+    if given.dtype.kind not in "fiu":
+        raise ArgumentError(f"{what}: expected real numbers, got dtype {given.dtype}")
+    if given.ndim != 2 or given.shape[1] != columns:
+        raise ArgumentError(f"{what}: expected shape (N, {columns}), got {given.shape}")
+    return np.ascontiguousarray(given, dtype=np.float64)
+
+
+def _split(error: ValueError) -> ProfileError:
+    """The core says 'field: reason'."""
+    key, _, reason = str(error).partition(": ")
+    return ProfileError(None, key, reason)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Camera:
+    """One calibrated camera. Immutable; use dataclasses.replace() for a changed copy.
+
+    Pixels: the centre of the top-left pixel is (0, 0), u right, v down. Camera frame: x right, y down, z along the
+    optical axis. Angles in radians, lengths in metres. f_u and f_v are in pixels per radian on the axis.
+    covariance is (n, n) over covariance_parameters, names out of PARAMETERS in their order; None = unknown.
+
+    Raises ProfileError, with the name of the argument, for a camera that is not valid or not supported.
+    """
+
+    width: int
+    height: int
+    f_u: float
+    f_v: float
+    c_u: float
+    c_v: float
+    theta_max: float
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    skew: float = 0.0
+    radial: str = "generic"
+    tilt: tuple[float, ...] = (0.0,) * 2
+    asym_radial_theta: tuple[float, ...] = (0.0,) * 3
+    asym_radial_phi: tuple[float, ...] = (0.0,) * 4
+    asym_tangential_theta: tuple[float, ...] = (0.0,) * 3
+    asym_tangential_phi: tuple[float, ...] = (0.0,) * 4
+    cpoly: tuple[float, ...] = (0.0,) * 14
+    mirror: float = 0.0
+    pupil_e1: float = 0.0
+    circle_u: float = 0.0
+    circle_v: float = 0.0
+    circle_radius: float = 0.0
+    name: str = ""
+    serial: str = ""
+    source: str = "unknown"
+    created: datetime.datetime | None = None
+    rms_px: float | None = None
+    theta_covered: float | None = None
+    covariance_parameters: tuple[str, ...] = ()
+    covariance: npt.NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        profile = _engine.Profile()
+
+        def put(key: str, value: Any) -> None:
+            object.__setattr__(self, key, value)
+            setattr(profile, key, value)
+
+        try:
+            for key in _INTEGERS:
+                put(key, _integer(key, getattr(self, key)))
+            for key in _SCALARS + _CIRCLE:
+                put(key, _number(key, getattr(self, key)))
+            for key, count in _ARRAYS.items():
+                put(key, _numbers(key, getattr(self, key), count))
+            for key in _TEXTS:
+                put(key, _text(key, getattr(self, key)))
+            profile.radial = _choice("radial", self.radial, _RADIAL)
+            profile.source = _choice("source", self.source, _SOURCE)
+            profile.created_unix_s = self._created_unix_s()
+            profile.rms_px = math.nan
+            if self.rms_px is not None:
+                put("rms_px", _number("rms_px", self.rms_px))
+            if self.theta_covered is not None:
+                put("theta_covered", _number("theta_covered", self.theta_covered))
+                object.__setattr__(self, "theta_covered", self.theta_covered or None)
+            self._set_covariance(profile)
+            profile.encode()
+        except ValueError as error:
+            raise _split(error) from None
+        object.__setattr__(self, "_profile", profile)
+
+    def _created_unix_s(self) -> int:
+        if self.created is None:
+            return 0
+        if not isinstance(self.created, datetime.datetime) or self.created.tzinfo is None:
+            raise ProfileError(None, "created", "not a time with its time zone")
+        object.__setattr__(self, "created", self.created.astimezone(datetime.UTC).replace(microsecond=0))
+        seconds = int(self.created.timestamp())
+        if seconds <= 0:
+            raise ProfileError(None, "created", "not after 1970")
+        return seconds
+
+    def _set_covariance(self, profile: Any) -> None:
+        names = self.covariance_parameters
+        if not isinstance(names, Sequence) or isinstance(names, str):
+            raise ProfileError(None, "covariance_parameters", "not a list of names")
+        for name in names:
+            if name not in PARAMETERS:
+                raise ProfileError(None, "covariance_parameters", f"{name!r:.60} is no parameter")
+        names = tuple(names)
+        places = [PARAMETERS.index(name) for name in names]
+        if places != sorted(set(places)):
+            raise ProfileError(None, "covariance_parameters", "a name twice, or not in the order of the parameters")
+        object.__setattr__(self, "covariance_parameters", names)
+        if self.covariance is None:
+            if names:
+                raise ProfileError(None, "covariance", "missing for its parameters")
+            return
+        try:
+            matrix = np.array(self.covariance, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ProfileError(None, "covariance", "not a matrix of numbers") from None
+        if not names or matrix.shape != (len(names), len(names)):
+            raise ProfileError(None, "covariance", f"not {len(names)} x {len(names)} as its parameters say")
+        if not np.isfinite(matrix).all():
+            raise ProfileError(None, "covariance", "not finite")
+        sigma = np.sqrt(np.abs(matrix.diagonal()))
+        if (np.abs(matrix - matrix.T) > 1e-9 * np.outer(sigma, sigma)).any():
+            raise ProfileError(None, "covariance", "not symmetric")
+        lower = np.tril_indices(len(names))
+        matrix.T[lower] = matrix[lower]
+        matrix.setflags(write=False)
+        object.__setattr__(self, "covariance", matrix)
+        profile.set_covariance(places, matrix[lower].tolist())
+
+    # ------------------------------------------------------------------ model
+
+    def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Points in the camera frame, (N, 3) metres -> pixels (N, 2), ok (N,).
+
+        A pixel is NaN where ok is False: beyond theta_max, the origin, or not finite. A pixel may lie off the image.
+        """
+        return self._profile.project(_rows("points", points, 3))
+
+    def unproject(self, pixels: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Pixels (N, 2) -> unit rays in the camera frame (N, 3), ok (N,).
+
+        A ray is NaN where ok is False: beyond theta_max, or not finite.
+        """
+        return self._profile.unproject(_rows("pixels", pixels, 2))
+
+    def origins(self, pixels: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera."""
+        return np.zeros((_rows("pixels", pixels, 2).shape[0], 3))
+
+    # ------------------------------------------------------------------ files
+
+    def to_binary(self) -> bytes:
+        """The binary form that devices store."""
+        return self._profile.encode()
+
+    @classmethod
+    def from_binary(cls, data: bytes) -> Camera:
+        """Reads the binary form. Raises ProfileError, with the field, for anything but one intact profile."""
+        try:
+            profile = _engine.Profile.decode(bytes(data))
+        except ValueError as error:
+            raise _split(error) from None
+        values = {key: getattr(profile, key) for key in (*_INTEGERS, *_SCALARS, *_CIRCLE, *_ARRAYS, *_TEXTS)}
+        names = tuple(PARAMETERS[i] for i in profile.free_param)
+        if names:
+            covariance = np.zeros((len(names), len(names)))
+            rows, columns = np.tril_indices(len(names))
+            covariance[rows, columns] = covariance[columns, rows] = profile.covariance
+            values |= {"covariance_parameters": names, "covariance": covariance}
+        if profile.created_unix_s:
+            values["created"] = datetime.datetime.fromtimestamp(profile.created_unix_s, datetime.UTC)
+        return cls(
+            radial=_RADIAL[profile.radial],
+            source=_SOURCE[profile.source],
+            rms_px=None if math.isnan(profile.rms_px) else profile.rms_px,
+            theta_covered=profile.theta_covered or None,
+            **values,
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Camera:
+        """Reads a profile in JSON. Raises ProfileError with the file, the key and the reason."""
+        try:
+            return cls._from_document(_parse(Path(path)))
+        except ProfileError as error:
+            key = "covariance.parameters" if error.key == "covariance_parameters" else error.key
+            raise ProfileError(path, key, error.reason) from None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the profile as JSON; the file appears whole or not at all. Raises OSError where it cannot."""
+        target = Path(path)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "w", encoding="utf-8") as file:
+                file.write(self.to_json())
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
+
+    @classmethod
+    def _from_document(cls, document: Mapping[str, Any]) -> Camera:
+        if document.get("format") != _FORMAT:
+            raise ProfileError(None, "format", f"not {_FORMAT!r}: this is not a profile")
+        if document.get("version") is True or document.get("version") != _VERSION:
+            raise ProfileError(None, "version", f"this version reads {_VERSION}")
+        values = {key: value for key, value in document.items() if key not in ("format", "version")}
+        known = {field.name for field in dataclasses.fields(cls)} - {"covariance_parameters"}
+        for key in values:
+            if key not in known:
+                raise ProfileError(None, key, "no such key in a profile")
+        for key in _JSON_REQUIRED:
+            if key not in values:
+                raise ProfileError(None, key, "missing")
+        if values.get("created") is not None:
+            values["created"] = _parse_time(values["created"])
+        if values.get("covariance") is not None:
+            values |= _parse_covariance(values["covariance"])
+        return cls(**values)
+
+    def to_json(self) -> str:
+        """The JSON form that people read, as `save` writes it."""
+        document: dict[str, Any] = {"format": _FORMAT, "version": _VERSION}
+        for key in (*_TEXTS, "source"):
+            document[key] = getattr(self, key)
+        document["created"] = None if self.created is None else self.created.strftime("%Y-%m-%dT%H:%M:%SZ")
+        for key in ("rms_px", "theta_covered", *_INTEGERS, "radial", *_SCALARS, *_CIRCLE, *_ARRAYS):
+            document[key] = getattr(self, key)
+        document["covariance"] = None
+        lines = [f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in document.items()]
+        if self.covariance is not None:
+            rows = [json.dumps(row[: i + 1]) for i, row in enumerate(self.covariance.tolist())]
+            names = json.dumps(self.covariance_parameters)
+            lower = ",\n      ".join(rows)
+            lines[-1] = f'  "covariance": {{\n    "parameters": {names},\n    "lower": [\n      {lower}\n    ]\n  }}'
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+    # ------------------------------------------------------------------ object
+
+    def __repr__(self) -> str:
+        parts = [
+            *([repr(self.name)] if self.name else []),
+            f"{self.width}x{self.height}",
+            f"f=({self.f_u:.2f}, {self.f_v:.2f})",
+            f"c=({self.c_u:.2f}, {self.c_v:.2f})",
+            f"k=({self.k2:.4g}, {self.k3:.4g}, {self.k4:.4g}, {self.k5:.4g})",
+            f"theta_max={math.degrees(self.theta_max):.2f} deg",
+            *([] if self.rms_px is None else [f"rms={self.rms_px:.3f} px"]),
+        ]
+        return f"Camera({', '.join(parts)})"
+
+    def __eq__(self, other: object) -> bool:
+        return self.to_binary() == other.to_binary() if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.to_binary())
+
+    def __reduce__(self) -> tuple[Any, tuple[bytes]]:
+        return Camera.from_binary, (self.to_binary(),)
+
+
+def _parse(path: Path) -> Mapping[str, Any]:
+    def without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in result:
+                raise ProfileError(None, key, "appears twice")
+            result[key] = value
+        return result
+
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_BYTES_MAX + 1)
+    except OSError as error:
+        raise ProfileError(None, None, error.strerror or str(error)) from None
+    if len(data) > _BYTES_MAX:
+        raise ProfileError(None, None, f"longer than {_BYTES_MAX} bytes: this is not a profile")
+    try:
+        document = json.loads(data.decode("utf-8"), object_pairs_hook=without_twins)
+    except UnicodeDecodeError as error:
+        raise ProfileError(None, f"byte {error.start}", "not UTF-8 text: this is not a profile in JSON") from None
+    except json.JSONDecodeError as error:
+        raise ProfileError(None, f"line {error.lineno} column {error.colno}", error.msg) from None
+    except (RecursionError, ValueError) as error:
+        raise ProfileError(None, None, f"not a profile in JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise ProfileError(None, None, "not a JSON object: this is not a profile")
+    return document
+
+
+def _parse_time(value: object) -> datetime.datetime:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return datetime.datetime.strptime(value, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=datetime.UTC)
+    raise ProfileError(None, "created", f"not a time like 2026-01-31T12:00:00Z: {value!r:.60}")
+
+
+def _parse_covariance(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict) or set(value) != {"parameters", "lower"}:
+        raise ProfileError(None, "covariance", "not an object of 'parameters' and 'lower'")
+    names, lower = value["parameters"], value["lower"]
+    if not isinstance(names, list) or not isinstance(lower, list) or not names or len(lower) != len(names):
+        raise ProfileError(None, "covariance", "'parameters' and 'lower' are not lists of one length")
+    matrix = np.zeros((len(names), len(names)))
+    for i, row in enumerate(lower):
+        matrix[i, : i + 1] = matrix[: i + 1, i] = _numbers(f"covariance.lower[{i}]", row, i + 1)
+    return {"covariance_parameters": names, "covariance": matrix}

@@ -1,0 +1,457 @@
+"""The command `pipefish`. Heavy imports happen in the commands, so that --help is quick."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from pipefish import __version__
+from pipefish.errors import PipefishError
+
+DONE, FAILED, USAGE = 0, 1, 2
+DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
+
+DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud) or tcp://host:port"
+
+
+def table(rows: Iterable[tuple[str, object]]) -> str:
+    """Two aligned columns; rows whose value is None or "" are left out."""
+    shown = [(name, str(value)) for name, value in rows if value is not None and value != ""]
+    width = max((len(name) for name, _ in shown), default=0)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)
+
+
+def size_text(count: float) -> str:
+    """Bytes for people."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def seconds_text(seconds: float) -> str:
+    """A duration for people."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min {rest:02d} s"
+
+
+# ---- commands: each returns (document for --json, text for people)
+
+Result = tuple[dict[str, Any], str]
+
+
+def run_demo(args: argparse.Namespace) -> Result:
+    from pipefish.demo import demo, figures
+
+    summary, page = demo(
+        Path(args.out), frames=args.frames, build_dir=args.build_dir, quiet=args.json, fresh=args.fresh
+    )
+    return summary, f"{figures(summary)}\n{page}"
+
+
+def run_receive(args: argparse.Namespace) -> Result:
+    from pipefish.receive import receive
+    from pipefish.transport import open_transport
+
+    summary = receive(
+        open_transport(args.device, args.baud),
+        Path(args.output),
+        overwrite=args.overwrite,
+        timeout_s=args.timeout,
+        quiet=args.json,
+    )
+    link = summary["link"]
+    goodput = link["goodput_bytes_per_s"]
+    recovered = summary["recovered_objects"]
+    rows = [
+        ("file", summary["file"]),
+        (
+            "keyframes",
+            f"{summary['keyframes']}" + (f", {summary['lost']} lost on the device" if summary["lost"] else ""),
+        ),
+        ("received", f"{size_text(link['bytes'])} in {seconds_text(link['duration_s'])}"),
+        ("goodput", f"{goodput / 1000:.1f} kB/s" if goodput else None),
+        ("from before", f"{recovered} objects of an interrupted run" if recovered else None),
+        ("damaged frames", f"{link['crc_errors_host']} here, {link['crc_errors_device']} on the device"),
+        ("sent again", f"{link['fragments_resent']} fragments"),
+        ("reconnections", link["reconnections"] or None),
+        *(("other survey", f"{o['file']}: {o['keyframes']} keyframes") for o in summary["other_surveys"]),
+        *(("incomplete", f) for f in summary["incomplete_surveys"]),
+        *(("damaged copy", f) for f in summary["damaged_copies"]),
+    ]
+    return summary, table(rows)
+
+
+def run_info(args: argparse.Namespace) -> Result:
+    from pipefish.survey import Survey
+
+    survey = Survey.open(args.survey)
+    return survey.info, info_text(survey.info)
+
+
+def info_text(info: dict[str, Any]) -> str:
+    """Survey.info for people."""
+    import datetime
+
+    tracks, link, profile = info["tracks"], info["link"], info["profile"]
+    when = info["first_time_unix_ns"]
+    started = datetime.datetime.fromtimestamp(when / 1e9).astimezone().isoformat(" ", "seconds") if when else None
+    missing = (
+        f"{len(info['missing'])} missing, {len(info['lost'])} of them lost on the device" if info["missing"] else ""
+    )
+    length = f"{info['length_m']:.2f} m" if info["length_m"] is not None else "unknown (no encoder)"
+    breaks = ", ".join(f"at keyframe {b['index']} ({b['reason']})" for b in info["breaks"])
+    diameter = info["nominal_diameter_m"]
+    lens = ""
+    if profile:
+        lens = profile.get("error") or f"{profile['name'] or 'unnamed'} {profile['serial']}".strip()
+    rows: list[tuple[str, object]] = [
+        ("survey", info["name"] or info["survey_id"]),
+        ("state", "complete" if info["complete"] else "incomplete"),
+        ("started", started),
+        ("device", info["software"]),
+        ("source", info["source"]),
+        ("profile", lens or "none"),
+        (
+            "picture",
+            f"{info['width']} x {info['height']}" + (f" at {info['frame_rate']:g}/s" if info["frame_rate"] else ""),
+        ),
+        ("pipe", f"DN{diameter * 1000:.0f}" if diameter else None),
+        ("length", length),
+        ("duration", seconds_text(info["duration_s"]) + (f" in {info['boots']} runs" if info["boots"] > 1 else "")),
+        ("frames", info["frames"]),
+        ("keyframes", f"{info['keyframes']}" + (f", {missing}" if missing else "")),
+        ("breaks", breaks or "none"),
+    ]
+    if tracks["tracks"]:
+        rows += [
+            ("tracks", f"{tracks['tracks']}, {tracks['per_keyframe_median']:.0f} on a typical keyframe"),
+            (
+                "track length",
+                f"median {tracks['length_frames_median']:.0f}, 90 % up to {tracks['length_frames_p90']:.0f} camera "
+                f"frames; median {tracks['length_keyframes_median']:.0f} keyframes",
+            ),
+        ]
+    rows.append(("ended", info["end_reason"]))
+    if info["object_bytes"]:
+        rows.append(("received", size_text(info["object_bytes"])))
+    if link.get("line"):
+        goodput = link.get("goodput_bytes_per_s", "None")
+        speed = f", {float(goodput) / 1000:.1f} kB/s" if goodput not in ("None", "") else ""
+        rows.append(("link", f"{link['line']}{speed}, {link.get('crc_errors_host', '?')} damaged frames"))
+    return table(rows)
+
+
+def run_show(args: argparse.Namespace) -> Result:
+    from pipefish.show import show
+    from pipefish.survey import Survey
+
+    written = show(Survey.open(args.survey), Path(args.output), args.keyframe, quiet=args.json)
+    return written, f"{written['file']} ({written['kind']}, {size_text(float(str(written['bytes'])))})"
+
+
+def run_status(args: argparse.Namespace) -> Result:
+    from google.protobuf.json_format import MessageToDict
+
+    from pipefish import pipefish_pb2 as pb
+    from pipefish.client import Client, Handlers
+    from pipefish.transport import open_transport
+
+    client = Client(open_transport(args.device, args.baud), Handlers(), wants_objects=False)
+    try:
+        client.open()
+        info = client.answer_to(args.timeout, get_info=pb.Nothing()).info
+        status = client.answer_to(args.timeout, get_status=pb.Nothing()).status
+    finally:
+        client.close()
+    document = {
+        "info": MessageToDict(info, preserving_proto_field_name=True, always_print_fields_with_no_presence=True),
+        "status": MessageToDict(status, preserving_proto_field_name=True, always_print_fields_with_no_presence=True),
+    }
+    link, stage = status.link, status.stage
+    rows = [
+        ("device", info.software),
+        ("source", info.source),
+        ("survey", info.survey_id.hex()),
+        ("state", status.state),
+        ("up for", seconds_text(status.uptime_ns / 1e9)),
+        (
+            "frames",
+            f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped, {status.frames_skipped} skipped",
+        ),
+        ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
+        ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
+        ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)}), {status.spool.evicted} evicted"),
+        (
+            "link",
+            f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, "
+            f"{link.fragments_resent} fragments sent again",
+        ),
+        ("frame time", f"{stage.pyramid + stage.track + stage.detect:.0f} us, slowest {stage.frame_max:.0f} us"),
+    ]
+    return document, table(rows)
+
+
+def run_simulate(args: argparse.Namespace) -> Result:
+    from pipefish.simulate import simulate
+
+    document = simulate(args.scene, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
+    rows = [
+        ("frames", f"{document['frames']} of {document['width']} x {document['height']} pixels"),
+        ("driven", f"{document['driven_m']:.2f} m"),
+        *(("written", file) for file in document["files"]),
+    ]
+    return document, table(rows)
+
+
+def load_profile(path: Path) -> Any:
+    """A Camera from a JSON or binary profile; the content decides. Raises ProfileError, OSError."""
+    from pipefish.camera import Camera
+    from pipefish.errors import ProfileError
+
+    with open(path, "rb") as stream:
+        data = stream.read(65536)
+    if data.lstrip()[:1] in (b"{", b""):
+        return Camera.load(path)
+    try:
+        return Camera.from_binary(data)
+    except ProfileError as error:
+        raise ProfileError(path, error.position, error.reason) from None
+
+
+def run_profile_show(args: argparse.Namespace) -> Result:
+    import math
+
+    camera = load_profile(Path(args.profile))
+    covered = f"{math.degrees(camera.theta_covered):.1f} deg" if camera.theta_covered else "unknown"
+    circle = f"({camera.circle_u:.1f}, {camera.circle_v:.1f}) radius {camera.circle_radius:.1f} px"
+    rows = [
+        ("name", camera.name or "unnamed"),
+        ("serial", camera.serial),
+        ("source", camera.source),
+        ("created", camera.created.isoformat() if camera.created else None),
+        ("picture", f"{camera.width} x {camera.height}"),
+        ("model", camera.radial),
+        ("f_u, f_v", f"{camera.f_u:.4f}, {camera.f_v:.4f} px/rad"),
+        ("c_u, c_v", f"{camera.c_u:.4f}, {camera.c_v:.4f} px"),
+        ("skew", f"{camera.skew:.6g}" if camera.skew else None),
+        ("k2 .. k5", ", ".join(f"{k:.6g}" for k in (camera.k2, camera.k3, camera.k4, camera.k5))),
+        ("field of view", f"{2 * math.degrees(camera.theta_max):.1f} deg (data covered half of it up to {covered})"),
+        ("image circle", circle if camera.circle_radius else "the whole picture"),
+        ("residual", f"{camera.rms_px:.4f} px rms" if camera.rms_px is not None else "unknown"),
+        (
+            "covariance",
+            f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
+        ),
+    ]
+    return json.loads(camera.to_json()), table(rows)
+
+
+def run_profile_check(args: argparse.Namespace) -> Result:
+    camera = load_profile(Path(args.profile))
+    document = {"file": args.profile, "valid": True, "name": camera.name}
+    return document, f"{args.profile}: valid ({camera.name or 'unnamed'}, {camera.width} x {camera.height})"
+
+
+def run_profile_convert(args: argparse.Namespace) -> Result:
+    from pipefish.show import write_atomically
+
+    camera, out = load_profile(Path(args.profile)), Path(args.out)
+    form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
+    data = camera.to_json().encode() if form == "json" else camera.to_binary()
+    write_atomically(out, data)
+    return {"file": str(out), "form": form, "bytes": len(data)}, f"{out}: {form}, {len(data)} bytes"
+
+
+# ---- the parser
+
+
+def positive(text: str) -> int:
+    """An argument that is a whole number above zero."""
+    value = int(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{value} is not above zero")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """An argument that is a number of at least zero."""
+    value = float(text)
+    if not value >= 0:
+        raise argparse.ArgumentTypeError(f"{value} is below zero")
+    return value
+
+
+def add_command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], Result], what: str, example: str
+) -> argparse.ArgumentParser:
+    """A command with what all of them share."""
+    parser = commands.add_parser(
+        name,
+        help=what[0].lower() + what[1:].rstrip("."),
+        description=what,
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON document on stdout, nothing else there")
+    parser.add_argument("--debug", action="store_true", help="show a traceback on errors")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("device", metavar="DEVICE", help=DEVICE_HELP)
+    parser.add_argument("--baud", type=positive, help=f"speed of a serial line [{DEFAULT_BAUD}]")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line of `pipefish`."""
+    parser = argparse.ArgumentParser(
+        prog="pipefish",
+        description="Measure pipes with one fisheye camera.",
+        epilog="example:\n  pipefish receive /dev/ttyUSB0 --baud 3000000 -o survey.mcap\n\n"
+        "`pipefish COMMAND --help` tells more.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"pipefish {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    p = add_command(
+        commands,
+        "demo",
+        run_demo,
+        "Simulate a pipe, survey it through the daemon and the link, and write a page about it.",
+        "pipefish demo --out build/demo",
+    )
+    p.add_argument("--out", default="build/demo", help="folder for the page and all that leads to it [build/demo]")
+    p.add_argument("--frames", type=positive, help="stop the simulated camera after so many frames")
+    p.add_argument("--build-dir", help="where the executables are [$PIPEFISH_BUILD or build/release]")
+    p.add_argument("--fresh", action="store_true", help="simulate anew even if the same recording is there")
+
+    p = add_command(
+        commands,
+        "simulate",
+        run_simulate,
+        "Simulate a camera in a pipe: recorded frames, telemetry, and the truth about both.",
+        "pipefish simulate demo -o /tmp/pipe",
+    )
+    p.add_argument("scene", metavar="SCENE", help="demo, straight, tiny, or a JSON file (docs/simulator.md)")
+    p.add_argument("-o", "--output", required=True, metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
+    p.add_argument("--frames", type=positive, help="stop after so many frames")
+    p.add_argument("--seed", type=int, help="of texture and noise [the scene's]")
+
+    p = add_command(
+        commands,
+        "receive",
+        run_receive,
+        "Receive a survey from a device into one MCAP file. An interrupted reception goes on with the same command.",
+        "pipefish receive serial:/dev/ttyUSB0@3000000 -o survey.mcap",
+    )
+    add_device(p)
+    p.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete"
+    )
+    p.add_argument("--overwrite", action="store_true", help="start anew even if FILE or FILE.partial is there")
+    p.add_argument(
+        "--timeout",
+        type=not_negative,
+        default=30.0,
+        metavar="S",
+        help="give up after S seconds without a device [30]; 0: never",
+    )
+
+    p = add_command(commands, "info", run_info, "Tell what is in a survey file.", "pipefish info survey.mcap")
+    p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
+
+    p = add_command(
+        commands,
+        "show",
+        run_show,
+        "Draw the tracks on a keyframe (.png, .jpg) or on all of them (.webp, .gif: an animation).",
+        "pipefish show survey.mcap -o tracks.png --keyframe 17",
+    )
+    p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help="picture to write")
+    p.add_argument("--keyframe", type=int, metavar="N", help="index of the keyframe [the middle one]")
+
+    p = add_command(
+        commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"
+    )
+    add_device(p)
+    p.add_argument("--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]")
+
+    add_profile(commands)
+    return parser
+
+
+def add_profile(commands: Any) -> None:
+    """`pipefish profile show|check|convert`."""
+    parser = commands.add_parser(
+        "profile", help="look at, check and convert camera profiles", description="Camera profiles."
+    )
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    p = add_command(actions, "show", run_profile_show, "Tell what a profile says.", "pipefish profile show camera.json")
+    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
+    p = add_command(
+        actions,
+        "check",
+        run_profile_check,
+        "Check a profile; exit code 1 if it is not valid.",
+        "pipefish profile check camera.json",
+    )
+    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
+    p = add_command(
+        actions,
+        "convert",
+        run_profile_convert,
+        "Convert a profile between JSON (for people) and binary (for devices).",
+        "pipefish profile convert camera.json camera.profile",
+    )
+    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
+    p.add_argument("out", metavar="OUT", help="file to write; .json: JSON, anything else: binary")
+    p.add_argument("--to", choices=("json", "binary"), help="form to write, whatever the name")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command. Returns the exit code: 0 done, 1 failed, 2 wrong usage."""
+    parser = build_parser()
+    try:
+        args = parser.parse_args(argv)
+    except SystemExit as exit_:  # argparse has printed the reason
+        return int(exit_.code or 0)
+    try:
+        document, text = args.run(args)
+        print(json.dumps(document, indent=2) if args.json else text, flush=True)
+        return DONE
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone; nothing to say to anybody
+        return FAILED
+    except (Exception, KeyboardInterrupt) as error:
+        if args.debug:
+            raise
+        print(f"pipefish: {message_of(error)}", file=sys.stderr)
+        return FAILED
+
+
+def message_of(error: BaseException) -> str:
+    """One clear line about what went wrong."""
+    match error:
+        case PipefishError():
+            return str(error)
+        case OSError():
+            return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        case KeyboardInterrupt():
+            return "interrupted"
+        case _:
+            return f"internal error: {type(error).__name__}: {error} (--debug shows where)"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

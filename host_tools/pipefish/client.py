@@ -1,0 +1,268 @@
+"""The host's end of the link: one select loop around the link's state machine (lib/link, through the binding)."""
+
+from __future__ import annotations
+
+import secrets
+import select
+import time
+from collections.abc import Callable
+from typing import Any
+
+from google.protobuf.message import DecodeError
+
+from pipefish import pipefish_pb2 as pb
+from pipefish.errors import PipefishError
+from pipefish.surveywrite import BootClock
+from pipefish.transport import Transport, TransportClosed
+
+SCHEMA_VERSION = 1  # of pipefish.proto
+MAX_OBJECT = 8 << 20  # bytes; a keyframe of a 20-megapixel camera stays well below
+RECEIVE_SLOTS = 4
+ROLE_HOST = 2
+
+# pf_link_event_type, pf_link_answer and pf_topic
+UP, DOWN, INCOMPATIBLE, CONTROL, LATEST, OFFER, OBJECT, SENT, REFUSED = range(1, 10)
+ACCEPT, STORED, REFUSE, AGAIN = range(1, 5)
+TOPIC_STATUS, TOPIC_PREVIEW = 0, 1
+
+BACKOFF_S = (0.1, 5.0)  # first and longest pause before the line is opened again
+OUTPUT_CHUNK = 4096  # bytes given to the line at once: about 14 ms at 3 Mbaud; acknowledgements are small
+IDLE_S = 0.5  # longest sleep: the caller's `until` is looked at this often
+
+
+class NoDevice(PipefishError):
+    """Nothing answered in time."""
+
+
+class Handlers:
+    """What a client does with what arrives; override what matters."""
+
+    def on_up(self, event: Any) -> None:
+        """The device answers; event.peer_boot_id is its boot id."""
+
+    def on_down(self) -> None:
+        """The device has gone silent."""
+
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused."""
+        raise NotImplementedError
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        """Answer (STORED, AGAIN, REFUSE) to an object that is all here; None: not yet, ask again on the next turn."""
+        raise NotImplementedError
+
+    def on_status(self, status: pb.Status) -> None:
+        """Newest counters of the device."""
+
+    def on_preview(self, preview: pb.Preview) -> None:
+        """Newest small picture of the device."""
+
+
+class Client:
+    """Keeps the link to one device up: opens the transport again when it breaks, and asks and answers.
+
+    statistics and state: `link.stats` (a dict, see pf_link_stats), `up`, `boot` (id of the device, 0 = unknown)
+    """
+
+    def __init__(self, transport: Transport, handlers: Handlers, wants_objects: bool, link: Any = None) -> None:
+        """`wants_objects`: False for a client that only asks; the device then keeps its objects.
+        `link`: for tests."""
+        self.transport = transport
+        self.handlers = handlers
+        if link is None:
+            from pipefish._engine import Link
+
+            link = Link(
+                role=ROLE_HOST,
+                nonce=secrets.randbits(32) | 1,
+                schema=SCHEMA_VERSION,
+                max_object=MAX_OBJECT if wants_objects else 0,
+                receive_slots=RECEIVE_SLOTS if wants_objects else 0,
+                max_latest=65536,
+                max_control=1000,
+            )
+        self.link = link
+        self.up = False
+        self.boot = 0
+        self.reconnections = 0
+        self.replies: dict[int, pb.Reply] = {}
+        self._open = False
+        self._backlog = b""  # bytes of the link that the line has not taken
+        # Objects whose answer is due: slot, name, kind, bytes. The link asks once, whatever happens to the line.
+        self._pending: list[tuple[int, bytes, int, bytes]] = []
+        self._last_id = 0
+        self._asked: set[int] = set()
+        self._retry_ns = 0
+        self._backoff_s = BACKOFF_S[0]
+        self.down_since_ns = time.monotonic_ns()
+
+    def open(self) -> None:
+        """Opens the line. Raises TransportClosed if that fails the first time: a wrong name should say so at once."""
+        self.transport.open()
+        self._open = True
+
+    def close(self) -> None:
+        """Closes the line."""
+        self.transport.close()
+        self._open = False
+
+    @property
+    def clock(self) -> BootClock | None:
+        """The device's clock as measured on the link: unix time = monotonic + offset; None before the first answer."""
+        stats = self.link.stats
+        if not self.up or stats["peer_clock_error_ns"] >= 2**63:
+            return None
+        ours = time.time_ns() - time.monotonic_ns()
+        return BootClock(ours - stats["peer_clock_offset_ns"], stats["peer_clock_error_ns"])
+
+    def run(self, until: Callable[[], bool], timeout_s: float = 0.0) -> None:
+        """Serves the link until `until()`. Raises NoDevice when nobody answered for `timeout_s` (0 = wait for ever)."""
+        while not until():
+            self.step(IDLE_S)
+            silent_s = (time.monotonic_ns() - self.down_since_ns) / 1e9
+            if not self.up and timeout_s and silent_s > timeout_s:
+                raise NoDevice(f"no device answers on {self.transport.name} (waited {timeout_s:g} s)")
+
+    def step(self, most_s: float) -> None:
+        """One turn: waits for bytes or a deadline, at most `most_s` seconds, and serves what happened."""
+        if not self._open:
+            self._reopen(most_s)
+            return
+        try:
+            self._turn(most_s)
+        except TransportClosed:
+            self._lost()
+
+    def _turn(self, most_s: float) -> None:
+        now = time.monotonic_ns()
+        blocked = self._flush(now)
+        wait_s = min(most_s, max(0.0, (self.link.deadline(now) - now) / 1e9))
+        if self._pending:
+            wait_s = min(wait_s, 0.01)
+        if blocked:
+            wait_s = min(wait_s, 0.005)
+        readable, _, _ = select.select([self.transport], [], [], wait_s)
+        now = time.monotonic_ns()
+        data = self.transport.read() if readable else b""
+        for event in self.link.input(data, now):
+            self._serve(event)
+        self._answer_pending()
+        self._flush(time.monotonic_ns())
+
+    def _flush(self, now: int) -> bool:
+        """Gives the line what the link wants to send. True while the line takes no more."""
+        while True:
+            if self._backlog:
+                self._backlog = self._backlog[self.transport.write(self._backlog) :]
+                if self._backlog:
+                    return True
+            if self.transport.waiting() > OUTPUT_CHUNK:
+                return True  # what waits in the driver cannot be overtaken by something more urgent
+            self._backlog = self.link.output(OUTPUT_CHUNK, now)
+            if not self._backlog:
+                return False
+
+    def _serve(self, event: Any) -> None:
+        match event.type:
+            case x if x == UP:
+                self.up, self.boot = True, event.peer_boot_id
+                self._backoff_s = BACKOFF_S[0]
+                self.handlers.on_up(event)
+            case x if x == DOWN:
+                self._down()
+            case x if x == INCOMPATIBLE:
+                raise PipefishError(
+                    f"the device on {self.transport.name} speaks version {event.peer_version} of the link, which this "
+                    "pipefish does not; update the older of the two"
+                )
+            case x if x == CONTROL:
+                self._reply(event.data)
+            case x if x == LATEST:
+                self._latest(event.topic, event.data)
+            case x if x == OFFER:
+                self.link.answer_object(event.slot, self.handlers.on_offer(event.name, event.kind, event.size))
+            case x if x == OBJECT:
+                self._pending.append((event.slot, event.name, event.kind, event.data))
+
+    def _answer_pending(self) -> None:
+        while self._pending:
+            slot, name, kind, data = self._pending[0]
+            answer = self.handlers.on_object(name, kind, data)
+            if answer is None:
+                return
+            self._pending.pop(0)
+            self.link.answer_object(slot, answer)
+
+    def _reply(self, data: bytes) -> None:
+        try:
+            reply = pb.Reply.FromString(data)
+        except DecodeError:
+            return  # the link's checksum holds, so this is another schema; a request then times out with a message
+        if reply.id in self._asked:
+            self._asked.discard(reply.id)
+            self.replies[reply.id] = reply
+
+    def _latest(self, topic: int, data: bytes) -> None:
+        try:
+            if topic == TOPIC_STATUS:
+                self.handlers.on_status(pb.Status.FromString(data))
+            elif topic == TOPIC_PREVIEW:
+                self.handlers.on_preview(pb.Preview.FromString(data))
+        except DecodeError:
+            return  # newest wins: the next one may be readable
+
+    def ask(self, **what: Any) -> int:
+        """Sends a request, for example ask(get_status=pb.Nothing()). Returns its id; the reply appears in `replies`.
+
+        Raises NoDevice if it is not there."""
+        self._last_id += 1
+        request = pb.Request(id=self._last_id, **what)
+        try:
+            self.link.send_control(request.SerializeToString())
+        except (ConnectionError, BufferError) as error:
+            raise NoDevice(f"the device on {self.transport.name} does not listen: {error}") from error
+        self._asked.add(request.id)
+        return request.id
+
+    def answer_to(self, timeout_s: float, **what: Any) -> pb.Reply:
+        """Sends a request, serves the link until its reply. Raises PipefishError: no answer, or the device's text."""
+        self.run(lambda: self.up, timeout_s)
+        wanted = self.ask(**what)
+        end = time.monotonic() + timeout_s
+        self.run(lambda: wanted in self.replies or time.monotonic() > end, timeout_s)
+        if wanted not in self.replies:
+            raise NoDevice(f"the device on {self.transport.name} did not reply within {timeout_s:g} s")
+        reply = self.replies.pop(wanted)
+        if reply.error:
+            raise PipefishError(f"the device says: {reply.error}")
+        return reply
+
+    def _down(self) -> None:
+        if self.up:
+            self.up = False
+            self.down_since_ns = time.monotonic_ns()
+            self.handlers.on_down()
+
+    def _lost(self) -> None:
+        """The stream broke: the link forgets half a frame, objects stay and resume."""
+        now = time.monotonic_ns()
+        self.close()
+        self._backlog = b""
+        self.link.reset(now)
+        for event in self.link.input(b"", now):
+            self._serve(event)
+        self._down()
+        self._retry_ns = now + int(self._backoff_s * 1e9)
+
+    def _reopen(self, most_s: float) -> None:
+        pause_s = (self._retry_ns - time.monotonic_ns()) / 1e9
+        if pause_s > 0:
+            time.sleep(min(pause_s, most_s))
+            return
+        try:
+            self.transport.open()
+            self._open = True
+            self.reconnections += 1
+        except TransportClosed:
+            self._retry_ns = time.monotonic_ns() + int(self._backoff_s * 1e9)
+            self._backoff_s = min(2 * self._backoff_s, BACKOFF_S[1])

@@ -1,0 +1,40 @@
+"""Colours of track ages: one scale for Foxglove, pictures and the page."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Ages run over several decades, so the scale is logarithmic: new tracks are violet, old ones yellow, lightness rising
+# all the way (readable on grey pictures and for colour-blind people).
+STOPS = np.array(
+    [
+        (112, 78, 236),
+        (146, 58, 214),
+        (182, 50, 180),
+        (212, 64, 138),
+        (232, 95, 98),
+        (246, 138, 62),
+        (253, 182, 45),
+        (244, 236, 60),
+    ],
+    dtype=float,
+)
+AGE_MAX = 300  # frames; older tracks share the last colour
+
+
+def age_position(age: np.ndarray) -> np.ndarray:
+    """(N,) ages in frames -> (N,) positions on the scale, 0..1."""
+    return np.clip(np.log1p(np.asarray(age, dtype=float)) / np.log1p(AGE_MAX), 0.0, 1.0)
+
+
+def scale_colours(position: np.ndarray) -> np.ndarray:
+    """(N,) positions 0..1 -> (N,3) uint8 RGB."""
+    x = np.asarray(position, dtype=float) * (len(STOPS) - 1)
+    return (
+        np.stack([np.interp(x, np.arange(len(STOPS)), STOPS[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
+    )
+
+
+def age_colours(age: np.ndarray) -> np.ndarray:
+    """(N,) ages in frames -> (N,3) uint8 RGB."""
+    return scale_colours(age_position(age))

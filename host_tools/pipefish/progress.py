@@ -1,0 +1,66 @@
+"""Progress on stderr: only on a terminal, and only for what takes longer than two seconds."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
+
+SHOW_AFTER_S = 2.0
+T = TypeVar("T")
+
+
+class Progress:
+    """A progress bar that appears after two seconds and only on a terminal.
+
+    with Progress("drawing", total=20) as bar: ... bar.update(completed, "note")
+    """
+
+    def __init__(self, what: str, total: float | None = None, quiet: bool = False) -> None:
+        self._what, self._total = what, total
+        self._start = time.monotonic()
+        self._enabled = not quiet and sys.stderr.isatty()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def update(self, completed: float, note: str = "", total: float | None = None) -> None:
+        """Sets how much is done; `note` stands behind the bar."""
+        self._total = total if total is not None else self._total
+        if not self._enabled or (self._bar is None and time.monotonic() - self._start < SHOW_AFTER_S):
+            return
+        if self._bar is None:
+            self._open()
+        self._bar.update(self._task, completed=completed, total=self._total, note=note)
+
+    def _open(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._bar.add_task(self._what, total=self._total, note="")
+        self._bar.start()
+
+
+def track(items: Iterable[T], what: str, total: int | None = None, quiet: bool = False) -> Iterator[T]:
+    """Yields `items` under a progress bar."""
+    with Progress(what, total, quiet) as bar:
+        for done, item in enumerate(items):
+            bar.update(done)
+            yield item

@@ -1,0 +1,238 @@
+"""`pipefish receive`: from the device's spool into survey files, each object on disk before it is acknowledged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pipefish import pipefish_pb2 as pb
+from pipefish.client import ACCEPT, AGAIN, REFUSE, STORED, Client, Handlers, NoDevice
+from pipefish.errors import PipefishError
+from pipefish.progress import Progress
+from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, BootClock, SurveyStore
+from pipefish.transport import Transport
+
+FIRST_ANSWERS_S = 2.0  # the first object waits this long for the device's clock and the name of its survey
+LINGER_S = 3.0  # most time after the end for the device to take in the last acknowledgement
+SURVEY_KINDS = (OBJECT_START, OBJECT_KEYFRAME, OBJECT_END)
+
+
+class Interrupted(PipefishError):
+    """Stopped before the survey was complete; what has arrived is safe in the partial file."""
+
+
+class Receiver(Handlers):
+    """Stores what one device sends. Use `receive`."""
+
+    def __init__(self, transport: Transport, store: SurveyStore, link: Any = None, quiet: bool = False) -> None:
+        self.store = store
+        self.client = Client(transport, self, wants_objects=True, link=link)
+        self.status: pb.Status | None = None
+        self.refused = 0
+        self.again = 0
+        self.received = 0
+        self.received_bytes = 0
+        self.sessions = 0
+        self._clocks: dict[int, BootClock] = {}
+        self._up_since = 0.0
+        self._info_id: int | None = None
+        self._first_object: float | None = None
+        self._last_object: float | None = None
+        self._clock_told = False
+        self._quiet = quiet
+
+    # ---- handlers
+
+    def on_up(self, event: Any) -> None:
+        self.sessions += 1
+        self._up_since = time.monotonic()
+        self._clock_told = False
+        self._info_id = self._ask(get_info=pb.Nothing())
+
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        if kind not in SURVEY_KINDS:
+            self.refused += 1
+            return REFUSE
+        return STORED if self.store.has(name) else ACCEPT
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        if self.store.has(name):
+            return STORED
+        self._learn()
+        waited = time.monotonic() - self._up_since
+        if waited < FIRST_ANSWERS_S and (self.client.clock is None or self._info_id is not None):
+            return None
+        stored = self.store.store(name, kind, data, self._clocks, time.time_ns())
+        if stored is None:
+            self.again += 1
+            return AGAIN
+        now = time.monotonic()
+        self._first_object = self._first_object or now
+        self._last_object = now
+        self.received += 1
+        self.received_bytes += len(data)
+        return STORED
+
+    def on_status(self, status: pb.Status) -> None:
+        self.status = status
+        self.store.choose_primary(status.survey_id)
+        writer = self.store.writers.get(status.survey_id)
+        clock = self._clocks.get(status.time.boot_id)
+        if writer is not None and clock is not None:
+            writer.note_status(status, status.time.monotonic_ns + clock.offset_ns, time.time_ns())
+
+    def _ask(self, **what: Any) -> int | None:
+        """Sends a request; None if the device went away this moment: all is asked again when it is back."""
+        try:
+            return self.client.ask(**what)
+        except NoDevice:
+            return None
+
+    def _learn(self) -> None:
+        """Takes in what the link has measured and the device has said since."""
+        clock = self.client.clock
+        if clock is not None and self.client.boot:
+            self._clocks[self.client.boot] = clock
+            if not self._clock_told:
+                self._clock_told = True
+                self._ask(
+                    clock_sync=pb.ClockSync(
+                        boot_id=self.client.boot, offset_ns=clock.offset_ns, error_ns=clock.error_ns
+                    )
+                )
+        reply = self.client.replies.pop(self._info_id, None) if self._info_id is not None else None
+        if reply is not None:
+            self._info_id = None
+            self.store.choose_primary(reply.info.survey_id)
+
+    # ---- the run
+
+    @property
+    def complete(self) -> bool:
+        """Whether the survey that the user asked for is all here."""
+        if self.store.primary is None:
+            return False
+        writer = self.store.writers.get(self.store.primary)
+        return self.store.primary in self.store.finished or (writer is not None and writer.content.complete)
+
+    def run(self, timeout_s: float, stop: Callable[[], bool] = lambda: False) -> None:
+        """Receives until complete or `stop()`. Raises NoDevice, PipefishError, KeyboardInterrupt."""
+        start = time.monotonic()
+        with Progress("receiving", quiet=self._quiet) as bar:
+
+            def done() -> bool:
+                self._learn()
+                completed, total = self._progress()
+                bar.update(completed, self._note(start), total)
+                return self.complete or stop()
+
+            self.client.run(done, timeout_s)
+        if self.complete:
+            self._linger()
+
+    def _linger(self) -> None:
+        """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure."""
+        end = time.monotonic() + LINGER_S
+        while time.monotonic() < end and self.client.up:
+            asked = self._ask(get_status=pb.Nothing())
+            turn = min(end, time.monotonic() + 0.5)
+            while self.client.up and time.monotonic() < turn and (asked is None or asked not in self.client.replies):
+                self.client.step(0.05)
+            reply = self.client.replies.pop(asked, None) if asked is not None else None
+            if reply is not None and reply.HasField("status"):
+                self.status = reply.status
+                if reply.status.spool.objects == 0:
+                    return
+
+    def _progress(self) -> tuple[int, int | None]:
+        waiting = self.status.spool.objects if self.status else None
+        return self.received, None if waiting is None else self.received + waiting
+
+    def _note(self, start: float) -> str:
+        if not self.client.up:
+            return "waiting for the device"
+        seconds = max(time.monotonic() - (self._first_object or start), 0.1)
+        stats = self.client.link.stats
+        waiting = f", {self.status.spool.objects} waiting" if self.status else ""
+        return f"{self.received_bytes / seconds / 1000:.0f} kB/s{waiting}, {stats['crc_errors']} damaged frames"
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of this run, as plain values."""
+        stats = self.client.link.stats
+        seconds = (self._last_object - self._first_object) if self._last_object and self._first_object else 0.0
+        device = self.status.link if self.status else pb.Status.Link()
+        return {
+            "objects": self.received,
+            "bytes": self.received_bytes,
+            "duration_s": round(seconds, 3),
+            "goodput_bytes_per_s": round(self.received_bytes / seconds) if seconds else None,
+            "crc_errors_host": stats["crc_errors"],
+            "crc_errors_device": device.crc_errors if self.status else None,
+            "fragments_received": stats["fragments_received"],
+            "fragments_duplicate": stats["fragments_duplicate"],
+            "fragments_resent": device.fragments_resent if self.status else None,
+            "damaged_objects": self.again,
+            "refused_objects": self.refused,
+            "sessions": stats["sessions"],
+            "reconnections": self.client.reconnections,
+            "rtt_ms": stats["rtt_us"] / 1000,
+            "line": self.client.transport.name,
+        }
+
+
+def receive(
+    transport: Transport,
+    path: Path,
+    *,
+    overwrite: bool = False,
+    timeout_s: float = 30.0,
+    stop: Callable[[], bool] = lambda: False,
+    quiet: bool = False,
+    link: Any = None,
+) -> dict[str, Any]:
+    """Receives one survey into `path` (docs/survey.md). Returns the summary: figures of the link and of each file.
+
+    timeout_s  give up when no device answers for so long; 0 = never
+    stop       asked several times a second; True ends the reception early
+    Raises PipefishError (also when stopped early: Interrupted), OSError. What has arrived stays in `<path>.partial`.
+    """
+    store = SurveyStore(path, overwrite)
+    receiver = Receiver(transport, store, link, quiet)
+    recovered = store.recovered
+    why = "stopped"
+    try:
+        if not receiver.complete:
+            receiver.client.open()
+            receiver.run(timeout_s, stop)
+    except KeyboardInterrupt:
+        why = "interrupted"
+    except NoDevice as error:
+        why = str(error)
+    finally:
+        receiver.client.close()
+        summary = receiver.summary()
+        keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
+        lost = {w.path: len(w.content.end.lost_index) if w.content.end else 0 for w in store.writers.values()}
+        damaged = [str(w.damaged) for w in store.writers.values() if w.damaged]
+        finished = store.finish_complete({key: str(value) for key, value in summary.items()})
+        partial = store.close()
+    if path not in finished:
+        raise Interrupted(f"{why}: {_resume_text(partial, sum(keyframes.values()))}")
+    return {
+        "file": str(path),
+        "keyframes": keyframes[path],
+        "lost": lost[path],
+        "recovered_objects": recovered,
+        "damaged_copies": damaged,
+        "other_surveys": [{"file": str(f), "keyframes": keyframes[f]} for f in finished if f != path],
+        "incomplete_surveys": [str(p) for p in partial],
+        "link": summary,
+    }
+
+
+def _resume_text(partial: list[Path], keyframes: int) -> str:
+    if not partial:
+        return "nothing has arrived yet"
+    return f"{keyframes} keyframes are safe in {partial[0]}; the same command goes on from there"

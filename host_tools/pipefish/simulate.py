@@ -1,0 +1,330 @@
+"""`pipefish simulate` and the simulated scene: a camera driving through a pipe, with exact truth (docs/simulator.md).
+
+The simulator shares no code with the camera model that everything else uses: its lens is its own.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipefish import __version__, _engine
+from pipefish.errors import ArgumentError, FormatError, PipefishError
+from pipefish.progress import track
+
+TRUTH_FORMAT = "pipefish-truth"
+TRUTH_VERSION = 1
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # 6 m DN300: straight, a bend of 30 degrees with a radius of three diameters to the right, an oval stretch.
+    "demo": {
+        "diameter": 0.3,
+        "pieces": [
+            {"length": 2.2},
+            {"angle": math.radians(30), "radius": 0.9, "clock": math.pi / 2},
+            {"length": 4.0},
+        ],
+        "ovals": [{"start": 3.6, "end": 5.4, "ramp": 0.4, "ovality": 0.04, "clock": math.pi / 2}],
+        "motion": {"frames": 601},
+    },
+    "straight": {"diameter": 0.3, "pieces": [{"length": 2.0}], "motion": {"frames": 60}},
+    "tiny": {
+        "diameter": 0.2,
+        "pieces": [{"length": 1.5}],
+        "lens": {"width": 320, "height": 240, "circle_radius": 118, "c_u": 159.5, "c_v": 119.5},
+        "motion": {"frames": 20, "metres_per_count": 0.0005},
+    },
+}
+
+
+def presets() -> list[str]:
+    """Names of the built-in scenes."""
+    return sorted(PRESETS)
+
+
+def read_json(path: Path) -> Any:
+    """A JSON file. Raises FormatError with line and column, OSError."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise FormatError(path, f"{error.lineno}:{error.colno}", error.msg) from None
+    except UnicodeDecodeError as error:
+        raise FormatError(path, f"byte {error.start}", "not UTF-8 text") from None
+
+
+class Scene:
+    """A simulated pipe with a camera driving through it.
+
+    World frame: the pipe begins at the origin along +z, x right, y down (gravity), metres. Clock angles: 0 is up,
+    positive clockwise seen along the drive. Frames are counted from 0.
+    """
+
+    def __init__(self, scene: dict[str, Any], source: str | os.PathLike[str] | None = None) -> None:
+        """From a description as docs/simulator.md lists it; what is not said takes its default.
+
+        Raises FormatError that names the key (and the file `source`) for one unknown or out of range.
+        """
+        try:
+            self._scene = _engine.Scene(scene)
+        except ValueError as error:
+            where, _, what = str(error).partition(": ")
+            raise FormatError(source, where, what) from None
+
+    @staticmethod
+    def load(name_or_path: str | os.PathLike[str]) -> Scene:
+        """A built-in scene by name, or a JSON file. Raises FormatError, OSError, PipefishError."""
+        if str(name_or_path) in PRESETS:
+            return Scene(PRESETS[str(name_or_path)])
+        path = Path(name_or_path)
+        if not path.exists():
+            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {', '.join(presets())}")
+        return Scene(read_json(path), path)
+
+    @staticmethod
+    def from_truth(path: str | os.PathLike[str]) -> Scene:
+        """The scene behind a truth file. Raises FormatError (also if this version's simulator drives otherwise)."""
+        truth = read_json(Path(path))
+        if not isinstance(truth, dict) or truth.get("format") != TRUTH_FORMAT:
+            raise FormatError(path, "format", f"not '{TRUTH_FORMAT}'")
+        if truth.get("version") != TRUTH_VERSION:
+            raise FormatError(path, "version", f"{truth.get('version')}: this is version {TRUTH_VERSION}")
+        scene = Scene(truth.get("scene"), path)
+        last = scene.frames - 1
+        try:
+            centre = np.array(truth["poses"][last][5:8], dtype=float)
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise FormatError(path, "poses", "must hold s, qw, qx, qy, qz, cx, cy, cz, driven of every frame") from None
+        if not np.allclose(centre, scene.centre(last), atol=1e-9):
+            raise FormatError(path, f"poses[{last}]", "this version's simulator drives otherwise: simulate anew")
+        return scene
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The whole description, defaults filled in."""
+        return self._scene.spec
+
+    @property
+    def frames(self) -> int:
+        """How many frames the drive has."""
+        return self.spec["motion"]["frames"]
+
+    @property
+    def length(self) -> float:
+        """Of the pipe, metres of arc length."""
+        return self._scene.length
+
+    @property
+    def circle_radius(self) -> float:
+        """Of the image circle, pixels."""
+        return self._scene.circle_radius
+
+    def render(self, frame: int, threads: int | None = None) -> np.ndarray:
+        """What the camera sees: (H, W) uint8. The same bits for any number of threads [all cores]."""
+        return self._scene.render(frame, threads or os.cpu_count() or 1)
+
+    def pose(self, frame: int) -> np.ndarray:
+        """cam_from_world [R | t], (3, 4)."""
+        return self._scene.pose(frame)
+
+    def centre(self, frame: int) -> np.ndarray:
+        """The camera's centre in the world, (3,) metres."""
+        pose = self.pose(frame)
+        return -pose[:, :3].T @ pose[:, 3]
+
+    def arc_length(self, frame: int) -> float:
+        """How far along the pipe the camera is, metres."""
+        return self._scene.arc_length(frame)
+
+    def driven(self, frame: int) -> float:
+        """How far the crawler has driven since frame 0, metres: what the encoder counts."""
+        return self._scene.driven(frame)
+
+    def telemetry(self, frame: int) -> tuple[int, int, float, float]:
+        """What the sensors say: time in ns, encoder counts, roll and pitch in radians."""
+        return self._scene.telemetry(frame)
+
+    def cast(self, frame: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2) pixels -> (N, 3) wall points in the world, (N,) ok (false outside the image circle)."""
+        return self._scene.cast(frame, _points(pixels, 2))
+
+    def project(self, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) world points -> (N, 2) pixels, (N,) ok (false beyond the field; what is in between is not asked)."""
+        return self._scene.project(frame, _points(points, 3))
+
+    def locate(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle; NaN far outside the pipe."""
+        return self._scene.locate(_points(points, 3))[0]
+
+    def wall(self, s: float, phi: float) -> np.ndarray:
+        """The wall point at arc length s and clock angle phi, (3,)."""
+        return self._scene.wall(s, phi)
+
+    def section(self, s: float) -> tuple[float, float, float]:
+        """D_max and D_min in metres, clock angle of D_max, at arc length s."""
+        return self._scene.section(s)
+
+    def lens(self) -> dict[str, list[float]]:
+        """The lens as its table: theta (radians), radius (pixels), pupil shift (metres)."""
+        theta = self._scene.lens_nodes
+        radius, pupil = zip(*(self._scene.lens(t) for t in theta), strict=True)
+        return {
+            "theta": [round(t, 12) for t in theta],
+            "radius_px": [round(r, 9) for r in radius],
+            "pupil_m": [round(e, 12) for e in pupil],
+        }
+
+
+def _points(values: np.ndarray, columns: int) -> np.ndarray:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise ArgumentError(f"must have the shape (N, {columns}), not {array.shape}")
+    return array
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """A rotation matrix (3, 3) as a unit quaternion (w, x, y, z), w >= 0."""
+    # The eigenvector of the largest eigenvalue (Bar-Itzhack 2000): no case needs a branch.
+    r = rotation
+    k = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    q = np.linalg.eigh(k, UPLO="U")[1][:, -1]
+    return q if q[0] >= 0 else -q
+
+
+def truth_of(scene: Scene) -> dict[str, Any]:
+    """What the truth file says."""
+    poses = []
+    for frame in range(scene.frames):
+        q = quaternion(scene.pose(frame)[:, :3])
+        row = [scene.arc_length(frame), *q, *scene.centre(frame), scene.driven(frame)]
+        poses.append([round(float(v), 12) for v in row])
+    return {
+        "format": TRUTH_FORMAT,
+        "version": TRUTH_VERSION,
+        "software": f"pipefish {__version__}",
+        "scene": scene.spec,
+        "pipe_length_m": scene.length,
+        "lens": scene.lens(),
+        "pose_columns": ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven"],
+        "poses": poses,
+    }
+
+
+def fitted_camera(scene: Scene) -> Any:
+    """The p9 camera closest to the scene's lens: least squares of its radius over field angle. A pipefish.Camera.
+
+    The lens's pupil shift is left out: this version's camera model is central.
+    """
+    from pipefish.camera import Camera
+
+    spec = scene.spec["lens"]
+    theta = np.linspace(0, spec["theta_max"], 1001)[1:]
+    radius = np.array([scene._scene.lens(t)[0] for t in theta])
+    powers = theta[:, None] ** np.array([1, 3, 5, 7, 9])
+    coefficients = np.linalg.lstsq(powers, radius, rcond=None)[0]
+    rms = float(np.sqrt(np.mean((powers @ coefficients - radius) ** 2)))
+    focal = float(coefficients[0])
+    k2, k3, k4, k5 = (coefficients[1:] / focal).tolist()
+    return Camera(
+        width=spec["width"],
+        height=spec["height"],
+        f_u=focal,
+        f_v=focal,
+        c_u=spec["c_u"],
+        c_v=spec["c_v"],
+        k2=k2,
+        k3=k3,
+        k4=k4,
+        k5=k5,
+        theta_max=spec["theta_max"],
+        circle_u=spec["c_u"],
+        circle_v=spec["c_v"],
+        circle_radius=scene.circle_radius,
+        name="simulated fisheye",
+        source="simulated",
+        rms_px=rms,
+        theta_covered=spec["theta_max"],
+    )
+
+
+def scene_key(name: str) -> dict[str, Any]:
+    """What a recording of this preset depends on, besides the software's version."""
+    return Scene.load(name).spec
+
+
+def simulate(
+    scene: str | os.PathLike[str] | dict[str, Any],
+    stem: Path,
+    *,
+    frames: int | None = None,
+    seed: int | None = None,
+    threads: int | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all.
+
+    scene: a preset's name, a JSON file, or the description itself. frames: stop after so many. seed: of texture, noise
+    and motion. Returns what was written. Raises FormatError, PipefishError, OSError.
+    """
+    made = Scene(scene) if isinstance(scene, dict) else Scene.load(scene)
+    if frames is not None or seed is not None:
+        spec = copy.deepcopy(made.spec)
+        if frames is not None:
+            spec["motion"]["frames"] = frames
+        for part in ("texture", "sensor", "motion") if seed is not None else ():
+            spec[part]["seed"] = seed
+        made = Scene(spec)
+    stem = Path(stem)
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    files = {kind: stem.with_name(stem.name + kind) for kind in (".y4m", ".csv", ".truth.json", ".profile.json")}
+    partial = {kind: file.with_name(file.name + ".partial") for kind, file in files.items()}
+    try:
+        _write_video(made, partial[".y4m"], threads, quiet)
+        _write_csv(made, partial[".csv"])
+        partial[".truth.json"].write_text(json.dumps(truth_of(made)) + "\n", encoding="utf-8")
+        fitted_camera(made).save(partial[".profile.json"])
+        for kind, file in files.items():
+            os.replace(partial[kind], file)
+    finally:
+        for file in partial.values():
+            file.unlink(missing_ok=True)
+    last = made.frames - 1
+    return {
+        "frames": made.frames,
+        "width": made.spec["lens"]["width"],
+        "height": made.spec["lens"]["height"],
+        "driven_m": made.arc_length(last) - made.arc_length(0),
+        "files": [str(f) for f in files.values()],
+    }
+
+
+def _write_video(scene: Scene, path: Path, threads: int | None, quiet: bool) -> None:
+    lens, rate = scene.spec["lens"], scene.spec["motion"]["frame_rate"]
+    numerator, denominator = (int(rate), 1) if rate == int(rate) else (round(rate * 1000), 1000)
+    with open(path, "wb") as out:
+        header = f"YUV4MPEG2 W{lens['width']} H{lens['height']} F{numerator}:{denominator} Ip A1:1 Cmono\n"
+        out.write(header.encode())
+        for frame in track(range(scene.frames), "simulating", scene.frames, quiet):
+            out.write(b"FRAME\n")
+            out.write(scene.render(frame, threads).tobytes())
+
+
+def _write_csv(scene: Scene, path: Path) -> None:
+    sigma = scene.spec["motion"]["attitude_sigma"]
+    with open(path, "w", encoding="utf-8", newline="\n") as out:
+        out.write("sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad\n")
+        for frame in range(scene.frames):
+            time_ns, count, roll, pitch = scene.telemetry(frame)
+            out.write(f"{frame},{time_ns},{count},{roll:.6f},{pitch:.6f},{sigma:g}\n")

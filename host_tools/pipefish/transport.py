@@ -1,0 +1,194 @@
+"""Byte streams to a device: a serial line or a TCP connection, non-blocking, with a file descriptor to wait on."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import socket
+import struct
+import termios
+from abc import ABC, abstractmethod
+
+from pipefish.errors import PipefishError
+
+DEFAULT_BAUD = 921600
+DEFAULT_PORT = 7447
+CONNECT_TIMEOUT_S = 5.0
+
+
+class TransportClosed(PipefishError):
+    """The line is gone: cable out, adapter removed, peer closed the connection. Reopening may help."""
+
+
+def _reason(error: Exception) -> str:
+    """The system's text for an error number, without what libraries put around it."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if isinstance(number, int) and number > 0 else str(error)
+
+
+class Transport(ABC):
+    """One byte stream. `open` may be called again after TransportClosed."""
+
+    name: str  # as the user wrote it
+
+    @abstractmethod
+    def open(self) -> None:
+        """Opens the stream. Raises TransportClosed with the reason if it cannot be opened now."""
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """File descriptor for select."""
+
+    @abstractmethod
+    def read(self) -> bytes:
+        """What has arrived, at most 64 KiB; b"" if nothing. Raises TransportClosed."""
+
+    @abstractmethod
+    def write(self, data: bytes) -> int:
+        """Takes as many bytes as fit now; returns how many. Raises TransportClosed."""
+
+    @abstractmethod
+    def waiting(self) -> int:
+        """Bytes written that the line has not taken yet."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Closes the stream; again is harmless."""
+
+
+class SerialTransport(Transport):
+    """A serial device, 8N1 without flow control; locked against other programs."""
+
+    def __init__(self, path: str, baud: int) -> None:
+        self.name = f"serial:{path}@{baud}"
+        self.path = path
+        self.baud = baud
+        self._port = None
+
+    def open(self) -> None:
+        import serial
+
+        self.close()
+        try:
+            self._port = serial.Serial(self.path, self.baud, timeout=0, write_timeout=0, exclusive=True)
+            self._port.reset_input_buffer()
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
+            raise TransportClosed(f"{self.path}: {_reason(error)}") from error
+
+    def fileno(self) -> int:
+        return self._port.fileno() if self._port is not None else -1
+
+    def read(self) -> bytes:
+        try:
+            return self._port.read(65536)
+        except (OSError, TypeError, AttributeError, termios.error) as error:
+            raise TransportClosed(f"{self.path}: {_reason(error)}") from error
+
+    def write(self, data: bytes) -> int:
+        import serial
+
+        try:
+            return self._port.write(data) or 0
+        except serial.SerialTimeoutException:
+            return 0
+        except (OSError, TypeError, AttributeError, termios.error) as error:
+            raise TransportClosed(f"{self.path}: {_reason(error)}") from error
+
+    def waiting(self) -> int:
+        try:
+            return self._port.out_waiting
+        except (OSError, AttributeError, termios.error) as error:
+            raise TransportClosed(f"{self.path}: {_reason(error)}") from error
+
+    def close(self) -> None:
+        if self._port is not None:
+            port, self._port = self._port, None
+            port.close()
+
+
+class TcpTransport(Transport):
+    """A TCP connection."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.name = f"tcp://{host}:{port}"
+        self.address = (host, port)
+        self._socket: socket.socket | None = None
+
+    def open(self) -> None:
+        self.close()
+        try:
+            self._socket = socket.create_connection(self.address, timeout=CONNECT_TIMEOUT_S)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setblocking(False)
+        except OSError as error:
+            raise TransportClosed(f"{self.name}: {_reason(error)}") from error
+
+    def fileno(self) -> int:
+        return self._socket.fileno() if self._socket is not None else -1
+
+    def read(self) -> bytes:
+        if self._socket is None:
+            raise TransportClosed(f"{self.name}: not connected")
+        try:
+            data = self._socket.recv(65536)
+        except (BlockingIOError, InterruptedError):
+            return b""
+        except OSError as error:
+            raise TransportClosed(f"{self.name}: {_reason(error)}") from error
+        if not data:
+            raise TransportClosed(f"{self.name}: the device closed the connection")
+        return data
+
+    def write(self, data: bytes) -> int:
+        if self._socket is None:
+            raise TransportClosed(f"{self.name}: not connected")
+        try:
+            return self._socket.send(data)
+        except (BlockingIOError, InterruptedError):
+            return 0
+        except OSError as error:
+            raise TransportClosed(f"{self.name}: {_reason(error)}") from error
+
+    def waiting(self) -> int:
+        if self._socket is None:
+            raise TransportClosed(f"{self.name}: not connected")
+        try:
+            raw = fcntl.ioctl(self._socket.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
+        except OSError as error:
+            raise TransportClosed(f"{self.name}: {_reason(error)}") from error
+        return struct.unpack("i", raw)[0]
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def open_transport(address: str, baud: int | None = None) -> Transport:
+    """A transport, not yet opened, for `serial:/dev/ttyUSB0@3000000`, `/dev/ttyUSB0` (speed from `baud`) or `tcp://host:port`.
+
+    Raises PipefishError if the address makes no sense.
+    """
+    if address.startswith("tcp://"):
+        match = re.fullmatch(r"tcp://(\[[0-9a-fA-F:.]+\]|[^\[\]/:]+)(?::(\d+))?/?", address)
+        port = int(match[2] or DEFAULT_PORT) if match else 0
+        if not match or not 0 < port < 65536:
+            raise PipefishError(
+                f"'{address}' is no address; write tcp://host:port, for example tcp://10.0.0.7:{DEFAULT_PORT}"
+            )
+        return TcpTransport(match[1].strip("[]"), port)
+    path = address.removeprefix("serial:")
+    if "://" in path or not path:
+        raise PipefishError(
+            f"'{address}' is no device; write /dev/ttyUSB0, serial:/dev/ttyUSB0@3000000 or tcp://host:port"
+        )
+    path, at, speed = path.rpartition("@") if re.search(r"@\d*$", path) else (path, "", "")
+    if at:
+        if not speed:
+            raise PipefishError(f"'{address}' has no speed after the @; write for example serial:{path}@{DEFAULT_BAUD}")
+        baud = int(speed)
+    baud = DEFAULT_BAUD if baud is None else baud
+    if not 1200 <= baud <= 12_000_000:
+        raise PipefishError(f"{baud} baud is out of range (1200 to 12000000)")
+    return SerialTransport(path, baud)

@@ -1,0 +1,170 @@
+/* The messages of lib/link/pipefish.proto as plain C: what the device encodes and decodes, without a type of the
+ * Protocol Buffers library. Encoders stream from the caller's arrays into the caller's buffer: nothing is copied in
+ * between, nothing is allocated. All pointers are borrowed for the call. Units and meanings are the schema's.
+ *
+ * Every encoder: out[capacity], *n gets the bytes written.
+ * Returns PF_OK; PF_ERR_SPACE (capacity too small: *n untouched, out[] undefined); PF_ERR_ARGUMENT (said at each).
+ */
+#ifndef PIPEFISH_MESSAGES_H
+#define PIPEFISH_MESSAGES_H
+
+#include "pipefish/link.h"
+#include "pipefish/track.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PF_SCHEMA_VERSION 1u /* of pipefish.proto; in the link's hello and in Info */
+
+typedef struct pf_msg_time {
+    uint64_t boot_id, monotonic_ns;
+} pf_msg_time;
+
+typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is set */
+    pf_msg_time time;
+    bool has_encoder, has_attitude, has_exposure, has_gain, has_lamp;
+    int64_t encoder_count;
+    uint32_t encoder_missed; /* edges */
+    float roll_rad, pitch_rad;
+    float attitude_sigma_rad; /* 0 = not stated */
+    uint32_t exposure_us;
+    float gain, lamp;
+} pf_msg_telemetry;
+
+typedef struct pf_msg_keyframe {
+    uint8_t survey_id[16];
+    uint32_t index;
+    pf_msg_time time;
+    uint64_t frame_sequence;
+    uint8_t frame_sha256[32];
+    uint32_t width, height; /* pixels */
+    const uint8_t *jpeg;
+    size_t jpeg_size;
+    uint32_t jpeg_quality; /* 1..100 */
+    pf_keyframe_cause cause;
+    pf_msg_telemetry telemetry;
+    const pf_track *tracks; /* n_tracks, ids ascending; lost ones are left out */
+    uint32_t n_tracks;
+    uint32_t common_tracks;
+    const char *break_reason; /* NULL = tracks go on from the keyframe before */
+} pf_msg_keyframe;
+
+/* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break_reason at most 256 bytes: 10
+ * (id)
+ * + 5 x 5 (x, y, covariance) + 5 (age) + 3 (quality) + 1 (status) a track. */
+#define PF_MSG_KEYFRAME_MAX(n_tracks, jpeg_size) ((size_t)1024 + 44u * (size_t)(n_tracks) + (size_t)(jpeg_size))
+
+typedef struct pf_msg_survey_start {
+    uint8_t survey_id[16];
+    pf_msg_time time;
+    const char *name, *software, *source;
+    const uint8_t *profile; /* binary profile; NULL = none */
+    size_t profile_size;
+    double metres_per_count, metres_per_count_sigma, noise_m_per_sqrt_m;
+    uint32_t width, height;
+    double frame_rate, nominal_diameter_m;
+    const char *const *config; /* config_count lines "section.key = value" */
+    uint32_t config_count;
+    uint8_t tracker_config_sha256[32];
+} pf_msg_survey_start;
+
+typedef struct pf_msg_stages { /* microseconds */
+    float capture, pyramid, track, detect, keyframe, store, frame_max;
+} pf_msg_stages;
+
+typedef struct pf_msg_spool {
+    uint64_t objects, bytes, stored, acknowledged, evicted, errors;
+} pf_msg_spool;
+
+typedef struct pf_msg_clock_sync {
+    uint64_t boot_id;
+    int64_t offset_ns;
+    uint64_t error_ns;
+} pf_msg_clock_sync;
+
+typedef struct pf_msg_status {
+    pf_msg_time time;
+    uint8_t survey_id[16];
+    const char *state;
+    uint64_t frames, frames_dropped, frames_skipped;
+    uint32_t tracks_live, tracks_new, tracks_lost;
+    uint64_t keyframes, keyframes_dropped;
+    double fps;
+    pf_msg_stages stage;
+    pf_msg_spool spool;
+    bool link_up;
+    pf_link_stats link;
+    pf_msg_telemetry telemetry;
+    uint64_t uptime_ns;
+    bool has_clock;
+    pf_msg_clock_sync clock;
+} pf_msg_status;
+
+typedef struct pf_msg_survey_end {
+    uint8_t survey_id[16];
+    pf_msg_time time;
+    uint32_t keyframes, boots;
+    uint64_t frames;
+    const char *reason;
+    const pf_msg_status *last_status; /* NULL = none */
+    const uint32_t *lost_index;       /* lost_count of them */
+    uint32_t lost_count;
+} pf_msg_survey_end;
+
+typedef struct pf_msg_preview {
+    pf_msg_time time;
+    uint64_t frame_sequence;
+    uint32_t width, height;
+    const uint8_t *jpeg;
+    size_t jpeg_size;
+} pf_msg_preview;
+
+typedef struct pf_msg_info {
+    const char *software, *source;
+    uint64_t boot_id;
+    uint32_t schema;
+    uint8_t survey_id[16];
+    uint8_t profile_sha256[32]; /* of the binary profile; zeros = there is none */
+} pf_msg_info;
+
+typedef struct pf_msg_reply {
+    uint32_t id;
+    const char *error;           /* "" = done */
+    const pf_msg_status *status; /* at most one of status and info; both NULL = neither was asked for */
+    const pf_msg_info *info;
+} pf_msg_reply;
+
+typedef enum pf_request_what {
+    PF_REQUEST_UNKNOWN = 0, /* none of those below: a newer host's */
+    PF_REQUEST_GET_STATUS = 2,
+    PF_REQUEST_GET_INFO = 3,
+    PF_REQUEST_STOP_SURVEY = 4,
+    PF_REQUEST_SET_LAMP = 5,
+    PF_REQUEST_CLOCK_SYNC = 6,
+    PF_REQUEST_SHUTDOWN = 7,
+} pf_request_what;
+
+typedef struct pf_msg_request {
+    uint32_t id;
+    pf_request_what what;
+    float lamp;              /* PF_REQUEST_SET_LAMP; as sent: may be any float */
+    pf_msg_clock_sync clock; /* PF_REQUEST_CLOCK_SYNC */
+} pf_msg_request;
+
+/* PF_ERR_ARGUMENT: n_tracks > 2 PF_TRACKS_MAX (a whole table, lost tracks included) or ids that do not ascend. */
+pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *keyframe, uint8_t *out, size_t capacity, size_t *n);
+pf_status pf_msg_encode_survey_start(const pf_msg_survey_start *start, uint8_t *out, size_t capacity, size_t *n);
+pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *end, uint8_t *out, size_t capacity, size_t *n);
+pf_status pf_msg_encode_status(const pf_msg_status *status, uint8_t *out, size_t capacity, size_t *n);
+pf_status pf_msg_encode_preview(const pf_msg_preview *preview, uint8_t *out, size_t capacity, size_t *n);
+/* PF_ERR_ARGUMENT: both status and info. */
+pf_status pf_msg_encode_reply(const pf_msg_reply *reply, uint8_t *out, size_t capacity, size_t *n);
+
+/* Decodes any bytes at all. PF_OK, or with *request untouched PF_ERR_FORMAT. */
+pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *request);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,307 @@
+/* The anchor of a track: the patch in which it was first seen, aligned with every new frame by an affine warp, gain and
+ * bias. Frame-to-frame errors add up along a track; against one template they do not. Inverse-compositional, all six
+ * parameters at once; gain and bias eliminated as in klt.c, and here also the two slopes of the bias: over a track's
+ * life the lamp's light slides over the patch, and its slope, not the noise, would be the largest error.
+ *
+ * Parameters d = (dx, dy, axx, axy, ayx, ayy): template coordinate x moves to x + (dx, dy) + [axx axy; ayx ayy] x. */
+#include <string.h>
+
+#include "track_private.h"
+
+#define SETTLED       655  /* 0.01 px */
+#define SETTLED_WARP  2000 /* Q16, times half the window: 0.03 px at the window's edge */
+#define STEP_MAX      (2 << 16)
+#define WARP_STEP_MAX (1 << 14)
+/* Added to the unit diagonal, Q20. It changes no fixed point (there the right-hand side is zero); it keeps directions
+ * that the texture does not determine where they were, and every entry of the inverse below 2^10. */
+#define RIDGE      1024
+#define RIDGE_WARP 16384
+
+static int32_t magnitude(int32_t v)
+{
+    return v < 0 ? -v : v;
+}
+
+static int32_t row_bytes(const pf_klt *klt)
+{
+    return klt->window + 2;
+}
+
+/* Unpacks the template: t (Q5 - 4080), Scharr gradients in Q4 and x times them. */
+static void unpack(pf_klt *klt, const uint8_t *pixels)
+{
+    const int32_t w = row_bytes(klt);
+    for (int32_t r = 0; r < klt->window; r++) {
+        const uint8_t *restrict a = pixels + r * w, *restrict b = a + w, *restrict c = b + w;
+        int16_t *restrict t = klt->t + r * PATCH_ROW, *restrict gx = klt->gx + r * PATCH_ROW,
+                          *restrict gy = klt->gy + r * PATCH_ROW;
+        for (int32_t i = 0; i < klt->window; i++) {
+            t[i] = (int16_t)(b[i + 1] * 32 - 4080);
+            gx[i] = (int16_t)((3 * (a[i + 2] - a[i]) + 10 * (b[i + 2] - b[i]) + 3 * (c[i + 2] - c[i]) + 1) >> 1);
+            gy[i] = (int16_t)((3 * (c[i] - a[i]) + 10 * (c[i + 1] - a[i + 1]) + 3 * (c[i + 2] - a[i + 2]) + 1) >> 1);
+        }
+        for (int32_t i = klt->window; i < klt->cols; i++)
+            t[i] = gx[i] = gy[i] = 0;
+        int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
+        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
+            px[i] = (int16_t)(gx[i] * (i - klt->half));
+            py[i] = (int16_t)(gy[i] * (i - klt->half));
+        }
+    }
+}
+
+/* Inverts the symmetric positive matrix m (Q20, diagonal about 1) in place: Gauss-Jordan without pivoting. With the
+ * ridges no entry ever exceeds 2^10, so products of two stay below 2^62. */
+static void invert6(int64_t m[6][6])
+{
+    for (int32_t k = 0; k < 6; k++) {
+        const int64_t inverse = ((int64_t)1 << 40) / (m[k][k] > 512 ? m[k][k] : 512);
+        m[k][k] = (int64_t)1 << 20;
+        for (int32_t j = 0; j < 6; j++)
+            m[k][j] = (m[k][j] * inverse) >> 20;
+        for (int32_t i = 0; i < 6; i++) {
+            if (i == k)
+                continue;
+            const int64_t f = m[i][k];
+            m[i][k] = 0;
+            for (int32_t j = 0; j < 6; j++)
+                m[i][j] -= (f * m[k][j]) >> 20;
+        }
+    }
+}
+
+/* Scales the normal matrix to a diagonal in [1/4, 1) and stores its inverse and the scales. */
+static void factor(pf_anchor *anchor, int64_t h[6][6])
+{
+    int64_t m[6][6];
+    for (int32_t i = 0; i < 6; i++) {
+        anchor->scale[i] = 0;
+        while (anchor->scale[i] < 30 && h[i][i] >> (2 * anchor->scale[i]) > 0)
+            anchor->scale[i]++;
+    }
+    for (int32_t i = 0; i < 6; i++)
+        for (int32_t j = 0; j < 6; j++)
+            m[i][j] = (h[i][j] * (1 << 20)) >> (anchor->scale[i] + anchor->scale[j]);
+    for (int32_t i = 0; i < 6; i++)
+        m[i][i] += i < 2 ? RIDGE : RIDGE_WARP;
+    invert6(m);
+    for (int32_t i = 0; i < 6; i++)
+        for (int32_t j = 0; j < 6; j++)
+            anchor->inverse[6 * i + j] = pf_clamp_i64(m[i][j], 1 << 30);
+}
+
+/* Product of the parts of two images that lie in the space of planes, given their sums times 1, x, y: over the
+ * symmetric window these three are orthogonal. */
+static int64_t plane_part(const pf_klt *klt, const int64_t a[3], const int64_t b[3])
+{
+    const int64_t w = klt->window, n = w * w;
+    const int64_t xx = w * klt->half * (klt->half + 1) * w / 3; /* sum of x^2 over the window */
+    return a[0] * b[0] / n + a[1] * b[1] / xx + a[2] * b[2] / xx;
+}
+
+void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anchor *anchor, uint8_t *pixels)
+{
+    const int32_t ix = (at.x + 32768) >> 16, iy = (at.y + 32768) >> 16, w = row_bytes(klt), half = klt->half;
+    anchor->offset = (pf_point_q16){at.x - ix * 65536, at.y - iy * 65536};
+    anchor->a[0] = anchor->a[3] = 65536;
+    anchor->a[1] = anchor->a[2] = 0;
+    for (int32_t r = 0; r < w; r++)
+        memcpy(pixels + r * w, image->data + (size_t)(iy - half - 1 + r) * image->stride + (ix - half - 1), (size_t)w);
+    unpack(klt, pixels);
+    int64_t h[6][6] = {{0}}, tt = 0;
+    memset(anchor->sum_j, 0, sizeof anchor->sum_j);
+    memset(anchor->dot_jt, 0, sizeof anchor->dot_jt);
+    memset(anchor->sum_t, 0, sizeof anchor->sum_t);
+    for (int32_t y = -half; y <= half; y++)
+        for (int32_t x = -half; x <= half; x++) {
+            const int32_t k = (y + half) * PATCH_ROW + x + half;
+            const int32_t gx = klt->gx[k], gy = klt->gy[k], t = klt->t[k], plane[3] = {1, x, y};
+            const int32_t j[6] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
+            for (int32_t a = 0; a < 6; a++) {
+                for (int32_t b = a; b < 6; b++)
+                    h[a][b] += (int64_t)j[a] * j[b];
+                for (int32_t b = 0; b < 3; b++)
+                    anchor->sum_j[a][b] += j[a] * plane[b];
+                anchor->dot_jt[a] += (int64_t)j[a] * t;
+            }
+            for (int32_t b = 0; b < 3; b++)
+                anchor->sum_t[b] += t * plane[b];
+            tt += (int64_t)t * t;
+        }
+    anchor->var_t = tt - plane_part(klt, anchor->sum_t, anchor->sum_t);
+    if (anchor->var_t < 1)
+        anchor->var_t = 1;
+    for (int32_t a = 0; a < 6; a++)
+        anchor->dot_jt[a] -= plane_part(klt, anchor->sum_j[a], anchor->sum_t);
+    for (int32_t a = 0; a < 6; a++)
+        for (int32_t b = a; b < 6; b++) {
+            /* Q8 of the ratio: it times dot_jt stays below 2^62 */
+            const int64_t ratio = anchor->dot_jt[b] * 256 / anchor->var_t;
+            h[a][b] -= plane_part(klt, anchor->sum_j[a], anchor->sum_j[b]) + ((anchor->dot_jt[a] * ratio) >> 8);
+            h[b][a] = h[a][b];
+        }
+    for (int32_t a = 0; a < 6; a++)
+        if (h[a][a] < 0)
+            h[a][a] = 0;
+    factor(anchor, h);
+}
+
+/* Samples `image` on the warped window around `centre` into klt->c. False if it would leave the image. */
+static bool sample_warped(pf_klt *klt, const pf_image *image, pf_point_q16 centre, const int32_t a[4])
+{
+    const int64_t half = klt->half;
+    const int64_t rx = (int64_t)(magnitude(a[0]) + magnitude(a[1])) * half,
+                  ry = (int64_t)(magnitude(a[2]) + magnitude(a[3])) * half;
+    if (centre.x - rx < 0 || centre.y - ry < 0 || centre.x + rx >= ((int64_t)image->width - 1) << 16 ||
+        centre.y + ry >= ((int64_t)image->height - 1) << 16)
+        return false;
+    const size_t stride = image->stride;
+    for (int32_t r = 0; r < klt->window; r++) {
+        int32_t x = (int32_t)(centre.x - half * a[0] + (r - half) * a[1]);
+        int32_t y = (int32_t)(centre.y - half * a[2] + (r - half) * a[3]);
+        int16_t *restrict out = klt->c + r * PATCH_ROW;
+        for (int32_t i = 0; i < klt->window; i++, x += a[0], y += a[2]) {
+            const uint8_t *p = image->data + (size_t)(y >> 16) * stride + (size_t)(x >> 16);
+            const int32_t fx = (x & 0xFFFF) >> 5, fy = (y & 0xFFFF) >> 5; /* Q11: 1/2048 px */
+            const int32_t top = (p[0] << 11) + (p[1] - p[0]) * fx;
+            const int32_t bottom = (p[stride] << 11) + (p[stride + 1] - p[stride]) * fx;
+            out[i] = (int16_t)(((top * 2048 + (bottom - top) * fy + (1 << 16)) >> 17) - 4080);
+        }
+    }
+    return true;
+}
+
+/* Right-hand side: the steepest-descent images against the sampled patch. */
+typedef struct pf_rhs {
+    int64_t b[6], gain_q14;
+    int64_t cov, var; /* with the template, and of the patch, both less their best plane */
+} pf_rhs;
+
+static void right_hand_side(const pf_klt *klt, const pf_anchor *anchor, pf_rhs *out)
+{
+    int64_t b[6] = {0}, sc[3] = {0}, scc = 0, sct = 0;
+    for (int32_t r = 0; r < klt->window; r++) {
+        const int16_t *restrict c = klt->c + r * PATCH_ROW, *restrict t = klt->t + r * PATCH_ROW;
+        const int16_t *restrict gx = klt->gx + r * PATCH_ROW, *restrict gy = klt->gy + r * PATCH_ROW;
+        const int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
+        const int16_t first = (int16_t)-klt->half;
+        int32_t s = 0, sx = 0, ss = 0, st = 0, x = 0, y = 0, xx = 0, xy = 0;
+        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
+            s += c[i];
+            sx += c[i] * (int16_t)(first + i);
+            ss += c[i] * c[i];
+            st += c[i] * t[i];
+            x += c[i] * gx[i];
+            y += c[i] * gy[i];
+            xx += c[i] * px[i];
+            xy += c[i] * py[i];
+        }
+        const int32_t row = r - klt->half;
+        sc[0] += s, sc[1] += sx, sc[2] += s * row, scc += ss, sct += st;
+        b[0] += x, b[1] += y, b[2] += xx, b[3] += (int64_t)x * row, b[4] += xy, b[5] += (int64_t)y * row;
+    }
+    const int64_t cov = sct - plane_part(klt, anchor->sum_t, sc), var = scc - plane_part(klt, sc, sc);
+    out->gain_q14 = cov * GAIN_ONE / anchor->var_t;
+    out->cov = cov;
+    out->var = var;
+    const int64_t gain_q16 = cov * 65536 / anchor->var_t;
+    for (int32_t i = 0; i < 6; i++)
+        out->b[i] = b[i] - plane_part(klt, anchor->sum_j[i], sc) - ((anchor->dot_jt[i] * gain_q16) >> 16);
+}
+
+/* The step d: Q16 pixels, Q16 warp. */
+static void solve(const pf_anchor *anchor, const pf_rhs *rhs, int32_t d[6])
+{
+    int64_t scaled[6];
+    for (int32_t i = 0; i < 6; i++)
+        scaled[i] = (rhs->b[i] * 4096) >> anchor->scale[i];
+    for (int32_t i = 0; i < 6; i++) {
+        int64_t v = 0;
+        for (int32_t j = 0; j < 6; j++)
+            v += anchor->inverse[6 * i + j] * scaled[j];
+        /* v is Q32 in Q9 over Q8: to Q16 pixels */
+        v >>= 17 + anchor->scale[i];
+        d[i] = pf_clamp_i64((int64_t)pf_clamp_i64(v, 1 << 26) * GAIN_ONE / rhs->gain_q14,
+                            i < 2 ? STEP_MAX : WARP_STEP_MAX);
+    }
+}
+
+/* a <- a (1 - D), centre <- centre - a d. */
+static void compose(pf_anchor *anchor, const int32_t d[6], pf_point_q16 *centre)
+{
+    int32_t *a = anchor->a;
+    const int64_t a0 = a[0], a1 = a[1], a2 = a[2], a3 = a[3];
+    a[0] -= (int32_t)((a0 * d[2] + a1 * d[4]) >> 16);
+    a[1] -= (int32_t)((a0 * d[3] + a1 * d[5]) >> 16);
+    a[2] -= (int32_t)((a2 * d[2] + a3 * d[4]) >> 16);
+    a[3] -= (int32_t)((a2 * d[3] + a3 * d[5]) >> 16);
+    centre->x -= (int32_t)(((int64_t)a[0] * d[0] + (int64_t)a[1] * d[1]) >> 16);
+    centre->y -= (int32_t)(((int64_t)a[2] * d[0] + (int64_t)a[3] * d[1]) >> 16);
+}
+
+/* The track's point relative to the template's centre, in the current frame. */
+static pf_point_q16 warped_offset(const pf_anchor *anchor)
+{
+    const int64_t x = anchor->offset.x, y = anchor->offset.y;
+    return (pf_point_q16){(int32_t)((anchor->a[0] * x + anchor->a[1] * y) >> 16),
+                          (int32_t)((anchor->a[2] * x + anchor->a[3] * y) >> 16)};
+}
+
+pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at)
+{
+    pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
+    const pf_point_q16 before = warped_offset(anchor);
+    pf_point_q16 centre = {at->x - before.x, at->y - before.y};
+    pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
+    unpack(klt, pixels);
+    for (int32_t r = 0; r < klt->window; r++)
+        memset(klt->c + r * PATCH_ROW + klt->window, 0, (size_t)(klt->cols - klt->window) * sizeof(int16_t));
+    for (int32_t i = 0; i < klt->iterations; i++) {
+        if (!sample_warped(klt, image, centre, anchor->a)) {
+            fit.reason = PF_TRACK_LEFT;
+            return fit;
+        }
+        right_hand_side(klt, anchor, &rhs);
+        if (rhs.gain_q14 < GAIN_MIN || rhs.gain_q14 > GAIN_MAX) {
+            fit.reason = PF_TRACK_DRIFT;
+            return fit;
+        }
+        int32_t d[6], warp = 0;
+        solve(anchor, &rhs, d);
+        compose(anchor, d, &centre);
+        for (int32_t k = 2; k < 6; k++)
+            warp = magnitude(d[k]) > warp ? magnitude(d[k]) : warp;
+        for (int32_t k = 0; k < 4; k++)
+            if (magnitude(anchor->a[k]) > 4 * 65536)
+                fit.reason = PF_TRACK_DRIFT;
+        if (fit.reason != PF_TRACK_OK)
+            return fit;
+        if (magnitude(d[0]) < SETTLED && magnitude(d[1]) < SETTLED && warp * klt->half < SETTLED_WARP)
+            break;
+    }
+    const pf_point_q16 after = warped_offset(anchor);
+    *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
+    fit.zncc_q15 = pf_zncc(rhs.cov, anchor->var_t, rhs.var);
+    fit.gain_q14 = (int32_t)rhs.gain_q14;
+    return fit;
+}
+
+void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track)
+{
+    static const uint8_t row[3] = {0, 1, 0}, col[3] = {0, 1, 1};
+    const int64_t gain2 = ((int64_t)gain_q14 * gain_q14) >> 14; /* Q14 */
+    const int64_t factor_q8 = 256 + ((int64_t)256 << 14) / gain2;
+    int64_t cov[3];
+    for (int32_t i = 0; i < 3; i++) {
+        const int64_t m = anchor->inverse[6 * row[i] + col[i]];
+        const int32_t shift = 8 + anchor->scale[row[i]] + anchor->scale[col[i]];
+        const int64_t v = (m * ((int64_t)noise_q8 * noise_q8)) >> shift;
+        cov[i] = v > (int64_t)1 << 40 ? (int64_t)1 << 40 : v < -((int64_t)1 << 40) ? -((int64_t)1 << 40) : v;
+        cov[i] = (cov[i] * factor_q8) >> 8;
+    }
+    cov[0] += PF_TRACK_COV_FLOOR_Q20;
+    cov[1] += PF_TRACK_COV_FLOOR_Q20;
+    track->cov_xx_q20 = cov[0] > UINT32_MAX ? UINT32_MAX : (uint32_t)cov[0];
+    track->cov_yy_q20 = cov[1] > UINT32_MAX ? UINT32_MAX : (uint32_t)cov[1];
+    track->cov_xy_q20 = pf_clamp_i64(cov[2], INT32_MAX);
+}

@@ -1,0 +1,128 @@
+"""The long tests: `make accept` writes build/accept.json ({name, value, bound, holds} each) and prints a table.
+
+Resumable: each check's result is kept in build/accept/ under the commit it was measured at; a second run at the same
+commit measures only what is missing. --fresh forgets them.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BUILD = ROOT / "build"
+
+
+def run(*command: str | Path, **env: str) -> subprocess.CompletedProcess:
+    """Runs a command at the project's top; its output is returned, not shown."""
+    return subprocess.run(
+        [str(c) for c in command], cwd=ROOT, env={**os.environ, **env}, capture_output=True, text=True, check=False
+    )
+
+
+def figure(name: str, value: float, bound: str, holds: bool) -> dict:
+    """One row of the table."""
+    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
+
+
+def at_least(name: str, value: float, bound: float) -> dict:
+    """A row that holds from `bound` upwards."""
+    return figure(name, value, f">= {bound}", value >= bound)
+
+
+def exactly(name: str, value: float, bound: float) -> dict:
+    """A row that holds at `bound` only."""
+    return figure(name, value, f"= {bound}", value == bound)
+
+
+def check_link_goodput() -> list[dict]:
+    """Payload delivered against what the emulated 3 Mbaud line carries, virtual time."""
+    done = run(BUILD / "release/tests/bench/bench_link")
+    values = {f["name"]: f["value"] for f in map(json.loads, done.stdout.splitlines())}
+    return [
+        at_least("link.goodput_clean", values["link.goodput_clean"], 0.95),
+        at_least("link.goodput_1pct", values["link.goodput_1pct"], 0.88),
+    ]
+
+
+def check_link_seeds() -> list[dict]:
+    """The link's fault scenarios under many more seeds than `make test` takes."""
+    done = run(BUILD / "debug/tests/unit/test_link", PIPEFISH_TEST_SEEDS="3000")
+    return [exactly("link.seeds_3000_failures", done.returncode, 0)]
+
+
+def check_daemon_kills() -> list[dict]:
+    """kill -9 of the daemon at random moments: nothing acknowledged is lost, nothing arrives twice."""
+    done = run(
+        sys.executable, "-m", "pytest", "-q", "tests/python/test_daemon.py", "-k", "kill", PIPEFISH_TEST_KILLS="200"
+    )
+    return [exactly("daemon.kills_200_failures", done.returncode, 0)]
+
+
+def check_fuzz() -> list[dict]:
+    """Every fuzz target for two million inputs."""
+    rows = []
+    for target in sorted((BUILD / "clang/tests/fuzz").glob("fuzz_*")):
+        if target.is_file() and os.access(target, os.X_OK):
+            done = run(target, "-runs=2000000", "-max_len=4096", "-max_total_time=600", "-verbosity=0")
+            rows.append(exactly(f"fuzz.{target.name.removeprefix('fuzz_')}_crashes", done.returncode, 0))
+    return rows
+
+
+def check_demo() -> list[dict]:
+    """The demo survey, whole."""
+    done = run(sys.executable, "-m", "pipefish", "demo", "--out", "build/demo")
+    if done.returncode != 0:
+        return [exactly("demo.exit_code", done.returncode, 0)]
+    summary = json.loads((BUILD / "demo/summary.json").read_text())
+    return [
+        at_least("demo.within_1px", summary["within_1px"], 0.95),
+        exactly("demo.keyframes_missing", summary["keyframes_sent"] - summary["keyframes_received"], 0),
+        exactly("demo.crc_errors", summary["crc_errors"], 0),
+    ]
+
+
+CHECKS: dict[str, Callable[[], list[dict]]] = {
+    "link_goodput": check_link_goodput,
+    "link_seeds": check_link_seeds,
+    "daemon_kills": check_daemon_kills,
+    "fuzz": check_fuzz,
+    "demo": check_demo,
+}
+
+
+def main() -> int:
+    """Measures what is missing; 1 when a row does not hold."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=BUILD / "accept.json")
+    parser.add_argument("--fresh", action="store_true", help="measure everything again")
+    args = parser.parse_args()
+    commit = run("git", "rev-parse", "--short", "HEAD").stdout.strip()
+    dirty = bool(run("git", "status", "--porcelain").stdout)
+    kept = BUILD / "accept"
+    kept.mkdir(parents=True, exist_ok=True)
+
+    rows: list[dict] = []
+    for name, check in CHECKS.items():
+        file = kept / f"{commit}-{name}.json"
+        if file.exists() and not args.fresh and not dirty:
+            rows += json.loads(file.read_text())
+            continue
+        print(f"{name}: {check.__doc__}", file=sys.stderr)
+        measured = check()
+        file.write_text(json.dumps(measured))
+        rows += measured
+    for row in rows:
+        print(f"  {'holds' if row['holds'] else 'FAILS'}  {row['name']:32} {row['value']:10.4g}  {row['bound']}")
+    partial = args.out.with_suffix(".partial")
+    partial.write_text(json.dumps(rows, indent=1) + "\n")
+    partial.replace(args.out)
+    print(args.out)
+    return 0 if all(row["holds"] for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

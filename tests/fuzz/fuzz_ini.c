@@ -1,0 +1,35 @@
+/* Invariants: any bytes are parsed or refused with "f:line: what"; a parsed configuration has every number in its range
+ * and every text UTF-8, so that printing it and parsing it again changes nothing. */
+#include "config.h"
+#include "utf8.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n);
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
+{
+    static pf_config first, second;
+    char error[1024] = "", line[PF_CONFIG_LINE_MAX], again[PF_CONFIG_LINE_MAX], assignment[PF_CONFIG_LINE_MAX];
+    pf_config_defaults(&first);
+    if (!pf_config_parse(&first, (const char *)data, n, "f", error, sizeof error)) {
+        if (strncmp(error, "f:", 2) != 0)
+            abort();
+        return 0;
+    }
+    pf_config_defaults(&second);
+    for (uint32_t i = 0; i < pf_config_keys(); i++) {
+        const char *equals;
+        if (pf_config_line(&first, i, line, sizeof line) >= sizeof line || !pf_utf8_check(line))
+            abort();
+        equals = strstr(line, " = ");
+        (void)snprintf(assignment, sizeof assignment, "%.*s=%s", (int)(equals - line), line, equals + 3);
+        if (!pf_config_override(&second, assignment, error, sizeof error))
+            abort();
+        (void)pf_config_line(&second, i, again, sizeof again);
+        if (strcmp(line, again) != 0)
+            abort();
+    }
+    return 0;
+}

@@ -1,0 +1,129 @@
+"""The command line: exit codes, one JSON document, one clear line on errors, atomic outputs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from device import Device
+from pipefish import cli
+from pipefish.camera import Camera
+from pipefish.survey import Survey
+from synthetic import SURVEY, survey_objects, write_survey
+
+COMMANDS = [
+    ["demo"],
+    ["simulate"],
+    ["receive"],
+    ["info"],
+    ["show"],
+    ["status"],
+    ["profile", "show"],
+    ["profile", "check"],
+    ["profile", "convert"],
+]
+
+
+@pytest.fixture
+def survey(tmp_path):
+    write_survey(tmp_path / "a.mcap", 6)
+    return tmp_path / "a.mcap"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command, capsys):
+    assert cli.main([*command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "example:\n  pipefish " + " ".join(command) in text and "--json" in text
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fly"], ["info"], ["show", "x.mcap"], ["receive", "tty", "-o", "x", "--timeout", "-1"]]
+)
+def test_wrong_usage_is_2(arguments, capsys):
+    assert cli.main(arguments) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_info_tells_the_survey(survey, capsys):
+    assert cli.main(["info", str(survey)]) == 0
+    text = capsys.readouterr().out
+    assert "test pipe" in text and "0.25 m" in text and "DN300" in text
+    assert cli.main(["info", str(survey), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["keyframes"] == 6 and document["complete"] and document["length_m"] == pytest.approx(0.25)
+
+
+def test_show_writes_what_it_says(survey, tmp_path, capsys):
+    out = tmp_path / "o.png"
+    assert cli.main(["show", str(survey), "-o", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": str(out), "kind": "overlay", "bytes": out.stat().st_size}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["info", "nothing.mcap"], "nothing.mcap: No such file"),
+        (["info", "junk.mcap"], "junk.mcap: offset 0: not an MCAP file"),
+        (["show", "a.mcap", "-o", "no/such/folder/o.png"], "No such file"),
+        (["receive", "http://x", "-o", "b.mcap"], "'http://x' is no device"),
+        (["receive", "tcp://127.0.0.1:1", "-o", "a.mcap"], "a.mcap exists already"),
+        (["status", "tcp://127.0.0.1:1"], "Connection refused"),
+        (["profile", "check", "junk.mcap"], "junk.mcap"),
+    ],
+)
+def test_failure_is_1_with_one_clear_line(survey, tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "junk.mcap").write_bytes(b"junk, and not little of it")
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    assert cli.main(arguments) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("pipefish: ") and captured.err.count("\n") == 1
+    assert words in captured.err
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before, "nothing half-written"
+
+
+def test_debug_shows_where(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        cli.main(["info", str(tmp_path / "nothing"), "--debug"])
+
+
+def test_receive_and_status_from_the_command_line(tmp_path, capsys):
+    with Device(survey_objects(4), SURVEY) as device:
+        assert cli.main(["status", device.address, "--json"]) == 0
+        status = json.loads(capsys.readouterr().out)
+        assert status["info"]["software"] == "test device" and status["status"]["spool"]["objects"] == "6"
+        assert len(device.spool) == 6, "asking takes nothing from the device"
+        assert cli.main(["receive", device.address, "-o", str(tmp_path / "r.mcap"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["keyframes"] == 4 and document["link"]["crc_errors_host"] == 0
+    assert Survey.open(tmp_path / "r.mcap").complete
+
+
+def test_profiles_convert_there_and_back(tmp_path, capsys):
+    camera = Camera(
+        width=640, height=480, f_u=200.5, f_v=201.0, c_u=319.0, c_v=241.0, k2=0.01, theta_max=1.6, name="lens"
+    )
+    camera.save(tmp_path / "c.json")
+    assert cli.main(["profile", "convert", str(tmp_path / "c.json"), str(tmp_path / "c.profile")]) == 0
+    assert (tmp_path / "c.profile").read_bytes() == camera.to_binary()
+    assert cli.main(["profile", "convert", str(tmp_path / "c.profile"), str(tmp_path / "d.json")]) == 0
+    assert (tmp_path / "d.json").read_bytes() == (tmp_path / "c.json").read_bytes()
+    capsys.readouterr()
+    assert cli.main(["profile", "show", str(tmp_path / "c.profile"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["f_u"] == 200.5
+    assert cli.main(["profile", "check", str(tmp_path / "c.json")]) == 0
+    assert "valid" in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from pipefish.cli import main; main(['--help']); "
+        "heavy = ('numpy', 'google.protobuf', 'PIL', 'plotly', 'rich', 'mcap', 'pipefish._engine'); "
+        "print([m for m in heavy if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"

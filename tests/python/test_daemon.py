@@ -1,0 +1,569 @@
+"""pipefishd as a program: its settings, one survey from end to end, and what survives kill -9."""
+
+import contextlib
+import hashlib
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipefish import pipefish_pb2 as pb
+from pipefish.client import ACCEPT, STORED, Client, Handlers
+from pipefish.transport import TcpTransport, TransportClosed
+
+ROOT = Path(__file__).resolve().parents[2]
+START, KEYFRAME, END = 1, 2, 3
+WIDTH, HEIGHT = 192, 160
+COUNTS_PER_FRAME = 10
+EVERY_FRAME = (
+    *("--set", "keyframe.step_mm=1", "--set", "keyframe.min_interval=1"),
+    *("--set", "keyframe.jpeg_quality=100"),
+)
+
+
+def find_daemon() -> Path:
+    """PIPEFISH_BUILD (a build folder) or the first of build/release and build/debug that has it."""
+    folders = [os.environ["PIPEFISH_BUILD"]] if "PIPEFISH_BUILD" in os.environ else ["build/release", "build/debug"]
+    for folder in folders:
+        program = ROOT / folder / "firmware" / "pipefishd"
+        if program.exists():
+            return program
+    pytest.skip("pipefishd is not built")
+
+
+def texture(seed: int) -> np.ndarray:
+    """A (HEIGHT, 4 WIDTH) uint8 pattern with corners at several scales, periodic to the right."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((HEIGHT, 4 * WIDTH))
+    for cell in (4, 8, 16):
+        image += np.kron(rng.normal(size=(HEIGHT // cell, 4 * WIDTH // cell)), np.ones((cell, cell))) * 25
+    image = sum(np.roll(image, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)) / 9
+    return np.clip(image + 128, 0, 255).astype(np.uint8)
+
+
+def write_recording(path: Path, frames: int, rate: int = 25, skip: tuple[int, ...] = (), seed: int = 1) -> list[str]:
+    """A Y4M of a pattern that moves 2 px a frame, with encoder; `skip`: sequence numbers that were dropped.
+
+    Returns the SHA-256 of each frame."""
+    pattern = texture(seed)
+    rows, hashes = ["sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad"], []
+    with path.open("wb") as out:
+        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F{rate}:1 Ip A1:1 Cmono\n".encode())
+        sequence = 0
+        for i in range(frames):
+            while sequence in skip:
+                sequence += 1
+            pixels = np.ascontiguousarray(np.roll(pattern, -2 * i, axis=1)[:, :WIDTH]).tobytes()
+            out.write(b"FRAME\n" + pixels)
+            hashes.append(hashlib.sha256(pixels).hexdigest())
+            rows.append(f"{sequence},{10**9 + sequence * 10**9 // rate},{i * COUNTS_PER_FRAME},0.01,-0.02,0.005")
+            sequence += 1
+    path.with_suffix(".csv").write_text("\n".join(rows) + "\n")
+    return hashes
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+class Crawler:
+    """A daemon's settings and its process, which may be started again and again on the same spool."""
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        self.port = free_port()
+        self.status_file = folder / "status.json"
+        self.config = folder / "pipefishd.ini"
+        self.log = folder / "log"
+        values = {
+            "camera.path": folder / "survey.y4m",
+            "camera.speed": "fast",
+            "encoder.metres_per_count": 0.0001,
+            "keyframe.step_mm": 2,  # of 1 mm a frame: every second one
+            "link.port": self.port,
+            "spool.path": folder / "spool.db",
+            "status.interval_ms": 100,
+            "status.preview_interval_ms": 100,
+            "daemon.drain_s": 20,
+            "daemon.status_file": self.status_file,
+        } | {key.replace("__", "."): value for key, value in settings.items()}
+        sections: dict[str, list[str]] = {}
+        for key, value in values.items():
+            section, name = key.split(".")
+            sections.setdefault(section, []).append(f"{name} = {value}")
+        self.config.write_text("".join(f"[{s}]\n" + "\n".join(lines) + "\n" for s, lines in sections.items()))
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self, *arguments: str) -> None:
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen([find_daemon(), "--config", self.config, *arguments], stderr=log)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def terminate(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+
+    def wait(self, timeout: float = 30) -> int:
+        return self.process.wait(timeout)
+
+    def status(self) -> dict:
+        return json.loads(self.status_file.read_text()) if self.status_file.exists() else {}
+
+    def text(self) -> str:
+        return self.log.read_text()
+
+
+class Store(Handlers):
+    """A host's durable store: what it holds outlives its clients."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.objects: dict[bytes, tuple[int, bytes]] = {}
+        self.arrivals: Counter[bytes] = Counter()
+        self.statuses: list[pb.Status] = []
+        self.previews: list[pb.Preview] = []
+
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        return STORED if name in self.objects else ACCEPT
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int:
+        assert hashlib.sha256(data).digest() == name
+        self.arrivals[name] += 1
+        self.objects[name] = (kind, data)
+        return STORED
+
+    def on_status(self, status: pb.Status) -> None:
+        self.statuses.append(status)
+
+    def on_preview(self, preview: pb.Preview) -> None:
+        self.previews.append(preview)
+
+    @contextlib.contextmanager
+    def client(self) -> Iterator[Client]:
+        """A fresh client, as after the host's own restart; waits for the daemon's port."""
+        client = Client(TcpTransport("127.0.0.1", self.port), self, wants_objects=True)
+        end = time.monotonic() + 10
+        while True:
+            try:
+                client.open()
+                break
+            except TransportClosed:
+                assert time.monotonic() < end, "the daemon does not listen"
+                time.sleep(0.01)
+        try:
+            yield client
+        finally:
+            client.close()
+
+    def of_kind(self, kind: int) -> list[bytes]:
+        return [data for k, data in self.objects.values() if k == kind]
+
+    @property
+    def starts(self) -> list[pb.SurveyStart]:
+        return [pb.SurveyStart.FromString(data) for data in self.of_kind(START)]
+
+    @property
+    def keyframes(self) -> list[pb.Keyframe]:
+        return sorted((pb.Keyframe.FromString(data) for data in self.of_kind(KEYFRAME)), key=lambda k: k.index)
+
+    @property
+    def ends(self) -> list[pb.SurveyEnd]:
+        return [pb.SurveyEnd.FromString(data) for data in self.of_kind(END)]
+
+
+def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
+    """Runs the client until `until()` or the daemon's end."""
+    end = time.monotonic() + timeout
+    while not until() and crawler.process.poll() is None:
+        assert time.monotonic() < end, crawler.text()
+        client.step(0.02)
+
+
+def receive_all(crawler: Crawler, store: Store) -> int:
+    """Serves the daemon until it exits; returns its exit code."""
+    with store.client() as client:
+        serve(crawler, client, lambda: False)
+    return crawler.wait()
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([find_daemon(), *map(str, arguments)], capture_output=True, text=True, timeout=20)
+
+
+@pytest.fixture
+def crawler(tmp_path: Path) -> Iterator[Crawler]:
+    """A daemon with a recording of 40 frames."""
+    write_recording(tmp_path / "survey.y4m", 40)
+    crawler = Crawler(tmp_path)
+    yield crawler
+    if crawler.process is not None:
+        crawler.kill()
+
+
+# ---- settings
+
+
+def test_help_config_is_the_committed_example_and_a_valid_file(tmp_path: Path):
+    text = run("--help-config").stdout
+    assert text == (ROOT / "firmware" / "pipefishd.ini.example").read_text()
+    config = tmp_path / "c.ini"
+    config.write_text(text)
+    assert run("--config", config, "--check-config", "--set", "camera.path=x").returncode == 0
+
+
+def test_check_config_accepts_a_good_file(crawler: Crawler):
+    done = run("--config", crawler.config, "--check-config")
+    assert (done.returncode, done.stdout) == (0, f"{crawler.config}: ok\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ("max_tracks = 4", "tracker.max_tracks = 4: must be 8..2048"),
+        ("max_tracks = 1e3x", "not a number"),
+        ("max_tracks = 10.5", "not a whole number"),
+        ("max_track = 400", "unknown key max_track in [tracker]; it has: max_tracks levels"),
+        ("[trackers]\nlevels = 4", "unknown section [trackers]; there are: survey camera tracker"),
+        ("levels = 4\nlevels = 4", "tracker.levels is set a second time; the first is in line 2"),
+        ("levels", "neither [section] nor key = value"),
+        ("[camera]\ndriver = v4l3", "camera.driver = v4l3: this build has: replay"),
+        ("[camera]\nrestamp = yes", "must be true or false"),
+    ],
+)
+def test_a_bad_setting_is_named_with_file_and_line(tmp_path: Path, line: str, what: str):
+    config = tmp_path / "c.ini"
+    config.write_text(f"[tracker]\n{line}\n")
+    done = run("--config", config, "--check-config")
+    where = 2 + line.count("\n")
+    assert done.returncode == 1
+    assert f"{config}:{where}: " in done.stderr
+    assert what in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_wrong_usage_exits_2_and_other_failures_1(tmp_path: Path, crawler: Crawler):
+    assert run("--nonsense").returncode == 2
+    assert run("survey.ini").returncode == 2
+    assert run("--config", tmp_path / "absent.ini").returncode == 1
+    for override, what in [("tracker.window=20", "must be odd"), ("nonsense", "section.key=value"), ("a.b=1", "[a]")]:
+        done = run("--config", crawler.config, "--check-config", "--set", override)
+        assert done.returncode == 1
+        assert what in done.stderr
+
+
+def test_a_profile_that_is_none_is_refused_before_anything_starts(tmp_path: Path, crawler: Crawler):
+    profile = tmp_path / "p.bin"
+    profile.write_bytes(b"nonsense")
+    done = run("--config", crawler.config, "--check-config", "--set", f"camera.profile={profile}")
+    assert done.returncode == 1
+    assert str(profile) in done.stderr
+
+
+def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_path: Path, crawler: Crawler):
+    with socket.create_server(("127.0.0.1", crawler.port)):
+        done = run("--config", crawler.config)
+    assert done.returncode == 1
+    assert str(crawler.port) in done.stderr
+    crawler.start("--set", "camera.loops=0")
+    with Store(crawler.port).client():
+        done = run("--config", crawler.config, "--set", f"link.port={free_port()}")
+    assert done.returncode == 1
+    assert "spool.db" in done.stderr
+    done = run("--config", crawler.config, "--set", f"camera.path={tmp_path}/absent.y4m")
+    assert done.returncode == 1
+    assert "absent.y4m" in done.stderr
+
+
+# ---- one survey
+
+
+def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: Crawler):
+    hashes = write_recording(tmp_path / "survey.y4m", 40)
+    store = Store(crawler.port)
+    crawler.start("--set", "survey.name=Ölstraße 7")
+    assert receive_all(crawler, store) == 0
+
+    [start], keyframes, [end] = store.starts, store.keyframes, store.ends
+    assert start.name == "Ölstraße 7"
+    assert start.source.startswith("replay")
+    assert (start.width, start.height, start.profile) == (WIDTH, HEIGHT, b"")
+    assert start.encoder.metres_per_count == 0.0001
+    assert "keyframe.step_mm = 2" in start.config
+    tracker = "".join(f"{line}\n" for line in start.config if line.startswith("tracker."))
+    assert start.tracker_config_sha256 == hashlib.sha256(tracker.encode()).digest()
+    assert {start.survey_id} == {k.survey_id for k in keyframes} | {end.survey_id}
+    assert [k.index for k in keyframes] == list(range(20))
+    assert end.reason == "end of recording"
+    assert (end.keyframes, end.frames, end.boots, list(end.lost_index)) == (20, 40, 1, [])
+    assert set(store.arrivals.values()) == {1}
+
+    boot = start.time.boot_id
+    ages: dict[int, int] = {}
+    for k in keyframes:
+        assert k.frame_sequence == 2 * k.index
+        assert (k.time.boot_id, k.time.monotonic_ns) == (boot, 10**9 + k.frame_sequence * 40_000_000)
+        assert k.frame_sha256.hex() == hashes[k.frame_sequence]
+        assert k.telemetry.encoder_count == k.frame_sequence * COUNTS_PER_FRAME
+        assert k.telemetry.roll_rad == pytest.approx(0.01)
+        assert k.cause == (pb.KEYFRAME_CAUSE_ENCODER if k.index else pb.KEYFRAME_CAUSE_FIRST)
+        assert not k.after_break
+        assert k.jpeg.startswith(b"\xff\xd8")
+        o = k.observations
+        n = len(o.id_delta)
+        assert n > 20
+        for column in (o.x_q16, o.y_q16, o.cov_xx_q20, o.cov_xy_q20, o.cov_yy_q20, o.age, o.quality, o.status):
+            assert len(column) == n
+        assert all(delta > 0 for delta in o.id_delta)
+        assert max(o.x_q16) < WIDTH << 16
+        assert set(o.status) <= {pb.TRACK_STATUS_NEW, pb.TRACK_STATUS_TRACKED}
+        for track, age in zip(np.cumsum(o.id_delta), o.age, strict=True):
+            if int(track) in ages:
+                assert age == ages[int(track)] + 2  # frames between keyframes
+            ages[int(track)] = age
+        ages = {int(t): int(a) for t, a in zip(np.cumsum(o.id_delta), o.age, strict=True)}
+
+    last = store.statuses[-1]
+    assert (last.state, last.frames, last.keyframes, last.frames_dropped) == ("idle", 40, 20, 0)
+    assert (last.spool.objects, last.spool.acknowledged, last.spool.stored) == (0, 22, 22)
+    assert last.link.objects_sent == 22
+    assert last.link.crc_errors == 0
+    assert last.fps > 0
+    assert min(last.stage.pyramid, last.stage.track, last.stage.detect, last.stage.keyframe, last.stage.store) > 0
+    status = crawler.status()
+    assert (status["frames"], status["keyframes"], status["keyframes_dropped"]) == (40, 20, 0)
+    assert status["survey_id"] == start.survey_id.hex()
+    assert status["spool"]["objects"] == 0
+    assert store.previews == [] or store.previews[-1].width == WIDTH // 4
+
+
+def test_two_runs_of_one_recording_track_the_same(tmp_path: Path):
+    write_recording(tmp_path / "survey.y4m", 30)
+    runs = []
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        crawler = Crawler(folder, camera__path=tmp_path / "survey.y4m")
+        store = Store(crawler.port)
+        crawler.start()
+        assert receive_all(crawler, store) == 0
+        runs.append([(k.observations.SerializeToString(), k.jpeg) for k in store.keyframes])
+    assert runs[0] == runs[1]
+
+
+def test_dropped_frames_are_counted_and_a_long_gap_is_a_marked_break(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 30, skip=(5, *range(20, 32)))
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    assert crawler.status()["frames_dropped"] == 13
+    breaks = [k for k in store.keyframes if k.after_break]
+    assert [(k.frame_sequence, k.break_reason, k.cause) for k in breaks] == [
+        (32, "gap of 12 frames", pb.KEYFRAME_CAUSE_FIRST)
+    ]
+    assert set(breaks[0].observations.status) == {pb.TRACK_STATUS_NEW}
+
+
+def test_sigterm_ends_the_survey_and_drains(tmp_path: Path, crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "camera.loops=0", "--set", "camera.speed=recorded")
+    with store.client() as client:
+        serve(crawler, client, lambda: len(store.keyframes) >= 3)
+        crawler.terminate()
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    [end] = store.ends
+    assert end.reason == "terminated"
+    assert [k.index for k in store.keyframes] == list(range(end.keyframes))
+
+
+def test_what_could_not_be_sent_is_delivered_by_the_next_start_before_its_new_survey(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=0")
+    assert crawler.wait() == 0
+    assert "22 objects stay in the spool" in crawler.text()
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    assert len({s.survey_id for s in store.starts}) == 2
+    assert [e.boots for e in store.ends] == [1, 1]
+    assert Counter(k.survey_id for k in store.keyframes) == {s.survey_id: 20 for s in store.starts}
+    # Up to four objects are under way at once, so the order is that of starting, give or take four.
+    order = list(store.objects.values())
+    old_end = next(i for i, (kind, _) in enumerate(order) if kind == END)
+    assert old_end <= 21 + 3
+
+
+def test_a_second_sigterm_exits_at_once(crawler: Crawler):
+    crawler.start("--set", "camera.loops=0")
+    with Store(crawler.port).client():
+        crawler.terminate()
+        end = time.monotonic() + 10
+        while "survey ends" not in crawler.text():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert crawler.process.poll() is None  # nobody takes the objects: it drains
+        crawler.terminate()
+        assert crawler.wait(5) == 1
+
+
+def test_requests_are_answered(crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "camera.loops=0", "--set", "camera.speed=recorded")
+
+    def ask(client: Client, **what: object) -> pb.Reply:
+        number = client.ask(**what)
+        serve(crawler, client, lambda: number in client.replies)
+        return client.replies.pop(number)
+
+    with store.client() as client:
+        serve(crawler, client, lambda: client.up and store.starts)
+        info = ask(client, get_info=pb.Nothing()).info
+        assert info.software == "pipefishd 0.1.0"
+        assert info.survey_id == store.starts[0].survey_id
+        status = ask(client, get_status=pb.Nothing()).status
+        assert status.state == "surveying"
+        assert status.time.boot_id == info.boot_id
+        assert "none that can be set" in ask(client, set_lamp=0.5).error
+        assert "0..1" in ask(client, set_lamp=float("nan")).error
+        sync = pb.ClockSync(boot_id=info.boot_id, offset_ns=-5, error_ns=7)
+        assert ask(client, clock_sync=sync).error == ""
+        assert "another boot" in ask(client, clock_sync=pb.ClockSync(boot_id=1)).error
+        assert "unknown request" in ask(client).error
+        serve(crawler, client, lambda: crawler.status().get("clock") == {"offset_ns": -5, "error_ns": 7})
+        serve(crawler, client, lambda: store.previews)
+        assert store.previews[-1].jpeg.startswith(b"\xff\xd8")
+        assert ask(client, stop_survey=pb.Nothing()).error == ""
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    assert store.ends[0].reason == "stopped by the operator"
+
+
+def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "daemon.exit_when_done=false")
+    with store.client() as client:
+        serve(crawler, client, lambda: bool(store.statuses) and store.statuses[-1].state == "idle")
+        assert crawler.process.poll() is None
+        assert len(store.keyframes) == 20
+        client.ask(shutdown=pb.Nothing())
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+
+
+def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Path, crawler: Crawler):
+    recording = tmp_path / "survey.y4m"
+    csv = recording.with_suffix(".csv")
+    hashes = write_recording(recording, 40)
+    rows = csv.read_text().splitlines()
+    csv.write_text("\n".join([rows[0] + ",sha256"] + [f"{r},{h}" for r, h in zip(rows[1:], hashes, strict=True)]))
+    data = bytearray(recording.read_bytes())
+    data[-30 * (WIDTH * HEIGHT + 6) + 100] ^= 1  # a pixel of the eleventh frame
+    recording.write_bytes(data)
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 1
+    [end] = store.ends
+    assert end.reason.startswith("camera failed: ")
+    assert "survey.y4m" in end.reason
+    assert end.frames == 10
+    assert len(store.keyframes) == end.keyframes == 5
+    assert "survey.y4m" in crawler.text()
+
+
+def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.loops=3", *EVERY_FRAME)
+    end = time.monotonic() + 20
+    while "make room" not in crawler.text():
+        assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+    assert receive_all(crawler, store) == 0
+    [end_message] = store.ends
+    assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
+    assert list(end_message.lost_index) == []
+
+
+def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 120, rate=60)
+    store = Store(crawler.port)
+    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.speed=recorded", *EVERY_FRAME)
+    end = time.monotonic() + 20
+    while "survey ends" not in crawler.text():
+        assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+    assert receive_all(crawler, store) == 0
+    [end_message] = store.ends
+    lost, got = set(end_message.lost_index), {k.index for k in store.keyframes}
+    assert lost
+    assert lost & got == set()
+    assert lost | got == set(range(end_message.keyframes))
+    assert crawler.status()["keyframes_dropped"] == len(lost)
+
+
+# ---- kill -9
+
+
+def check_everything_arrived_once(store: Store, kills: int) -> None:
+    """Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
+    [end] = store.ends
+    assert {k.survey_id for k in store.keyframes} == {end.survey_id}
+    assert [k.index for k in store.keyframes] == list(range(end.keyframes))
+    assert list(end.lost_index) == []
+    assert 1 < end.boots <= kills + 1
+    # One start for each boot that came to store it; each boot's first keyframe is marked.
+    boots = [s.time.boot_id for s in store.starts]
+    assert len(set(boots)) == len(boots) <= end.boots
+    before = None
+    for k in store.keyframes:
+        assert k.time.boot_id in boots
+        is_first = k.time.boot_id != before
+        assert k.after_break == (is_first and k.index > 0), k.index
+        if k.after_break:
+            assert k.break_reason == "restart"
+        before = k.time.boot_id
+
+
+def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path, crawler: Crawler):
+    # No host at all while it is being killed; then one that takes what the boots have left.
+    write_recording(tmp_path / "survey.y4m", 120)
+    rng = random.Random(3)
+    kills = 15
+    for _ in range(kills):
+        crawler.start("--set", "camera.loops=0")
+        time.sleep(rng.uniform(0.02, 0.25))
+        crawler.kill()
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    check_everything_arrived_once(store, kills)
+
+
+def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(tmp_path: Path, crawler: Crawler):
+    # What the host has stored but the daemon had not yet removed is offered again and answered from the store: it does
+    # not arrive twice. Every second time the host dies as well, in the middle of whatever was under way.
+    write_recording(tmp_path / "survey.y4m", 120)
+    rng = random.Random(4)
+    kills = 20
+    store = Store(crawler.port)
+    for i in range(kills):
+        crawler.start("--set", "camera.loops=0")
+        for _ in range(1 + i % 2):
+            with store.client() as client:
+                end = time.monotonic() + rng.uniform(0.02, 0.2)
+                serve(crawler, client, lambda end=end: time.monotonic() > end)
+        crawler.kill()
+    assert len(store.objects) > kills  # it was indeed sending
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    check_everything_arrived_once(store, kills)
+    assert set(store.arrivals.values()) == {1}

@@ -1,0 +1,56 @@
+"""Evaluation against truth: anchored at the first sighting, in pixels; what cannot be seen counts as wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipefish.evaluate import evaluate, track_errors
+from pipefish.survey import Survey
+from synthetic import write_survey
+
+
+class Flat:
+    """A world in which the points of the synthetic survey move outwards as it draws them, plus `drift` a frame."""
+
+    def __init__(self, drift: float = 0.0, blind_after: int = 10**9) -> None:
+        self.drift, self.blind_after = drift, blind_after
+
+    def cast(self, frame, pixels):
+        offset = pixels - [80, 60]
+        radius = np.linalg.norm(offset, axis=1) - 0.6 * frame
+        angle = np.arctan2(offset[:, 1], offset[:, 0])
+        return np.stack([radius, angle, np.full(len(pixels), frame)], axis=1), np.ones(len(pixels), dtype=bool)
+
+    def project(self, frame, points):
+        radius = points[:, 0] + 0.6 * frame + self.drift * (frame - points[:, 2])
+        pixels = np.stack([80 + radius * np.cos(points[:, 1]), 60 + radius * np.sin(points[:, 1])], axis=1)
+        return pixels, np.full(len(points), frame <= self.blind_after)
+
+
+def opened(tmp_path) -> Survey:
+    write_survey(tmp_path / "a.mcap", 12)
+    return Survey.open(tmp_path / "a.mcap")
+
+
+def test_perfect_tracks_have_no_error(tmp_path):
+    survey = opened(tmp_path)
+    result = evaluate(survey, Flat())
+    assert result["within_1px"] == 1.0 and result["p95_px"] < 1e-3  # Q16.16 positions
+    assert result["observations"] == 12 * 40 - len(survey.tracks().id)
+
+
+def test_drift_grows_with_the_age_since_the_anchor(tmp_path):
+    errors = track_errors(opened(tmp_path), Flat(drift=0.12))
+    np.testing.assert_allclose(errors["error"], 0.12 * errors["age"], atol=1e-3)
+    result = evaluate(opened_again(tmp_path), Flat(drift=0.12))
+    assert result["by_age"][0]["within_1px"] == 1.0  # 5 frames: 0.6 px
+    assert result["by_age"][1]["within_1px"] == 0.0  # 10 frames: 1.2 px
+
+
+def opened_again(tmp_path) -> Survey:
+    return Survey.open(tmp_path / "a.mcap")
+
+
+def test_a_track_that_cannot_be_there_is_wrong(tmp_path):
+    result = evaluate(opened(tmp_path), Flat(blind_after=0))
+    assert result["within_1px"] == 0.0

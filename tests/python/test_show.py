@@ -1,0 +1,63 @@
+"""Pictures of a survey: right size, tracks where they belong, readable formats, nothing half-written."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipefish.colours import age_colours
+from pipefish.errors import PipefishError
+from pipefish.show import Painter, Style, animation, show, spread
+from pipefish.survey import Survey
+from synthetic import write_survey
+
+
+@pytest.fixture
+def survey(tmp_path):
+    write_survey(tmp_path / "a.mcap", 12)
+    return Survey.open(tmp_path / "a.mcap")
+
+
+def test_the_dot_of_a_track_is_where_the_track_is(survey):
+    scale = 4
+    picture = np.asarray(Painter(survey).draw(9, Style(160 * scale, legend=False, line=0.5)).convert("RGB")).astype(int)
+    seen = survey.keyframes[9].observations
+    centres = np.round((seen.xy + 0.5) * scale - 0.5).astype(int)
+    distance = np.abs(picture[centres[:, 1], centres[:, 0]] - age_colours(seen.age).astype(int)).max(axis=1)
+    assert np.mean(distance <= 40) > 0.85  # the others lie under a neighbour
+
+
+def test_an_overlay_has_the_picture_and_a_legend(survey, tmp_path):
+    written = show(survey, tmp_path / "o.png", keyframe=3)
+    picture = Image.open(tmp_path / "o.png")
+    assert written["kind"] == "overlay" and picture.width == 160 * 7
+    assert picture.height > 120 * 7 and picture.mode == "RGB"
+
+
+@pytest.mark.parametrize("name", ["a.webp", "a.gif"])
+def test_an_animation_has_all_keyframes_and_stays_small(survey, tmp_path, name):
+    written = show(survey, tmp_path / name)
+    picture = Image.open(tmp_path / name)
+    assert written["kind"] == "animation" and picture.n_frames == 12
+    assert (tmp_path / name).stat().st_size < 10 << 20
+
+
+def test_an_animation_is_thinned_until_it_fits(survey):
+    data = animation(Painter(survey), ".webp", limit=60_000)
+    assert len(data) <= 60_000 and Image.open(io.BytesIO(data)).n_frames >= 1
+
+
+def test_what_cannot_be_drawn_is_said(survey, tmp_path):
+    with pytest.raises(PipefishError, match=r"no keyframe 99 \(0 to 11\)"):
+        show(survey, tmp_path / "o.png", keyframe=99)
+    with pytest.raises(PipefishError, match=r"\.png"):
+        show(survey, tmp_path / "o.mov")
+    assert not list(tmp_path.glob("o.*"))
+
+
+def test_spread_keeps_both_ends():
+    assert spread(100, 5) == [0, 25, 50, 74, 99] or spread(100, 5)[::4] == [0, 99]
+    assert spread(3, 10) == [0, 1, 2] and spread(1, 5) == [0]

@@ -1,0 +1,249 @@
+"""The simulator: its truth agrees with itself and with its pictures; bad scenes are refused by name."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipefish.errors import FormatError, PipefishError
+from pipefish.simulate import PRESETS, Scene, quaternion, simulate
+
+
+def small(**changes: object) -> dict:
+    """A quick scene: 320 x 240, a bend and an oval stretch in 2 m of DN200."""
+    scene = {
+        "diameter": 0.2,
+        "pieces": [{"length": 0.9}, {"angle": 0.5, "radius": 0.6, "clock": 2.0}, {"length": 1.0}],
+        "ovals": [{"start": 1.2, "end": 1.9, "ramp": 0.2, "ovality": 0.05, "clock": 0.7}],
+        "lens": {"width": 320, "height": 240, "circle_radius": 118, "c_u": 158.3, "c_v": 121.1},
+        "motion": {"frames": 141},
+    }
+    return scene | changes
+
+
+def pixels_in_circle(scene: Scene, count: int, seed: int) -> np.ndarray:
+    """Random pixels inside the image circle."""
+    rng = np.random.default_rng(seed)
+    lens = scene.spec["lens"]
+    radius = scene.circle_radius * np.sqrt(rng.uniform(0.001, 0.99, count))
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.column_stack([lens["c_u"] + radius * np.cos(angle), lens["c_v"] + radius * np.sin(angle)])
+
+
+@pytest.mark.parametrize("frame", [0, 60, 90, 140])
+def test_cast_and_project_are_inverse_in_straight_bend_and_oval(frame: int) -> None:
+    scene = Scene(small())
+    pixels = pixels_in_circle(scene, 2000, frame)
+    points, ok = scene.cast(frame, pixels)
+    assert ok.all()
+    back, seen = scene.project(frame, points)
+    assert seen.all()
+    assert np.abs(back - pixels).max() < 1e-6
+
+
+@pytest.mark.parametrize("frame", [0, 60, 90, 140])
+def test_cast_points_lie_on_the_wall_and_nothing_is_in_front(frame: int) -> None:
+    scene = Scene(small())
+    points, _ = scene.cast(frame, pixels_in_circle(scene, 500, frame))
+    for s, rho, phi in scene.locate(points):
+        d_max, d_min, clock = scene.section(s)
+        ellipse = 1 / math.hypot(2 * math.cos(phi - clock) / d_max, 2 * math.sin(phi - clock) / d_min)
+        assert abs(rho - ellipse) < 1e-7
+    # Walk each ray from the camera: every place before the hit is inside the pipe. The pupil shift (1.5 mm) makes the
+    # straight line from the centre a little different: its last per cent is left out.
+    centre = scene.centre(frame)
+    for share in np.linspace(0, 0.98, 50):
+        s, rho, phi = scene.locate(centre + share * (points - centre)).T
+        for a, r, p in zip(s, rho, phi, strict=True):
+            d_max, d_min, clock = scene.section(a)
+            assert r < 1 / math.hypot(2 * math.cos(p - clock) / d_max, 2 * math.sin(p - clock) / d_min) + 1e-4
+
+
+def test_centreline_matches_closed_form_of_a_bend() -> None:
+    scene = Scene(small())
+    # Towards clock 2.0: right is +x, up is -y. After the bend of 0.5 rad with radius 0.6 that begins at z = 0.9.
+    inward = np.array([math.sin(2.0), -math.cos(2.0), 0])
+    end = np.array([0, 0, 0.9]) + 0.6 * ((1 - math.cos(0.5)) * inward + np.array([0, 0, math.sin(0.5)]))
+    middle = (scene.wall(0.9 + 0.3, 0.4) + scene.wall(0.9 + 0.3, 0.4 + math.pi)) / 2
+    assert np.abs(middle - end).max() < 1e-12
+    assert abs(scene.length - (0.9 + 0.3 + 1.0)) < 1e-12
+    beyond = (scene.wall(1.7, 0.4) + scene.wall(1.7, 0.4 + math.pi)) / 2
+    tangent = math.sin(0.5) * inward + np.array([0, 0, math.cos(0.5)])
+    assert np.abs(beyond - (end + 0.5 * tangent)).max() < 1e-12
+
+
+def test_section_has_the_stated_ovality_where_it_is_stated() -> None:
+    scene = Scene(small())
+    assert scene.section(1.0)[:2] == (0.2, 0.2)
+    d_max, d_min, clock = scene.section(1.55)
+    assert (d_max - d_min) / ((d_max + d_min) / 2) == pytest.approx(0.05, abs=1e-12)
+    assert clock == 0.7
+    across = np.linalg.norm(scene.wall(1.55, 0.7) - scene.wall(1.55, 0.7 + math.pi))
+    assert across == pytest.approx(d_max, abs=1e-12)
+
+
+def test_pictures_agree_with_project() -> None:
+    # White discs on the wall: the centroid of what they change in the picture, against the area centroid of their
+    # projected outline. Change / picture without them is the covered share of a pixel, whatever the light does.
+    places = [(0.62, 0.3), (0.66, 2.0), (0.7, 3.8), (0.64, 5.2)]
+    base = small(
+        texture={"contrast": 0, "joint_spacing": 0},
+        lens={"width": 960, "height": 720, "circle_radius": 354, "c_u": 478.3, "c_v": 361.1, "vignetting": 0},
+        sensor={"read_noise": 0, "shot_noise": 0},
+        lamp={"side": 1, "forward": 2, "exposure": 400},
+    )
+    markers = [{"s": s, "phi": phi, "radius": 0.008} for s, phi in places]
+    scene, frame = Scene(base | {"markers": markers}), 20
+    without = Scene(base).render(frame).astype(float)
+    covered = (scene.render(frame) - without) / np.maximum(without, 1)
+    for s, phi in places:
+        centre = scene.wall(s, phi)
+        around, along = scene.wall(s, phi + 1e-4) - centre, scene.wall(s + 1e-4, phi) - centre
+        around, along = around / np.linalg.norm(around), along / np.linalg.norm(along)
+        # The disc is the wall within a sphere: its outline bulges by the wall's sagitta, which locate() takes out.
+        angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+        ring = centre + 0.008 * (np.cos(angle)[:, None] * around + np.sin(angle)[:, None] * along)
+        ring = np.array([scene.wall(a, p) for a, _, p in scene.locate(ring)])
+        outline, _ = scene.project(frame, ring)
+        (x, y), (x2, y2) = outline.T, np.roll(outline, -1, axis=0).T
+        cross = x * y2 - x2 * y
+        truth = np.array([((x + x2) * cross).sum(), ((y + y2) * cross).sum()]) / (3 * cross.sum())
+        u, v = np.round(truth).astype(int)
+        reach = int(np.ceil(np.ptp(outline, axis=0).max() / 2)) + 4
+        rows, columns = np.mgrid[v - reach : v + reach + 1, u - reach : u + reach + 1]
+        weight = covered[rows, columns]
+        seen = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+        # Pixels are sampled, not integrated: each of the n = 2 pi r on the outline is off by up to half a pixel (sigma
+        # 0.29), with levers of up to r: the centroid's sigma is 0.29 r sqrt(n / 2) / (pi r^2) an axis.
+        radius = math.sqrt(abs(cross.sum()) / 2 / math.pi)
+        assert np.abs(seen - truth).max() < 3 * 0.29 / math.sqrt(math.pi * radius), (s, phi)
+
+
+def test_same_bits_for_any_number_of_threads_and_other_bits_for_another_seed() -> None:
+    one = Scene(small()).render(7, threads=1)
+    assert np.array_equal(one, Scene(small()).render(7, threads=3))
+    other = Scene(small(sensor={"seed": 2})).render(7)
+    assert not np.array_equal(one, other)
+
+
+def test_noise_has_the_stated_variance() -> None:
+    quiet = Scene(small(sensor={"read_noise": 0, "shot_noise": 0})).render(3).astype(float)
+    noisy = Scene(small(sensor={"read_noise": 3, "shot_noise": 0.2})).render(3).astype(float)
+    for low, high in [(30, 60), (60, 100), (100, 160)]:
+        where = (quiet >= low) & (quiet < high)
+        level = quiet[where].mean()
+        expected = 9 + 0.2 * level + 2 / 12  # both pictures are rounded
+        variance = (noisy - quiet)[where].var()
+        # The variance of n normal samples is known to sqrt(2 / n); four of these.
+        assert variance == pytest.approx(expected, rel=4 * math.sqrt(2 / where.sum()) + 0.02)
+
+
+def test_encoder_has_the_stated_bias_and_slip() -> None:
+    ends = []
+    for seed in range(60):
+        scene = Scene(small(pieces=[{"length": 3.0}], ovals=[], motion={"frames": 200, "seed": seed}))
+        driven = scene.arc_length(199) - scene.arc_length(0)
+        ends.append(scene.telemetry(199)[1] * 0.0005 - driven)
+    expected_bias, expected_sigma = 0.004 * driven - 0.00025, 0.00224 * math.sqrt(driven)
+    assert np.mean(ends) == pytest.approx(expected_bias, abs=4 * expected_sigma / math.sqrt(60))
+    assert np.std(ends) == pytest.approx(expected_sigma, rel=4 / math.sqrt(2 * 60))
+
+
+def test_roll_and_pitch_are_those_of_the_pose() -> None:
+    scene = Scene(small(motion={"frames": 30, "attitude_sigma": 0}))
+    for frame in (0, 13, 29):
+        down = scene.pose(frame)[:, :3] @ np.array([0, 1, 0])
+        _, _, roll, pitch = scene.telemetry(frame)
+        assert roll == pytest.approx(math.atan2(down[0], down[1]), abs=1e-12)
+        assert pitch == pytest.approx(math.asin(-down[2]), abs=1e-12)
+
+
+def test_lens_is_outside_the_polynomial_family_but_close_to_it(tmp_path: Path) -> None:
+    simulate("tiny", tmp_path / "t", frames=1, quiet=True)
+    profile = json.loads((tmp_path / "t.profile.json").read_text())
+    assert profile["source"] == "simulated"
+    assert 0 < profile["rms_px"] < 0.01
+
+
+def test_quaternion_is_the_rotation() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        w, x, y, z = q = (lambda v: v / np.linalg.norm(v))(rng.normal(size=4))
+        matrix = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        assert min(np.abs(quaternion(matrix) - q).max(), np.abs(quaternion(matrix) + q).max()) < 1e-12
+
+
+def test_simulate_writes_a_recording_that_says_what_the_scene_does(tmp_path: Path) -> None:
+    done = simulate("tiny", tmp_path / "a", frames=5, quiet=True)
+    assert done["frames"] == 5
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.profile.json", "a.truth.json", "a.y4m"]
+    scene = Scene.from_truth(tmp_path / "a.truth.json")
+    data = (tmp_path / "a.y4m").read_bytes()
+    header = b"YUV4MPEG2 W320 H240 F20:1 Ip A1:1 Cmono\n"
+    assert data.startswith(header)
+    frame = data[len(header) :][2 * (6 + 320 * 240) :][6 : 6 + 320 * 240]
+    assert np.array_equal(np.frombuffer(frame, np.uint8).reshape(240, 320), scene.render(2))
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert len(rows) == 6
+    assert rows[3].startswith(f"2,{scene.telemetry(2)[0]},{scene.telemetry(2)[1]},")
+
+
+def test_truth_of_another_simulator_is_refused(tmp_path: Path) -> None:
+    simulate("tiny", tmp_path / "a", frames=3, quiet=True)
+    truth = json.loads((tmp_path / "a.truth.json").read_text())
+    truth["poses"][2][5] += 1e-3
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth))
+    with pytest.raises(FormatError, match=r"poses\[2\].*simulate anew"):
+        Scene.from_truth(tmp_path / "a.truth.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"widht": 3}, "widht: unknown; known are diameter"),
+        ({"lens": {"focal": 3}}, "lens.focal: unknown"),
+        ({"lens": {"width": 3.5}}, "lens.width: must be a whole number"),
+        ({"lens": {"width": "wide"}}, "lens.width: must be a number"),
+        ({"lens": 5}, "lens.*: must be an object"),
+        ({"diameter": -1}, "diameter: must be within"),
+        ({"diameter": float("nan")}, "diameter: must be within"),
+        ({"pieces": []}, "pieces: needs at least one"),
+        ({"pieces": {}}, "pieces: must be a list"),
+        ({"pieces": [{"length": 1}, {"angle": 1, "radius": 0.1}]}, r"pieces\[1\].radius: must be above"),
+        ({"pieces": [{"radius": 1}]}, r"pieces\[0\]: a straight run needs a length"),
+        ({"ovals": [{"start": 2, "end": 1}]}, r"ovals\[0\].end: must lie behind start"),
+        ({"motion": {"frames": 5000}}, "motion: the camera would drive out"),
+        ({"motion": {"below_axis": 0.3}}, "motion.below_axis: the camera would leave"),
+    ],
+)
+def test_a_bad_scene_is_refused_with_the_key(change: dict, where: str) -> None:
+    with pytest.raises(FormatError, match=where):
+        Scene(small(**change))
+
+
+def test_a_bad_scene_file_is_refused_with_file_and_place(tmp_path: Path) -> None:
+    file = tmp_path / "scene.json"
+    file.write_text('{"pieces": [\n  {"length": }]}')
+    with pytest.raises(FormatError, match=r"scene\.json: 2:14: "):
+        Scene.load(file)
+    file.write_text('{"pieces": [{"length": 2}], "lens": {"width": 1}}')
+    with pytest.raises(FormatError, match=r"scene\.json: lens\.width: "):
+        simulate(file, tmp_path / "out", quiet=True)
+    with pytest.raises(PipefishError, match="demo, straight, tiny"):
+        Scene.load("no-such-scene")
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.json"]
+
+
+def test_every_preset_is_a_valid_scene() -> None:
+    for name in PRESETS:
+        assert Scene.load(name).frames > 0

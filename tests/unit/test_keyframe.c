@@ -1,0 +1,156 @@
+#include <math.h>
+#include <string.h>
+
+#include "pipefish/track.h"
+#include "unity.h"
+
+#define N 200
+
+static pf_keyframe_state state;
+static pf_track tracks[N];
+static pf_ray_q30 rays[N];
+static const pf_keyframe_config config = {.min_interval = 1};
+
+void setUp(void)
+{
+    memset(&state, 0, sizeof state);
+}
+void tearDown(void) {}
+
+/* Points on the wall of a 300 mm pipe, seen from z = `travel` (metres) by a camera turned by `angle` about `axis`. */
+static void look(double travel, double angle, int axis)
+{
+    const double c = cos(angle), s = sin(angle);
+    for (int i = 0; i < N; i++) {
+        const double phi = i * 2.399963, p[3] = {0.15 * cos(phi), 0.15 * sin(phi), 0.05 + 0.002 * i - travel};
+        const int a = (axis + 1) % 3, b = (axis + 2) % 3;
+        double q[3] = {p[0], p[1], p[2]};
+        q[a] = c * p[a] - s * p[b];
+        q[b] = s * p[a] + c * p[b];
+        const double n = 1073741824.0 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]);
+        rays[i] = (pf_ray_q30){(int32_t)lrint(q[0] * n), (int32_t)lrint(q[1] * n), (int32_t)lrint(q[2] * n)};
+        tracks[i] = (pf_track){.id = (uint64_t)i + 1u, .status = PF_TRACK_TRACKED};
+    }
+}
+
+static pf_keyframe_cause decide(const pf_keyframe_config *c, const int64_t *encoder, uint32_t *common)
+{
+    return pf_keyframe_decide(&state, c, tracks, rays, N, encoder, common);
+}
+
+/* Proves: the encoder rules where there is one, in either direction, and parallax then does not. */
+static void test_encoder_steps_choose_keyframes_in_both_directions(void)
+{
+    const pf_keyframe_config c = {.step_counts = 100, .min_interval = 1};
+    static const struct {
+        int64_t at;
+        pf_keyframe_cause expected;
+    } step[] = {{1000, PF_KEYFRAME_FIRST}, {1099, PF_KEYFRAME_NO},      {1100, PF_KEYFRAME_ENCODER},
+                {1001, PF_KEYFRAME_NO},    {1000, PF_KEYFRAME_ENCODER}, {901, PF_KEYFRAME_NO}};
+    for (size_t i = 0; i < sizeof step / sizeof step[0]; i++) {
+        look(0.02 * (double)i, 0, 0);
+        TEST_ASSERT_EQUAL_INT(step[i].expected, decide(&c, &step[i].at, NULL));
+    }
+}
+
+/* Proves: rotation alone is no parallax, about any axis and up to 15 degrees; it is compensated, not just ignored. */
+static void test_pure_rotation_makes_no_keyframe(void)
+{
+    for (int axis = 0; axis < 3; axis++) {
+        uint32_t common = 0;
+        memset(&state, 0, sizeof state);
+        look(0, 0, 0);
+        TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, &common));
+        TEST_ASSERT_EQUAL_UINT32(0, common);
+        look(0, 15 * 3.14159265 / 180, axis);
+        TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, &common));
+        TEST_ASSERT_EQUAL_UINT32(N, common);
+    }
+}
+
+/* Proves: driving makes a keyframe when the median angle passes the threshold, and not before, roll or no roll. */
+static void test_forward_motion_makes_a_keyframe_at_the_parallax(void)
+{
+    for (int k = 0; k < 2; k++) {
+        int steps = 0;
+        double median[N];
+        memset(&state, 0, sizeof state);
+        look(0, 0, 2);
+        TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, NULL));
+        do {
+            steps++;
+            look(0.002 * steps, 0.1 * k, 2);
+        } while (decide(&config, NULL, NULL) == PF_KEYFRAME_NO && steps < 200);
+        for (int i = 0; i < N; i++) { /* axial points turn by the difference of their polar angles */
+            const double z = 0.05 + 0.002 * i;
+            median[i] = fabs(atan2(0.15, z - 0.002 * steps) - atan2(0.15, z));
+        }
+        int above = 0;
+        for (int i = 0; i < N; i++)
+            above += median[i] >= 0.174533;
+        /* half of the points at the threshold; the roll leaves a little to the robust fit */
+        TEST_ASSERT_INT_WITHIN(10, N / 2, above);
+    }
+}
+
+/* Proves: few common tracks force a keyframe; a weakly textured reference is judged by half of what it had. */
+static void test_few_common_tracks_force_a_keyframe(void)
+{
+    uint32_t common;
+    look(0, 0, 0);
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, NULL));
+    for (int i = 0; i < 100; i++)
+        tracks[i].status = PF_TRACK_LOST;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, &common));
+    TEST_ASSERT_EQUAL_UINT32(100, common);
+    tracks[100].status = PF_TRACK_LOST;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FEW_COMMON, decide(&config, NULL, &common));
+    TEST_ASSERT_EQUAL_UINT32(99, common);
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, NULL)); /* 99 of 99, though fewer than 100 */
+    for (int i = 101; i < 150; i++)
+        tracks[i].status = PF_TRACK_LOST;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, &common)); /* 50 of 99: above half */
+    tracks[150].status = tracks[151].status = PF_TRACK_LOST;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FEW_COMMON, decide(&config, NULL, NULL));
+}
+
+/* Proves: the interval holds whatever the cause. */
+static void test_interval_between_keyframes_is_kept(void)
+{
+    const pf_keyframe_config c = {.step_counts = 1, .min_interval = 3};
+    for (int64_t k = 0; k < 12; k++) {
+        const int64_t at = 1000 * k;
+        look(0.05 * (double)k, 0, 0);
+        for (int i = 0; i < N; i++)
+            tracks[i].id += 1000u * (uint64_t)k; /* nothing in common either */
+        TEST_ASSERT_EQUAL_INT(k == 0       ? PF_KEYFRAME_FIRST
+                              : k % 3 == 0 ? PF_KEYFRAME_ENCODER
+                                           : PF_KEYFRAME_NO,
+                              decide(&c, &at, NULL));
+    }
+}
+
+/* Proves: bearings outside the camera's domain are left out of the parallax but count as common. */
+static void test_invalid_bearings_are_left_out(void)
+{
+    uint32_t common;
+    look(0, 0, 0);
+    decide(&config, NULL, NULL);
+    look(0.001, 0, 0);
+    for (int i = 0; i < N - 20; i++)
+        rays[i] = (pf_ray_q30){0, 0, 0};
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, &common));
+    TEST_ASSERT_EQUAL_UINT32(N, common);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_encoder_steps_choose_keyframes_in_both_directions);
+    RUN_TEST(test_pure_rotation_makes_no_keyframe);
+    RUN_TEST(test_forward_motion_makes_a_keyframe_at_the_parallax);
+    RUN_TEST(test_few_common_tracks_force_a_keyframe);
+    RUN_TEST(test_interval_between_keyframes_is_kept);
+    RUN_TEST(test_invalid_bearings_are_left_out);
+    return UNITY_END();
+}

@@ -1,0 +1,290 @@
+/* The link over bad lines. Proves, for seeded lines and interruptions: every object arrives once, whole and identical;
+ * control arrives once and in order; latest never goes back; everything ends in bounded (virtual) time; and a loop
+ * driven by the deadline alone neither stalls nor spins (link_world.c asserts most of it while it runs). Does not
+ * prove: that the emulated line's faults are those of your cable. */
+#include "link_world.h"
+#include "unity.h"
+
+#include <stdio.h>
+#include <string.h>
+
+static world w;
+
+void setUp(void) {}
+void tearDown(void) {}
+
+static pf_link_config end_config(uint32_t role)
+{
+    return (pf_link_config){.role = role, .nonce = 1, .max_object = WORLD_OBJECT_SIZE, .max_latest = 12000};
+}
+
+static void begin(const pf_sim_line_config *line)
+{
+    pf_link_config configs[2] = {end_config(PF_LINK_DEVICE), end_config(PF_LINK_HOST)};
+    world_init(&w, line, configs);
+}
+
+static void fill_spool(uint32_t end, uint32_t objects, uint32_t most)
+{
+    world_app *app = &w.apps[end];
+    app->objects = objects;
+    for (uint32_t id = 0; id < objects; id++)
+        app->sizes[id] = 1 + (uint32_t)world_random(&w, most);
+}
+
+static const pf_link_stats *stats(uint32_t end)
+{
+    return pf_link_get_stats(w.apps[end].link);
+}
+
+/* Two ends as different as the configuration allows. */
+static void begin_random(uint64_t seed, const pf_sim_faults *faults)
+{
+    static const uint32_t bauds[] = {115200, 921600, 3000000}, fragments[] = {64, 200, 1000, 1024};
+    uint64_t r = seed * UINT64_C(0x9E3779B97F4A7C15) >> 20;
+    pf_sim_line_config line = {.baud = bauds[r % 3],
+                               .fifo = r / 3 % 2 ? 1100 : 8192,
+                               .latency_ns = (r / 6 % 3) * 7 * WORLD_MS,
+                               .seed = seed,
+                               .faults = *faults};
+    pf_link_config configs[2] = {end_config(PF_LINK_DEVICE), end_config(PF_LINK_HOST)};
+    for (uint32_t i = 0; i < 2; i++) {
+        configs[i].max_fragment = fragments[r / (i == 0 ? 18 : 72) % 4];
+        configs[i].send_slots = 1 + (uint32_t)(r / 300 % 4);
+        configs[i].receive_slots = 1 + (uint32_t)(r / 1200 % 4);
+        configs[i].window = r / 5000 % 3 == 0 ? 3000 : 65536;
+    }
+    world_init(&w, &line, configs);
+    fill_spool(0, 1 + (uint32_t)world_random(&w, 8), 16000);
+    fill_spool(1, (uint32_t)world_random(&w, 3), 8000);
+    for (uint32_t i = 0; i < 2; i++) {
+        w.apps[i].control_every = (20 + world_random(&w, 100)) * WORLD_MS;
+        w.apps[i].latest_every = (10 + world_random(&w, 100)) * WORLD_MS;
+        w.apps[i].latest_size = 500 + (uint32_t)world_random(&w, 5000);
+        w.apps[i].answer_delay = world_random(&w, 3) * 50 * WORLD_MS;
+    }
+}
+
+static void expect_done(uint64_t seed, uint64_t limit)
+{
+    char text[120];
+    snprintf(text, sizeof text, "seed %u: not finished in time", (unsigned)seed);
+    TEST_ASSERT_TRUE_MESSAGE(world_run(&w, limit), text);
+    for (uint32_t end = 0; end < 2; end++)
+        for (uint32_t id = 0; id < w.apps[end].objects; id++)
+            TEST_ASSERT_TRUE(w.apps[end].refused[id] || w.apps[!end].stored[id]);
+}
+
+/* ---- a clean line ---- */
+
+static void test_clean_line_delivers_everything_and_repeats_nothing(void)
+{
+    for (uint64_t seed = 0; seed < 30; seed++) {
+        begin_random(seed, &(pf_sim_faults){0});
+        w.lossless = true;
+        expect_done(seed, 60000 * WORLD_MS);
+        for (uint32_t end = 0; end < 2; end++) {
+            /* A round trip that jumps when buffers fill may cost one probe, not more. */
+            TEST_ASSERT_TRUE(stats(end)->fragments_resent <= 1);
+            TEST_ASSERT_EQUAL_UINT64(stats(!end)->fragments_resent, stats(end)->fragments_duplicate);
+            TEST_ASSERT_EQUAL_UINT64(0, stats(end)->crc_errors);
+            TEST_ASSERT_EQUAL_UINT64(0, stats(end)->malformed);
+            TEST_ASSERT_EQUAL_UINT64(1, stats(end)->sessions);
+        }
+    }
+}
+
+/* ---- bad lines ---- */
+
+static void test_frames_lost_up_to_30_percent(void)
+{
+    for (uint64_t seed = 0; seed < 40; seed++) {
+        begin_random(seed, &(pf_sim_faults){.frame_loss_ppm = (uint32_t)(seed % 4 + 1) * 75000});
+        expect_done(seed, 240000 * WORLD_MS);
+    }
+}
+
+static void test_bytes_corrupted_and_dropped_in_bursts(void)
+{
+    for (uint64_t seed = 100; seed < 130; seed++) {
+        begin_random(seed,
+                     &(pf_sim_faults){.corrupt_ppm = 100, .drop_ppm = 50, .drop_burst = (uint32_t)(1 + seed % 40)});
+        expect_done(seed, 120000 * WORLD_MS);
+    }
+}
+
+static void test_duplicated_and_reordered_frames(void)
+{
+    for (uint64_t seed = 200; seed < 230; seed++) {
+        begin_random(seed, &(pf_sim_faults){
+                               .frame_loss_ppm = seed % 2 ? 20000 : 0, .duplicate_ppm = 200000, .reorder_ppm = 200000});
+        expect_done(seed, 120000 * WORLD_MS);
+    }
+}
+
+/* ---- interruptions ---- */
+
+/* Each run is cut about every 300 ms; then, by chance, one end or both notice. */
+static void test_random_cuts_with_reset_of_one_or_both_ends(void)
+{
+    for (uint64_t seed = 300; seed < 330; seed++) {
+        begin_random(seed, &(pf_sim_faults){.frame_loss_ppm = 20000});
+        for (uint32_t cut = 0; cut < 8 && !world_done(&w); cut++) {
+            world_pass(&w, world_random(&w, 600) * WORLD_MS);
+            pf_sim_line_cut(w.line);
+            for (uint32_t end = 0, who = (uint32_t)world_random(&w, 4); end < 2; end++)
+                if ((who >> end & 1u) != 0)
+                    pf_link_reset(w.apps[end].link, w.now);
+        }
+        expect_done(seed, 120000 * WORLD_MS);
+    }
+}
+
+static void test_random_restarts_of_either_end(void)
+{
+    for (uint64_t seed = 400; seed < 440; seed++) {
+        begin_random(seed, &(pf_sim_faults){.frame_loss_ppm = 20000, .duplicate_ppm = seed % 3 == 0 ? 50000 : 0});
+        for (uint32_t cut = 0; cut < 6 && !world_done(&w); cut++) {
+            world_pass(&w, world_random(&w, 600) * WORLD_MS);
+            world_restart(&w, (uint32_t)world_random(&w, 2));
+            if (world_random(&w, 3) == 0) /* the other at once, or while it still finds out */
+                world_restart(&w, (uint32_t)world_random(&w, 2));
+        }
+        expect_done(seed, 120000 * WORLD_MS);
+    }
+}
+
+static void test_silence_brings_the_link_down_and_up_again(void)
+{
+    begin(&(pf_sim_line_config){.baud = 921600, .seed = 1});
+    fill_spool(0, 8, 20000);
+    world_pass(&w, 300 * WORLD_MS);
+    pf_sim_line_connect(w.line, false);
+    world_pass(&w, 4500 * WORLD_MS);
+    TEST_ASSERT_FALSE(pf_link_is_up(w.apps[0].link));
+    TEST_ASSERT_FALSE(pf_link_is_up(w.apps[1].link));
+    TEST_ASSERT_EQUAL_UINT32(1, w.apps[0].downs);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, pf_link_send_control(w.apps[0].link, "x", 1));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, pf_link_send_latest(w.apps[0].link, 0, "x", 1));
+    pf_sim_line_connect(w.line, true);
+    expect_done(1, 10000 * WORLD_MS);
+    TEST_ASSERT_EQUAL_UINT32(2, w.apps[0].ups);
+}
+
+/* Only one direction is dead for longer than the keepalives: the end that hears nothing goes down alone. */
+static void test_peer_that_reset_alone_is_taken_back_without_a_new_session(void)
+{
+    begin(&(pf_sim_line_config){.baud = 921600, .seed = 2});
+    fill_spool(0, 6, 20000);
+    world_pass(&w, 200 * WORLD_MS);
+    pf_link_reset(w.apps[1].link, w.now);
+    expect_done(2, 5000 * WORLD_MS);
+    TEST_ASSERT_EQUAL_UINT32(0, w.apps[0].downs);
+    TEST_ASSERT_EQUAL_UINT32(2, w.apps[1].ups);
+}
+
+/* An object cut in the middle, sender restarted: only what was under way is sent again. */
+static void test_resume_does_not_resend_what_arrived(void)
+{
+    begin(&(pf_sim_line_config){.baud = 921600, .fifo = 2200, .seed = 3});
+    w.apps[0].objects = 1;
+    w.apps[0].sizes[0] = WORLD_OBJECT_SIZE; /* 24 fragments, 0.26 s */
+    world_pass(&w, 150 * WORLD_MS);
+    uint64_t arrived = stats(1)->fragments_received;
+    TEST_ASSERT_TRUE(arrived > 5 && arrived < 20);
+    pf_sim_line_cut(w.line);
+    world_restart(&w, 0);
+    expect_done(3, 5000 * WORLD_MS);
+    TEST_ASSERT_EQUAL_UINT64(24 - arrived, stats(0)->fragments_sent);
+    TEST_ASSERT_EQUAL_UINT64(24, stats(1)->fragments_received);
+    TEST_ASSERT_EQUAL_UINT32(1, w.apps[1].offers); /* and nobody was asked again */
+}
+
+/* ---- answers ---- */
+
+static void test_receiver_refuses_and_asks_again(void)
+{
+    for (uint64_t seed = 500; seed < 520; seed++) {
+        begin_random(seed, &(pf_sim_faults){.frame_loss_ppm = 50000});
+        w.apps[1].refuse_mask = 0x25;
+        w.apps[1].again_left = 4;
+        expect_done(seed, 120000 * WORLD_MS);
+        for (uint32_t id = 0; id < w.apps[0].objects; id++)
+            TEST_ASSERT_EQUAL(0x25u >> id & 1u, w.apps[0].refused[id]);
+    }
+}
+
+/* The answer comes three seconds late, and the sender polls meanwhile: it must not open the question again. */
+static void test_late_answers_are_waited_for(void)
+{
+    begin(&(pf_sim_line_config){.baud = 921600, .seed = 4, .faults = {.frame_loss_ppm = 50000}});
+    fill_spool(0, 4, 20000);
+    w.apps[1].answer_delay = 6000 * WORLD_MS;
+    expect_done(4, 30000 * WORLD_MS);
+    TEST_ASSERT_EQUAL_UINT32(4, w.apps[1].offers);
+}
+
+/* ---- priorities ---- */
+
+/* A slow line full of bulk and previews: status still comes, and and bulk keeps its half. */
+static void test_latest_gets_through_a_saturated_line(void)
+{
+    begin(&(pf_sim_line_config){.baud = 115200, .fifo = 1100, .seed = 5});
+    fill_spool(0, 12, WORLD_OBJECT_SIZE);
+    w.apps[0].latest_every = 5 * WORLD_MS;
+    w.apps[0].latest_size = 8000;
+    world_pass(&w, 5000 * WORLD_MS);
+    uint64_t bulk = stats(1)->fragments_received * 1024;
+    TEST_ASSERT_TRUE(w.apps[1].latest_count > 20);
+    for (uint32_t topic = 0; topic < 3; topic++)
+        TEST_ASSERT_TRUE(w.apps[1].latest_seen[topic] > 0);
+    TEST_ASSERT_TRUE(bulk > 11520 * 5 * 4 / 10 && bulk < 11520 * 5 * 6 / 10);
+    TEST_ASSERT_TRUE(stats(0)->latest_replaced > 100);
+}
+
+/* Control waits for what the FIFO holds, one frame of overhang and the frames more urgent; not for the objects. */
+static void test_bulk_does_not_hold_up_control(void)
+{
+    pf_sim_line_config line = {.baud = 921600, .fifo = 2200, .seed = 6};
+    begin(&line);
+    fill_spool(0, 12, WORLD_OBJECT_SIZE);
+    w.apps[0].latest_every = 5 * WORLD_MS;
+    w.apps[0].latest_size = 8000;
+    w.apps[0].control_every = 50 * WORLD_MS;
+    world_pass(&w, 2000 * WORLD_MS);
+    TEST_ASSERT_TRUE(w.apps[1].control_count > 35);
+    uint64_t byte_ns = UINT64_C(10000000000) / line.baud, fifo = line.fifo + PF_LINK_FRAME_MAX + 200;
+    TEST_ASSERT_TRUE(w.apps[1].worst_control_wait < fifo * byte_ns + 2 * WORLD_MS);
+}
+
+/* A slow line behind a deep buffer of the operating system: the round trip grows to seconds, and nothing is repeated.
+ */
+static void test_deep_buffer_fires_no_timeout(void)
+{
+    begin(&(pf_sim_line_config){.baud = 115200, .fifo = 60000, .seed = 8});
+    fill_spool(0, 12, WORLD_OBJECT_SIZE);
+    expect_done(8, 60000 * WORLD_MS);
+    TEST_ASSERT_EQUAL_UINT64(0, stats(0)->fragments_resent);
+    TEST_ASSERT_EQUAL_UINT64(0, stats(1)->fragments_duplicate);
+    TEST_ASSERT_EQUAL_UINT32(1, w.apps[0].ups);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_clean_line_delivers_everything_and_repeats_nothing);
+    RUN_TEST(test_frames_lost_up_to_30_percent);
+    RUN_TEST(test_bytes_corrupted_and_dropped_in_bursts);
+    RUN_TEST(test_duplicated_and_reordered_frames);
+    RUN_TEST(test_random_cuts_with_reset_of_one_or_both_ends);
+    RUN_TEST(test_random_restarts_of_either_end);
+    RUN_TEST(test_silence_brings_the_link_down_and_up_again);
+    RUN_TEST(test_peer_that_reset_alone_is_taken_back_without_a_new_session);
+    RUN_TEST(test_resume_does_not_resend_what_arrived);
+    RUN_TEST(test_receiver_refuses_and_asks_again);
+    RUN_TEST(test_late_answers_are_waited_for);
+    RUN_TEST(test_latest_gets_through_a_saturated_line);
+    RUN_TEST(test_bulk_does_not_hold_up_control);
+    RUN_TEST(test_deep_buffer_fires_no_timeout);
+    return UNITY_END();
+}

@@ -1,0 +1,415 @@
+/* The profile's binary format: what is written is read, old images load, and no damage passes. */
+#include "pipefish/profile.h"
+#include "unity.h"
+
+#include <math.h>
+#include <string.h>
+
+void setUp(void) {}
+void tearDown(void) {}
+
+#define COVARIANCE_MAX (PF_PROFILE_FREE_MAX * (PF_PROFILE_FREE_MAX + 1) / 2)
+
+static pf_profile sample(void)
+{
+    pf_profile profile;
+    memset(&profile, 0, sizeof profile);
+    profile.camera.width = 1280;
+    profile.camera.height = 800;
+    profile.camera.f_u = 356.25;
+    profile.camera.f_v = 355.875;
+    profile.camera.skew = 0.125;
+    profile.camera.c_u = 647.5;
+    profile.camera.c_v = 404.75;
+    profile.camera.k2 = -0.03125;
+    profile.camera.k3 = 0.00390625;
+    profile.camera.k4 = -0.0009765625;
+    profile.camera.k5 = 0.00006103515625;
+    profile.camera.theta_max = 1.625;
+    profile.camera.circle_u = 640.5;
+    profile.camera.circle_v = 400.5;
+    profile.camera.circle_radius = 560.25;
+    strcpy(profile.name, "Golden \xC3\xB6 1");
+    strcpy(profile.serial, "SN-42");
+    profile.source = PF_SOURCE_TARGET;
+    profile.created_unix_s = 1700000000;
+    profile.rms_px = 0.25;
+    profile.theta_covered = 1.5;
+    profile.free_count = 2;
+    profile.free_param[0] = 0;
+    profile.free_param[1] = 8;
+    profile.covariance[0] = 0.25;
+    profile.covariance[1] = -0.0625;
+    profile.covariance[2] = 0.5;
+    return profile;
+}
+
+/* sample() as version 1 of the format wrote it. Devices hold such images: this must never change. */
+static const char GOLDEN[] = "5046505201000000640200000100000000f1536500000000000000000000d03f000000000000f83f"
+                             "476f6c64656e20c3b620310000000000000000000000000000000000000000000000000000000000"
+                             "000000000000000000000000000000000000000000000000534e2d34320000000000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "000000000000000000050000200300000000000002000000000000000044764000000000003e7640"
+                             "000000000000c03f00000000003c844000000000004c794000000000000000000000000000000000"
+                             "000000000000a0bf000000000000703f00000000000050bf000000000000103f0000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "00000000000000000000000000000000000000000000000000000000000000000000000000000000"
+                             "0000000000000000000000000000000000000000000000000000000000000000000000000000fa3f"
+                             "00000000000484400000000000087940000000000082814000080000000000000000000000000000"
+                             "000000000000000000000000000000000000000000000000000000000000d03f000000000000b0bf"
+                             "000000000000e03fff80ab92";
+
+static size_t encode_ok(const pf_profile *profile, uint8_t *out)
+{
+    size_t n = 0;
+    const char *why = NULL;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_profile_encode(profile, out, PF_PROFILE_BINARY_MAX, &n, &why), why);
+    TEST_ASSERT_EQUAL_STRING("ok", why);
+    return n;
+}
+
+static void put_u32(uint8_t *p, uint32_t value)
+{
+    for (int i = 0; i < 4; i++)
+        p[i] = (uint8_t)(value >> (8 * i));
+}
+
+static void repair(uint8_t *bytes, size_t n)
+{
+    put_u32(bytes + n - 4, pf_crc32c(0, bytes, n - 4));
+}
+
+/* Expects a refusal that leaves the profile as it was and names the field. */
+static void refused(pf_status expected, const uint8_t *bytes, size_t n, const char *field)
+{
+    static pf_profile profile, before;
+    memset(&profile, 0x5A, sizeof profile);
+    memcpy(&before, &profile, sizeof profile);
+    const char *why = NULL;
+    TEST_ASSERT_EQUAL_INT(expected, pf_profile_decode(bytes, n, &profile, &why));
+    TEST_ASSERT_EQUAL_STRING_LEN(field, why, strlen(field));
+    TEST_ASSERT_EQUAL_CHAR(':', why[strlen(field)]);
+    TEST_ASSERT_EQUAL_MEMORY(&before, &profile, sizeof profile);
+    TEST_ASSERT_EQUAL_INT(expected, pf_profile_decode(bytes, n, &profile, NULL));
+}
+
+/* Proves: the writer writes version 1 of the format byte for byte, and the reader reads it. */
+static void test_golden_bytes_of_version_1(void)
+{
+    uint8_t golden[sizeof GOLDEN / 2], bytes[PF_PROFILE_BINARY_MAX];
+    for (size_t i = 0; i < sizeof golden; i++) {
+        uint8_t value = 0;
+        for (size_t j = 0; j < 2; j++) {
+            char c = GOLDEN[2 * i + j];
+            value = (uint8_t)(value << 4 | (c <= '9' ? c - '0' : c - 'a' + 10));
+        }
+        golden[i] = value;
+    }
+    pf_profile expected = sample(), profile;
+    TEST_ASSERT_EQUAL_size_t(sizeof golden, encode_ok(&expected, bytes));
+    TEST_ASSERT_EQUAL_HEX8_ARRAY(golden, bytes, sizeof golden);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_profile_decode(golden, sizeof golden, &profile, NULL));
+    TEST_ASSERT_EQUAL_DOUBLE(expected.camera.k5, profile.camera.k5);
+    TEST_ASSERT_EQUAL_DOUBLE(expected.camera.circle_radius, profile.camera.circle_radius);
+    TEST_ASSERT_EQUAL_STRING(expected.name, profile.name);
+    TEST_ASSERT_EQUAL_DOUBLE(-0.0625, profile.covariance[1]);
+}
+
+static void assert_round_trip(const pf_profile *profile)
+{
+    static pf_profile back;
+    uint8_t bytes[PF_PROFILE_BINARY_MAX], again[PF_PROFILE_BINARY_MAX];
+    size_t n = encode_ok(profile, bytes);
+    const char *why = NULL;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_profile_decode(bytes, n, &back, &why), why);
+    TEST_ASSERT_EQUAL_size_t(n, encode_ok(&back, again));
+    TEST_ASSERT_EQUAL_MEMORY(bytes, again, n);
+    TEST_ASSERT_EQUAL_MEMORY(&profile->camera, &back.camera, sizeof back.camera);
+    TEST_ASSERT_EQUAL_STRING(profile->name, back.name);
+    TEST_ASSERT_EQUAL_STRING(profile->serial, back.serial);
+    TEST_ASSERT_EQUAL_UINT32(profile->source, back.source);
+    TEST_ASSERT_EQUAL_INT64(profile->created_unix_s, back.created_unix_s);
+    TEST_ASSERT_TRUE(isnan(profile->rms_px) ? isnan(back.rms_px) : profile->rms_px == back.rms_px);
+    TEST_ASSERT_EQUAL_DOUBLE(profile->theta_covered, back.theta_covered);
+    TEST_ASSERT_EQUAL_UINT32(profile->free_count, back.free_count);
+    TEST_ASSERT_EQUAL_MEMORY(profile->free_param, back.free_param, sizeof back.free_param);
+    TEST_ASSERT_EQUAL_MEMORY(profile->covariance, back.covariance, sizeof back.covariance);
+}
+
+/* Proves: every field survives, at its extremes too, and with 0 to 40 free parameters. */
+static void test_round_trip_of_every_field_and_extreme(void)
+{
+    static pf_profile profile;
+    profile = sample();
+    assert_round_trip(&profile);
+    for (uint32_t count = 0; count <= PF_PROFILE_FREE_MAX; count++) {
+        profile = sample();
+        memset(profile.covariance, 0, sizeof profile.covariance);
+        memset(profile.free_param, 0, sizeof profile.free_param);
+        profile.free_count = count;
+        size_t at = 0;
+        for (uint32_t i = 0; i < count; i++) {
+            profile.free_param[i] = (uint8_t)(i + 1);
+            for (uint32_t j = 0; j <= i; j++)
+                profile.covariance[at++] = i == j ? 1e3 / (i + 1) : (i + j) % 2 ? -1e-3 * i : 1e-200;
+        }
+        assert_round_trip(&profile);
+    }
+    memset(&profile, 0, sizeof profile);
+    profile.camera.width = profile.camera.height = 16384;
+    profile.camera.f_u = profile.camera.f_v = 1e5;
+    profile.camera.skew = -1e5;
+    profile.camera.c_u = profile.camera.circle_radius = 1e5;
+    profile.camera.c_v = -1e5;
+    profile.camera.k2 = profile.camera.k5 = 1e6;
+    profile.camera.theta_max = profile.theta_covered = 3.1415926535897927;
+    memset(profile.name, 'x', 63);
+    memcpy(profile.serial, "\xF4\x8F\xBF\xBF\xED\x9F\xBF\xC2\xA0", 10);
+    profile.source = PF_SOURCE_SIMULATED;
+    profile.created_unix_s = 253402300799;
+    profile.rms_px = (double)NAN;
+    profile.free_count = 1;
+    profile.free_param[0] = PF_PROFILE_PARAMS - 1;
+    profile.covariance[0] = 1.7976931348623157e308;
+    assert_round_trip(&profile);
+    profile.rms_px = -(double)NAN;
+    profile.covariance[0] = 4.9406564584124654e-324;
+    assert_round_trip(&profile);
+    profile.rms_px = -0.0;
+    profile.camera.k2 = -0.0;
+    assert_round_trip(&profile);
+}
+
+/* Proves: bytes behind a text's end in memory are not written. */
+static void test_text_is_padded_with_zeros(void)
+{
+    pf_profile clean = sample(), dirty = sample();
+    uint8_t a[PF_PROFILE_BINARY_MAX], b[PF_PROFILE_BINARY_MAX];
+    memset(dirty.serial + strlen(dirty.serial) + 1, 0xEE, 8);
+    dirty.free_param[7] = 0xEE;
+    size_t n = encode_ok(&clean, a);
+    TEST_ASSERT_EQUAL_size_t(n, encode_ok(&dirty, b));
+    TEST_ASSERT_EQUAL_MEMORY(a, b, n);
+}
+
+/* Proves: cut at any length, the profile is refused as cut, with room for nothing read behind the end (ASan). */
+static void test_truncation_at_every_length(void)
+{
+    pf_profile profile = sample();
+    uint8_t bytes[PF_PROFILE_BINARY_MAX];
+    size_t n = encode_ok(&profile, bytes);
+    for (size_t cut = 0; cut < n; cut++) {
+        uint8_t exact[PF_PROFILE_BINARY_MAX];
+        uint8_t *end = exact + sizeof exact - cut; /* the cut data end where the array ends */
+        memcpy(end, bytes, cut);
+        refused(PF_ERR_TRUNCATED, end, cut, "length");
+    }
+    bytes[n] = 0;
+    refused(PF_ERR_FORMAT, bytes, n + 1, "length");
+}
+
+/* Proves: a single flipped bit anywhere is detected; outside magic and length it is called damage. */
+static void test_every_flipped_bit_is_detected(void)
+{
+    pf_profile profile = sample();
+    uint8_t bytes[PF_PROFILE_BINARY_MAX];
+    size_t n = encode_ok(&profile, bytes);
+    for (size_t bit = 0; bit < 8 * n; bit++) {
+        bytes[bit / 8] ^= (uint8_t)(1u << bit % 8);
+        pf_profile out;
+        pf_status status = pf_profile_decode(bytes, n, &out, NULL);
+        bool envelope = bit < 32 || (bit >= 64 && bit < 96);
+        TEST_ASSERT_TRUE(envelope ? status == PF_ERR_FORMAT || status == PF_ERR_TRUNCATED : status == PF_ERR_CHECKSUM);
+        bytes[bit / 8] ^= (uint8_t)(1u << bit % 8);
+    }
+}
+
+/* Proves: an intact profile of another version is called that, whatever follows its envelope and however long. */
+static void test_other_versions_are_named_as_such(void)
+{
+    pf_profile profile = sample();
+    uint8_t bytes[PF_PROFILE_BINARY_MAX];
+    size_t n = encode_ok(&profile, bytes);
+    const uint32_t versions[] = {0, 2, 256, UINT32_MAX};
+    for (int i = 0; i < 4; i++) {
+        put_u32(bytes + 4, versions[i]);
+        repair(bytes, n);
+        refused(PF_ERR_VERSION, bytes, n, "version");
+    }
+    put_u32(bytes + 4, 2);
+    put_u32(bytes + 8, 16);
+    repair(bytes, 16);
+    refused(PF_ERR_VERSION, bytes, 16, "version");
+}
+
+/* Proves: with a correct checksum, every field out of range is refused and named. */
+static void test_bad_fields_are_refused_and_named(void)
+{
+    static const struct {
+        size_t at, count;
+        uint8_t byte;
+        pf_status status;
+        const char *field;
+    } item[] = {
+        {0, 1, 'X', PF_ERR_FORMAT, "magic"},
+        {12, 1, 5, PF_ERR_FORMAT, "source"},
+        {23, 1, 0x80, PF_ERR_FORMAT, "created_unix_s"},
+        {20, 1, 0xFF, PF_ERR_FORMAT, "created_unix_s"},
+        {31, 1, 0xBF, PF_ERR_FORMAT, "rms_px"},
+        {24, 8, 0xFF, PF_ERR_FORMAT, "rms_px"},
+        {39, 1, 0xBF, PF_ERR_FORMAT, "theta_covered"},
+        {39, 1, 0x7F, PF_ERR_FORMAT, "theta_covered"},
+        {40, 1, 0x1F, PF_ERR_FORMAT, "name"},
+        {40, 64, 'x', PF_ERR_FORMAT, "name"},
+        {100, 1, 'x', PF_ERR_FORMAT, "name"},
+        {47, 1, 0x80, PF_ERR_FORMAT, "name"},
+        {104, 1, 0xC1, PF_ERR_FORMAT, "serial"},
+        {104, 1, 0xFF, PF_ERR_FORMAT, "serial"},
+        {104, 1, 0x7F, PF_ERR_FORMAT, "serial"},
+        {168, 2, 0, PF_ERR_FORMAT, "width"},
+        {175, 1, 1, PF_ERR_FORMAT, "height"},
+        {176, 1, 1, PF_ERR_UNSUPPORTED, "radial"},
+        {176, 1, 7, PF_ERR_FORMAT, "radial"},
+        {180, 1, 41, PF_ERR_FORMAT, "free_count"},
+        {180, 4, 0xFF, PF_ERR_FORMAT, "free_count"},
+        {183, 1, 1, PF_ERR_FORMAT, "free_count"},
+        {180, 1, 3, PF_ERR_FORMAT, "length"},
+        {180, 1, 0, PF_ERR_FORMAT, "length"},
+        {184, 8, 0, PF_ERR_FORMAT, "f_u"},
+        {192, 8, 0xFF, PF_ERR_FORMAT, "f_v"},
+        {224, 1, 1, PF_ERR_UNSUPPORTED, "tilt"},
+        {240 + 7, 1, 0xFF, PF_ERR_FORMAT, "k2"},
+        {248 + 7, 1, 0xBF, PF_ERR_DOMAIN, "theta_max"}, /* k3 = -0.0039, doubled below */
+        {272, 1, 1, PF_ERR_UNSUPPORTED, "asym_radial_theta"},
+        {296, 1, 1, PF_ERR_UNSUPPORTED, "asym_radial_phi"},
+        {328, 1, 1, PF_ERR_UNSUPPORTED, "asym_tangential_theta"},
+        {352, 1, 1, PF_ERR_UNSUPPORTED, "asym_tangential_phi"},
+        {384 + 8 * 13, 1, 1, PF_ERR_UNSUPPORTED, "cpoly"},
+        {496, 1, 1, PF_ERR_UNSUPPORTED, "mirror"},
+        {504, 1, 1, PF_ERR_UNSUPPORTED, "pupil_e1"},
+        {512, 8, 0, PF_ERR_FORMAT, "theta_max"},
+        {536, 8, 0xBF, PF_ERR_FORMAT, "circle_radius"},
+        {544, 1, 8, PF_ERR_FORMAT, "free_param"},
+        {545, 1, 41, PF_ERR_FORMAT, "free_param"},
+        {546, 1, 9, PF_ERR_FORMAT, "free_param"},
+        {583, 1, 1, PF_ERR_FORMAT, "free_param"},
+        {584 + 7, 1, 0xBF, PF_ERR_FORMAT, "covariance"},
+        {584, 8, 0xFF, PF_ERR_FORMAT, "covariance"},
+        {592 + 7, 1, 0x7F, PF_ERR_FORMAT, "covariance"},
+        {592 + 7, 1, 0xC0, PF_ERR_FORMAT, "covariance"},
+    };
+    for (size_t i = 0; i < sizeof item / sizeof item[0]; i++) {
+        pf_profile profile = sample();
+        if (item[i].at == 248 + 7)
+            profile.camera.k3 = 0.4; /* its sign bit makes r' = 1 - .09 s - 2 s^2 .. turn at 0.82 */
+        uint8_t bytes[PF_PROFILE_BINARY_MAX];
+        size_t n = encode_ok(&profile, bytes);
+        memset(bytes + item[i].at, item[i].byte, item[i].count);
+        repair(bytes, n);
+        refused(item[i].status, bytes, n, item[i].field);
+    }
+    uint8_t tiny[16] = {'P', 'F', 'P', 'R', 1};
+    put_u32(tiny + 8, 16);
+    repair(tiny, 16);
+    refused(PF_ERR_FORMAT, tiny, 16, "length");
+    put_u32(tiny + 8, 15);
+    refused(PF_ERR_FORMAT, tiny, 15, "length");
+}
+
+/* Proves: what RFC 3629 excludes is no text: overlong forms, surrogates, beyond U+10FFFF, cut and stray bytes, C1. */
+static void test_text_must_be_utf8(void)
+{
+    static const char *const bad[] = {
+        "\xC0\x80", "\xE0\x9F\xBF", "\xED\xA0\x80", "\xF0\x8F\xBF\xBF", "\xF4\x90\x80\x80", "\xF5",
+        "\xE2\x82", "\xE2\x28\xA1", "a\xBF",        "\xC2\x9F"};
+    for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
+        pf_profile profile = sample();
+        uint8_t bytes[PF_PROFILE_BINARY_MAX];
+        size_t n = encode_ok(&profile, bytes);
+        memset(bytes + 104, 0, 64);
+        memcpy(bytes + 104, bad[i], strlen(bad[i]));
+        repair(bytes, n);
+        refused(PF_ERR_FORMAT, bytes, n, "serial");
+        memset(bytes + 104, 'x', 64);
+        memcpy(bytes + 168 - strlen(bad[i]), bad[i], strlen(bad[i]));
+        repair(bytes, n);
+        refused(PF_ERR_FORMAT, bytes, n, "serial");
+    }
+}
+
+/* Proves: random bytes, bare or behind a right envelope, never pass and never read out of bounds (ASan). */
+static void test_garbage(void)
+{
+    uint32_t state = 1;
+    for (int round = 0; round < 4000; round++) {
+        uint8_t bytes[1024];
+        size_t n = 16 + (size_t)round % 1000;
+        for (size_t i = 0; i < n; i++) {
+            state = state * 1664525u + 1013904223u;
+            bytes[i] = (uint8_t)(state >> 24);
+        }
+        if (round % 2) {
+            memcpy(bytes, "PFPR\1\0\0\0", 8);
+            put_u32(bytes + 8, (uint32_t)n);
+            repair(bytes, n);
+        }
+        pf_profile profile;
+        TEST_ASSERT_TRUE(pf_profile_decode(bytes, n, &profile, NULL) < 0);
+    }
+}
+
+/* Proves: encode refuses what decode would, and says why; a buffer one byte short is refused before it is touched. */
+static void test_encode_refuses(void)
+{
+    uint8_t bytes[PF_PROFILE_BINARY_MAX];
+    size_t n = 12345;
+    const char *why = NULL;
+    pf_profile profile = sample();
+    memset(bytes, 0x5A, sizeof bytes);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_profile_encode(&profile, bytes, sizeof GOLDEN / 2 - 1, &n, &why));
+    TEST_ASSERT_EACH_EQUAL_HEX8(0x5A, bytes, sizeof bytes);
+    profile.free_count = 41;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    profile = sample();
+    memset(profile.name, 'x', sizeof profile.name);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    TEST_ASSERT_EQUAL_STRING_LEN("name:", why, 5);
+    profile = sample();
+    profile.created_unix_s = -1;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    profile = sample();
+    profile.camera.f_u = (double)NAN;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, NULL));
+    profile = sample();
+    profile.camera.pupil_e1 = 1e-3;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    TEST_ASSERT_EQUAL_STRING_LEN("pupil_e1:", why, 9);
+    profile = sample();
+    profile.camera.k2 = -1;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_DOMAIN, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(NULL, bytes, sizeof bytes, &n, &why));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, NULL, sizeof bytes, &n, &why));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, NULL, &why));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_decode(NULL, 0, &profile, &why));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_decode(bytes, 0, NULL, &why));
+    TEST_ASSERT_EQUAL_size_t(12345, n);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_golden_bytes_of_version_1);
+    RUN_TEST(test_round_trip_of_every_field_and_extreme);
+    RUN_TEST(test_text_is_padded_with_zeros);
+    RUN_TEST(test_truncation_at_every_length);
+    RUN_TEST(test_every_flipped_bit_is_detected);
+    RUN_TEST(test_other_versions_are_named_as_such);
+    RUN_TEST(test_bad_fields_are_refused_and_named);
+    RUN_TEST(test_text_must_be_utf8);
+    RUN_TEST(test_garbage);
+    RUN_TEST(test_encode_refuses);
+    return UNITY_END();
+}

@@ -1,0 +1,231 @@
+#include "pipefish/drivers/transport.h"
+#include "unity.h"
+
+#include <arpa/inet.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <poll.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+static pf_transport line;
+static char error[256];
+
+void setUp(void) {}
+
+void tearDown(void)
+{
+    if (line.self != NULL)
+        line.ops->close(line.self);
+    line.self = NULL;
+}
+
+static uint16_t port_of_name(void)
+{
+    return (uint16_t)atoi(strrchr(line.ops->name(line.self), ':') + 1);
+}
+
+static void open_listener(const char *address)
+{
+    pf_tcp_config config = {address, 0};
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error), error);
+    TEST_ASSERT_TRUE(port_of_name() != 0);
+}
+
+static int connect_client(void)
+{
+    struct sockaddr_in a = {.sin_family = AF_INET, .sin_port = htons(port_of_name())};
+    a.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    int fd = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    TEST_ASSERT_EQUAL_INT(0, connect(fd, (struct sockaddr *)&a, sizeof a));
+    return fd;
+}
+
+static void wait_readable(void)
+{
+    struct pollfd p = {line.ops->fd(line.self), POLLIN, 0};
+    TEST_ASSERT_EQUAL_INT(1, poll(&p, 1, 10000));
+}
+
+static void accept_client(void)
+{
+    bool fresh = false;
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_TRUE(fresh);
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_FALSE(fresh);
+}
+
+static void expect_read(const char *text)
+{
+    char buffer[64];
+    size_t have = 0, n;
+    while (have < strlen(text)) {
+        wait_readable();
+        TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->read(line.self, (uint8_t *)buffer + have, sizeof buffer - have, &n));
+        have += n;
+    }
+    TEST_ASSERT_EQUAL_size_t(strlen(text), have);
+    TEST_ASSERT_EQUAL_MEMORY(text, buffer, have);
+}
+
+/* Proves: bytes go both ways; a client that leaves is noticed, the next one starts a fresh stream. */
+static void test_connect_disconnect_reconnect(void)
+{
+    uint8_t byte;
+    size_t n;
+    bool fresh;
+    open_listener("127.0.0.1");
+    TEST_ASSERT_EQUAL_INT(PF_ERR_AGAIN, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, line.ops->read(line.self, &byte, 1, &n));
+    TEST_ASSERT_EQUAL_size_t(0, line.ops->room(line.self));
+    for (int round = 0; round < 3; round++) {
+        char reply[8];
+        int client = connect_client();
+        accept_client();
+        TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->read(line.self, &byte, 1, &n));
+        TEST_ASSERT_EQUAL_size_t(0, n);
+        TEST_ASSERT_EQUAL_INT(5, write(client, "hello", 5));
+        expect_read("hello");
+        TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->write(line.self, (const uint8_t *)"world", 5, &n));
+        TEST_ASSERT_EQUAL_size_t(5, n);
+        TEST_ASSERT_EQUAL_INT(5, recv(client, reply, 5, MSG_WAITALL));
+        if (round == 1) { /* an abortive close: the driver must see a reset as an end too */
+            struct linger hard = {1, 0};
+            setsockopt(client, SOL_SOCKET, SO_LINGER, &hard, sizeof hard);
+        }
+        close(client);
+        wait_readable();
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, line.ops->read(line.self, &byte, 1, &n));
+        TEST_ASSERT_TRUE(line.ops->error(line.self)[0] != '\0');
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, line.ops->write(line.self, &byte, 1, &n));
+    }
+}
+
+/* Proves: a second client waits, undisturbed, until the first has left; then its bytes are all there. */
+static void test_second_client_waits(void)
+{
+    uint8_t byte;
+    size_t n;
+    open_listener("127.0.0.1");
+    int first = connect_client(), second;
+    accept_client();
+    second = connect_client();
+    TEST_ASSERT_EQUAL_INT(6, write(second, "second", 6));
+    TEST_ASSERT_EQUAL_INT(5, write(first, "first", 5));
+    expect_read("first");
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->read(line.self, &byte, 1, &n));
+    TEST_ASSERT_EQUAL_size_t(0, n);
+    close(first);
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, line.ops->read(line.self, &byte, 1, &n));
+    accept_client();
+    expect_read("second");
+    close(second);
+}
+
+/* Proves: with a client that does not read, room falls to nothing instead of queueing without end, writing never
+ * blocks, and every byte that was taken arrives. */
+static void test_room_bounds_the_queue(void)
+{
+    static uint8_t bytes[65536];
+    size_t n, room, total = 0, got = 0;
+    open_listener("127.0.0.1");
+    int client = connect_client();
+    accept_client();
+    TEST_ASSERT_TRUE(line.ops->room(line.self) >= 32768);
+    /* What has reached the client's receive buffer no longer counts as queued: it fills first (some megabytes). */
+    for (int idle = 0; idle < 50;) {
+        room = line.ops->room(line.self);
+        TEST_ASSERT_TRUE(room <= 65536);
+        n = 0;
+        if (room > 0)
+            TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->write(line.self, bytes, room, &n));
+        total += n;
+        TEST_ASSERT_TRUE(total < 64u << 20);
+        if (n == 0) {
+            idle++;
+            usleep(1000);
+        } else {
+            idle = 0;
+        }
+    }
+    TEST_ASSERT_TRUE(line.ops->room(line.self) < 65536);
+    while (got < total) {
+        ssize_t k = recv(client, bytes, sizeof bytes, 0);
+        TEST_ASSERT_TRUE(k > 0);
+        got += (size_t)k;
+    }
+    close(client);
+}
+
+/* Proves: only loopback is listened on without TLS; what is no address is said to be none. */
+static void test_other_addresses_are_refused(void)
+{
+    static const char *const others[] = {"0.0.0.0", "192.168.1.1", "128.0.0.1", "::", "fe80::1", "::ffff:127.0.0.1"};
+    static const char *const no_addresses[] = {"", "localhost", "127.0.0", "127.0.0.1:80", NULL};
+    for (size_t i = 0; i < sizeof others / sizeof others[0]; i++) {
+        pf_tcp_config config = {others[i], 0};
+        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_ERR_UNSUPPORTED, pf_tcp_listen(&line, &config, error, sizeof error),
+                                      others[i]);
+        TEST_ASSERT_NOT_NULL(strstr(error, "TLS"));
+        TEST_ASSERT_NOT_NULL(strstr(error, others[i]));
+    }
+    for (size_t i = 0; i < sizeof no_addresses / sizeof no_addresses[0]; i++) {
+        pf_tcp_config config = {no_addresses[i], 0};
+        TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_tcp_listen(&line, &config, error, sizeof error));
+    }
+    TEST_ASSERT_NULL(line.self);
+}
+
+/* Proves: a port that is taken is an error with its address, and a port is free again at once after closing. */
+static void test_taken_port(void)
+{
+    pf_transport second = {NULL, NULL};
+    open_listener("127.0.0.1");
+    pf_tcp_config config = {"127.0.0.1", port_of_name()};
+    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, pf_tcp_listen(&second, &config, error, sizeof error));
+    TEST_ASSERT_NOT_NULL(strstr(error, line.ops->name(line.self)));
+    int client = connect_client();
+    accept_client();
+    line.ops->close(line.self); /* the server closes first: its end lingers in TIME_WAIT */
+    line.self = NULL;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error), error);
+    close(client);
+}
+
+/* Proves: IPv6's loopback works, and is named as people write it. */
+static void test_ipv6(void)
+{
+    pf_tcp_config config = {"::1", 0};
+    pf_status status = pf_tcp_listen(&line, &config, error, sizeof error);
+    if (status == PF_ERR_IO)
+        TEST_IGNORE_MESSAGE("no IPv6 on this machine: not tested");
+    TEST_ASSERT_EQUAL_INT(PF_OK, status);
+    TEST_ASSERT_EQUAL_INT(0, strncmp(line.ops->name(line.self), "tcp [::1]:", 10));
+    struct sockaddr_in6 a = {
+        .sin6_family = AF_INET6, .sin6_port = htons(port_of_name()), .sin6_addr = in6addr_loopback};
+    int fd = socket(AF_INET6, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    TEST_ASSERT_EQUAL_INT(0, connect(fd, (struct sockaddr *)&a, sizeof a));
+    accept_client();
+    TEST_ASSERT_EQUAL_INT(2, write(fd, "v6", 2));
+    expect_read("v6");
+    close(fd);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_connect_disconnect_reconnect);
+    RUN_TEST(test_second_client_waits);
+    RUN_TEST(test_room_bounds_the_queue);
+    RUN_TEST(test_other_addresses_are_refused);
+    RUN_TEST(test_taken_port);
+    RUN_TEST(test_ipv6);
+    return UNITY_END();
+}
