@@ -44,6 +44,8 @@ Tube::Tube(double radius, const std::vector<Piece> &pieces, const std::vector<Ov
     double ovality = 0.0;
     for (const OvalStretch &o : ovals_) {
         ovality += std::abs(o.ovality);
+        const double e = 0.5 * o.ovality * radius_;
+        largest_.emplace_back(e * std::cos(2.0 * o.clock), e * std::sin(2.0 * o.clock));
         if (!(o.ramp > 0.0) || !(o.start + 2.0 * o.ramp <= o.end)) {
             throw std::invalid_argument("an oval stretch must be at least two ramps long");
         }
@@ -128,18 +130,20 @@ void Tube::set_section_bounds(Segment &segment) const
 Section Tube::section(double s) const
 {
     Section out{radius_, 0.0, 0.0, 0.0, 0.0};
-    for (const OvalStretch &o : ovals_) {
+    for (size_t i = 0; i < ovals_.size(); i++) {
+        const OvalStretch &o = ovals_[i];
+        if (s <= o.start || s >= o.end) {
+            continue;
+        }
         double up_slope = 0.0, down_slope = 0.0;
         const double up = smooth_step((s - o.start) / o.ramp, up_slope);
         const double down = smooth_step((o.end - s) / o.ramp, down_slope);
-        const double amplitude = 0.5 * o.ovality * radius_;
-        const double value = amplitude * up * down;
-        const double slope = amplitude * (up_slope * down - up * down_slope) / o.ramp;
-        const double c = std::cos(2.0 * o.clock), si = std::sin(2.0 * o.clock);
-        out.e_c += value * c;
-        out.e_s += value * si;
-        out.d_c += slope * c;
-        out.d_s += slope * si;
+        const Eigen::Vector2d &e = largest_[i];
+        const double value = up * down, slope = (up_slope * down - up * down_slope) / o.ramp;
+        out.e_c += value * e.x();
+        out.e_s += value * e.y();
+        out.d_c += slope * e.x();
+        out.d_s += slope * e.y();
     }
     return out;
 }

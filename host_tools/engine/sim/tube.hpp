@@ -108,6 +108,7 @@ private:
 
     double radius_, length_;
     std::vector<OvalStretch> ovals_;
+    std::vector<Eigen::Vector2d> largest_; // of each stretch: (e_c, e_s) between its ramps
     std::vector<Segment> segments_;
 };
 
