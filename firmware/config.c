@@ -100,7 +100,7 @@ static const setting settings[] = {
 
     {"spool", "path", TEXT, AT(spool.path), "", "/var/lib/pipefish/spool.db", 0, 0, NULL,
      "file that keeps what the host has not acknowledged; its folder must exist"},
-    {"spool", "quota_mb", INTEGER, AT(spool.quota_mb), "MB", "4096", 0, 4000000, NULL,
+    {"spool", "quota_mb", NUMBER, AT(spool.quota_mb), "MB", "4096", 0, 4000000, NULL,
      "most megabytes that may wait in it; 0 = no limit"},
 
     {"status", "interval_ms", INTEGER, AT(status.interval_ms), "ms", "1000", 50, 3600000, NULL,

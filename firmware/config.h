@@ -54,7 +54,7 @@ typedef struct pf_config {
     } link;
     struct {
         pf_config_text path;
-        uint32_t quota_mb;
+        double quota_mb;
     } spool;
     struct {
         uint32_t interval_ms, preview_interval_ms, preview_quality;

@@ -198,7 +198,7 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->courier = courier;
     p->next_index = survey->next_index;
     p->boots = survey->boots;
-    if (survey->is_resumed)
+    if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
     if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) || !store_start(p, error, n)) {
         release(p);

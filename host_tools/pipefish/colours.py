@@ -19,7 +19,7 @@ STOPS = np.array(
     ],
     dtype=float,
 )
-AGE_MAX = 300  # frames; older tracks share the last colour
+AGE_MAX = 60  # frames; older tracks share the last colour. In a narrow pipe a point is in view for about 30.
 
 
 def age_position(age: np.ndarray) -> np.ndarray:

@@ -168,10 +168,8 @@ def survey_over_the_line(programs: Programs, recording: Recording, run: Path, qu
                 )
             except Interrupted as error:
                 code = daemon.poll()
-                why = "is still running" if code is None else f"ended with code {code}"
-                raise PipefishError(
-                    f"{error}\npipefishd {why}; its log, {daemon_log}:\n{last_lines(daemon_log)}"
-                ) from error
+                why = str(error) if code is None else f"pipefishd ended with code {code} before the survey was complete"
+                raise PipefishError(f"{why}; its log, {daemon_log}:\n{last_lines(daemon_log)}") from error
             with contextlib.suppress(subprocess.TimeoutExpired):
                 daemon.wait(5)  # its spool is empty: it ends by itself
         if daemon.returncode != 0:

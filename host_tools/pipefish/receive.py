@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from pipefish.client import ACCEPT, AGAIN, REFUSE, STORED, Client, Handlers, NoD
 from pipefish.errors import PipefishError
 from pipefish.progress import Progress
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, BootClock, SurveyStore
-from pipefish.transport import Transport
+from pipefish.transport import Transport, TransportClosed
 
 FIRST_ANSWERS_S = 2.0  # the first object waits this long for the device's clock and the name of its survey
 LINGER_S = 3.0  # most time after the end for the device to take in the last acknowledgement
@@ -204,7 +205,11 @@ def receive(
     why = "stopped"
     try:
         if not receiver.complete:
-            receiver.client.open()
+            try:
+                receiver.client.open()
+            except TransportClosed as error:  # it may be about to start, or about to be plugged in
+                if not quiet:
+                    print(f"{error}; waiting for it", file=sys.stderr, flush=True)
             receiver.run(timeout_s, stop)
     except KeyboardInterrupt:
         why = "interrupted"

@@ -107,7 +107,7 @@ class Painter:
         ramp = scale_colours(np.linspace(0, 1, length))
         bar = Image.fromarray(np.broadcast_to(ramp, (unit * 6 // 10, length, 3)).copy(), "RGB")
         strip.paste(bar, (left, unit * 15 // 10))
-        for age in (0, 1, 3, 10, 30, 100, AGE_MAX):
+        for age in (0, 1, 3, 10, 30, AGE_MAX):
             x = left + float(age_position(np.array([age]))[0]) * (length - 1)
             label = f"{age}+" if age == AGE_MAX else str(age)
             pen.text((x, unit * 2.4), label, font=small, fill=MUTED, anchor="mt")

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import pickle
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -342,14 +341,10 @@ def test_stored_profiles_load():
         assert pf.Camera.load(file).name
 
 
-def test_published_equidistant_calibrations_round_trip():
-    """EuRoC cam0 and TUM-VI as published by others: not in this project; PIPEFISH_DATA names the folder with them."""
-    folder = Path(os.environ.get("PIPEFISH_DATA", "")) / "profiles"
-    files = sorted(folder.glob("adapter_euroc_KB.yml")) if "PIPEFISH_DATA" in os.environ else []
-    if not files:
-        warnings.warn("no published calibrations: set PIPEFISH_DATA", stacklevel=1)
-        pytest.skip("set PIPEFISH_DATA to the folder of real data to run this")
-    values = dict(line.strip().split(":") for line in files[0].read_text().splitlines() if line.strip())
+def test_published_equidistant_calibration_round_trips(real_data):
+    """EuRoC cam0 as published by others."""
+    file = real_data("profiles/adapter_euroc_KB.yml")
+    values = dict(line.strip().split(":") for line in file.read_text().splitlines() if line.strip())
     value = {key: float(text) for key, text in values.items() if text.strip()}
     cam = pf.Camera(
         width=int(value["width"]),

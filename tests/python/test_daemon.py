@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import random
@@ -15,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import ACCEPT, STORED, Client, Handlers
 from pipefish.transport import TcpTransport, TransportClosed
@@ -190,6 +193,14 @@ def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
         client.step(0.02)
 
 
+def wait_for_log(crawler: Crawler, text: str) -> None:
+    """Until the daemon has logged `text`."""
+    end = time.monotonic() + 20
+    while text not in crawler.text():
+        assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+
+
 def receive_all(crawler: Crawler, store: Store) -> int:
     """Serves the daemon until it exits; returns its exit code."""
     with store.client() as client:
@@ -277,6 +288,7 @@ def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_p
     assert str(crawler.port) in done.stderr
     crawler.start("--set", "camera.loops=0")
     with Store(crawler.port).client():
+        wait_for_log(crawler, "begins")
         done = run("--config", crawler.config, "--set", f"link.port={free_port()}")
     assert done.returncode == 1
     assert "spool.db" in done.stderr
@@ -347,6 +359,46 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     assert store.previews == [] or store.previews[-1].width == WIDTH // 4
 
 
+def test_a_profile_goes_with_the_survey_and_gives_parallax_keyframes_and_the_image_circle(
+    tmp_path: Path, crawler: Crawler
+):
+    camera = pf.Camera(
+        **{"width": WIDTH, "height": HEIGHT, "f_u": 60.0, "f_v": 60.0, "c_u": 95.5, "c_v": 79.5, "theta_max": 1.5},
+        **{"circle_u": 95.5, "circle_v": 79.5, "circle_radius": 75.0},
+    )
+    profile = tmp_path / "camera.bin"
+    profile.write_bytes(camera.to_binary())
+    store = Store(crawler.port)
+    crawler.start(
+        *("--set", f"camera.profile={profile}", "--set", "keyframe.min_common=1"),
+        *("--set", "encoder.metres_per_count=0", "--set", "keyframe.parallax_deg=1"),
+    )
+    assert receive_all(crawler, store) == 0
+    assert store.starts[0].profile == camera.to_binary()
+    causes = Counter(k.cause for k in store.keyframes)
+    assert causes[pb.KEYFRAME_CAUSE_FIRST] == 1
+    assert causes[pb.KEYFRAME_CAUSE_PARALLAX] >= 2
+    assert len(store.keyframes) < 20
+    for k in store.keyframes:
+        pixels = np.asarray(Image.open(io.BytesIO(k.jpeg)))
+        assert pixels[:8, :8].max() == 0  # outside of the circle
+        assert pixels[60:100, 60:130].min() > 0
+        x, y = np.array(k.observations.x_q16) / 65536, np.array(k.observations.y_q16) / 65536
+        assert np.hypot(x - 95.5, y - 79.5).max() <= 75
+    done = run(
+        "--config", crawler.config, "--set", f"camera.profile={profile}", "--set", f"camera.path={other(tmp_path)}"
+    )
+    assert done.returncode == 1
+    assert "the profile is for 192 x 160, the camera gives 64 x 64" in done.stderr
+
+
+def other(folder: Path) -> Path:
+    """A recording of another size."""
+    path = folder / "other.y4m"
+    path.write_bytes(b"YUV4MPEG2 W64 H64 F25:1 Ip A1:1 Cmono\nFRAME\n" + bytes(4096))
+    return path
+
+
 def test_two_runs_of_one_recording_track_the_same(tmp_path: Path):
     write_recording(tmp_path / "survey.y4m", 30)
     runs = []
@@ -407,10 +459,7 @@ def test_a_second_sigterm_exits_at_once(crawler: Crawler):
     crawler.start("--set", "camera.loops=0")
     with Store(crawler.port).client():
         crawler.terminate()
-        end = time.monotonic() + 10
-        while "survey ends" not in crawler.text():
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        wait_for_log(crawler, "survey ends")
         assert crawler.process.poll() is None  # nobody takes the objects: it drains
         crawler.terminate()
         assert crawler.wait(5) == 1
@@ -482,11 +531,8 @@ def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Pat
 
 def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
     store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.loops=3", *EVERY_FRAME)
-    end = time.monotonic() + 20
-    while "make room" not in crawler.text():
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
+    crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
+    wait_for_log(crawler, "make room")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
@@ -494,13 +540,10 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
 
 
 def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
-    write_recording(tmp_path / "survey.y4m", 120, rate=60)
+    write_recording(tmp_path / "survey.y4m", 40, rate=20)
     store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=1", "--set", "camera.speed=recorded", *EVERY_FRAME)
-    end = time.monotonic() + 20
-    while "survey ends" not in crawler.text():
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
+    crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
+    wait_for_log(crawler, "survey ends")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     lost, got = set(end_message.lost_index), {k.index for k in store.keyframes}
@@ -548,7 +591,9 @@ def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path,
     check_everything_arrived_once(store, kills)
 
 
-def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(tmp_path: Path, crawler: Crawler):
+def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(
+    tmp_path: Path, crawler: Crawler
+):
     # What the host has stored but the daemon had not yet removed is offered again and answered from the store: it does
     # not arrive twice. Every second time the host dies as well, in the middle of whatever was under way.
     write_recording(tmp_path / "survey.y4m", 120)

@@ -7,7 +7,8 @@ void bind_camera(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 
-NB_MODULE(_engine, m) {
+NB_MODULE(_engine, m)
+{
     m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
     bind_camera(m);
     bind_link(m);

@@ -28,13 +28,13 @@ extern "C" {
 /* Result of every function that can fail: zero or negative. Results come through pointers. */
 typedef enum pf_status {
     PF_OK = 0,
-    PF_ERR_ARGUMENT = -1,    /* the call itself is wrong: null, out of range, sizes differ */
-    PF_ERR_DOMAIN = -2,      /* the value lies outside what the model covers (behind, beyond theta_max, off the image) */
-    PF_ERR_FORMAT = -3,      /* the bytes are not what they must be */
-    PF_ERR_CHECKSUM = -4,    /* the bytes were damaged */
-    PF_ERR_VERSION = -5,     /* written by a version that this one cannot read */
-    PF_ERR_TRUNCATED = -6,   /* the data end too early */
-    PF_ERR_SPACE = -7,       /* the caller's buffer, or the medium, is too small */
+    PF_ERR_ARGUMENT = -1,  /* the call itself is wrong: null, out of range, sizes differ */
+    PF_ERR_DOMAIN = -2,    /* the value lies outside what the model covers (behind, beyond theta_max, off the image) */
+    PF_ERR_FORMAT = -3,    /* the bytes are not what they must be */
+    PF_ERR_CHECKSUM = -4,  /* the bytes were damaged */
+    PF_ERR_VERSION = -5,   /* written by a version that this one cannot read */
+    PF_ERR_TRUNCATED = -6, /* the data end too early */
+    PF_ERR_SPACE = -7,     /* the caller's buffer, or the medium, is too small */
     PF_ERR_UNSUPPORTED = -8, /* valid, but this build cannot do it */
     PF_ERR_IO = -9,          /* the operating system or the device failed */
     PF_ERR_AGAIN = -10,      /* nothing to do now; try again later */

@@ -1,13 +1,13 @@
 /* The link between crawler and host: framing, acknowledged delivery, flow control. Sans-IO: it consumes and produces
- * bytes and takes the time as an argument; the same code runs in the daemon, the host client, the tests and the fuzzers.
- * lib/link/SPEC.md describes every byte.
+ * bytes and takes the time as an argument; the same code runs in the daemon, the host client, the tests and the
+ * fuzzers. lib/link/SPEC.md describes every byte.
  *
  * Three priorities:
  *   control  small messages, reliable, in order, exactly once in a session (requests, replies)
  *   latest   previews and counters by topic: a newer one replaces an older one, nothing is repeated
- *   bulk     objects named by their SHA-256: selective repeat, resumed after any interruption, and released by the sender
- *            only when the receiver says that it has stored the object durably
- * Both ends are equal: either may send any of the three.
+ *   bulk     objects named by their SHA-256: selective repeat, resumed after any interruption, and released by the
+ * sender only when the receiver says that it has stored the object durably Both ends are equal: either may send any of
+ * the three.
  *
  * The caller's loop, for each chunk of bytes read:      and whenever the line can take bytes:
  *   while (n) {                                           n = pf_link_output(link, buffer, sizeof buffer, now);
@@ -25,12 +25,12 @@
 extern "C" {
 #endif
 
-#define PF_LINK_VERSION       1u    /* of the wire format */
-#define PF_LINK_FRAGMENT_MAX  1024u /* one fragment is 11.4 ms at 921600 baud: what control waits for at most */
-#define PF_LINK_FRAME_MAX     1072u /* most bytes of one frame on the wire: header, fragment, checksum, COBS, delimiter */
-#define PF_LINK_NAME_SIZE     32u
-#define PF_LINK_SLOTS_MAX     16u
-#define PF_LINK_TOPICS        8u
+#define PF_LINK_VERSION      1u    /* of the wire format */
+#define PF_LINK_FRAGMENT_MAX 1024u /* one fragment is 11.4 ms at 921600 baud: what control waits for at most */
+#define PF_LINK_FRAME_MAX    1072u /* most bytes of one frame on the wire: header, fragment, checksum, COBS, delimiter */
+#define PF_LINK_NAME_SIZE    32u
+#define PF_LINK_SLOTS_MAX    16u
+#define PF_LINK_TOPICS       8u
 
 typedef enum pf_link_role { PF_LINK_DEVICE = 1, PF_LINK_HOST = 2 } pf_link_role;
 
@@ -43,16 +43,21 @@ typedef enum pf_object_kind {
     PF_OBJECT_RAW_FRAME = 5, /* one uncompressed or lossless frame, for calibration */
 } pf_object_kind;
 
-typedef enum pf_topic { PF_TOPIC_STATUS = 0, PF_TOPIC_PREVIEW = 1, PF_TOPIC_TRACKS = 2, PF_TOPIC_TELEMETRY = 3 } pf_topic;
+typedef enum pf_topic {
+    PF_TOPIC_STATUS = 0,
+    PF_TOPIC_PREVIEW = 1,
+    PF_TOPIC_TRACKS = 2,
+    PF_TOPIC_TELEMETRY = 3
+} pf_topic;
 
 /* Zero means the default in brackets. */
 typedef struct pf_link_config {
-    uint32_t role;          /* pf_link_role, required */
-    uint32_t nonce;         /* required, not 0: random for each start of this end, tells a restart from a reconnection */
-    uint64_t boot_id;       /* of this end; 0 = does not matter (host) */
-    uint32_t schema;        /* version of pipefish.proto that this end speaks */
-    uint32_t max_fragment;  /* 64..1024 bytes [1024]; the smaller of both ends is used */
-    uint32_t send_slots;    /* objects under way at once, 1..16 [4] */
+    uint32_t role;         /* pf_link_role, required */
+    uint32_t nonce;        /* required, not 0: random for each start of this end, tells a restart from a reconnection */
+    uint64_t boot_id;      /* of this end; 0 = does not matter (host) */
+    uint32_t schema;       /* version of pipefish.proto that this end speaks */
+    uint32_t max_fragment; /* 64..1024 bytes [1024]; the smaller of both ends is used */
+    uint32_t send_slots;   /* objects under way at once, 1..16 [4] */
     uint32_t receive_slots; /* objects being received at once, 1..16 [4]; 0 with max_object = 0: receives none, and
                                the peer keeps what it has to send for another session */
     uint32_t max_object;    /* most bytes of a received object [0: receives none] */
@@ -64,22 +69,22 @@ typedef struct pf_link_config {
     uint32_t rto_min_ms;    /* least retransmission timeout [50] */
 } pf_link_config;
 
-typedef struct pf_link_stats { /* since init; never reset */
-    uint64_t bytes_in, bytes_out;      /* on the wire */
+typedef struct pf_link_stats {    /* since init; never reset */
+    uint64_t bytes_in, bytes_out; /* on the wire */
     uint64_t frames_in, frames_out;
-    uint64_t crc_errors;               /* frames whose checksum or COBS coding was wrong */
-    uint64_t malformed;                /* intact frames that make no sense: wrong length, unknown type, out of range */
-    uint64_t stale;                    /* frames of an earlier session, or of an object that is done */
+    uint64_t crc_errors; /* frames whose checksum or COBS coding was wrong */
+    uint64_t malformed;  /* intact frames that make no sense: wrong length, unknown type, out of range */
+    uint64_t stale;      /* frames of an earlier session, or of an object that is done */
     /* sent counts repetitions too; duplicate: received, but not needed */
     uint64_t fragments_sent, fragments_resent, fragments_received, fragments_duplicate;
     uint64_t objects_sent, objects_received; /* durably acknowledged / handed to the caller */
     uint64_t object_bytes_sent, object_bytes_received;
     uint64_t control_sent, control_resent, control_received;
     uint64_t latest_sent, latest_replaced, latest_received, latest_incomplete;
-    uint64_t sessions;                 /* times the peer came up */
-    uint32_t rtt_us;                   /* smoothed; 0 = not measured yet */
-    int64_t peer_clock_offset_ns;      /* peer's clock minus ours, from the ping with the least round trip */
-    uint64_t peer_clock_error_ns;      /* half of that round trip; UINT64_MAX = not measured yet */
+    uint64_t sessions;            /* times the peer came up */
+    uint32_t rtt_us;              /* smoothed; 0 = not measured yet */
+    int64_t peer_clock_offset_ns; /* peer's clock minus ours, from the ping with the least round trip */
+    uint64_t peer_clock_error_ns; /* half of that round trip; UINT64_MAX = not measured yet */
 } pf_link_stats;
 
 typedef enum pf_link_event_type {
@@ -110,7 +115,8 @@ typedef struct pf_link pf_link; /* opaque, in the caller's workspace */
 size_t pf_link_workspace_size(const pf_link_config *config); /* 0 if out of range */
 pf_status pf_link_init(pf_link **link, const pf_link_config *config, void *workspace, size_t size);
 
-/* The byte stream broke (cable out, TCP reconnected): drop half a frame and say hello again. Objects stay and resume. */
+/* The byte stream broke (cable out, TCP reconnected): drop half a frame and say hello again. Objects stay and resume.
+ */
 void pf_link_reset(pf_link *link, uint64_t now_ns);
 
 /* Consumes bytes; returns how many, fewer than n when an event waits to be taken. Any bytes at all are safe. */
@@ -134,8 +140,8 @@ pf_status pf_link_send_control(pf_link *link, const void *bytes, size_t n);
 pf_status pf_link_send_latest(pf_link *link, uint32_t topic, const void *bytes, size_t n);
 
 /* Starts an object; `bytes` is borrowed until PF_LINK_SENT or PF_LINK_REFUSED names it or pf_link_cancel_object.
- * Works without a peer: it is offered when one comes. PF_ERR_SPACE: all send slots are taken; PF_ERR_ARGUMENT: empty, or
- * the name is under way already. */
+ * Works without a peer: it is offered when one comes. PF_ERR_SPACE: all send slots are taken; PF_ERR_ARGUMENT: empty,
+ * or the name is under way already. */
 pf_status pf_link_send_object(pf_link *link, const uint8_t name[PF_LINK_NAME_SIZE], uint32_t kind, const void *bytes,
                               size_t n);
 pf_status pf_link_cancel_object(pf_link *link, const uint8_t name[PF_LINK_NAME_SIZE]);
@@ -148,8 +154,8 @@ typedef enum pf_link_answer {
     PF_ANSWER_AGAIN = 4,  /* object: the bytes do not match the name; send all of it again */
 } pf_link_answer;
 
-/* Answers PF_LINK_OFFER or PF_LINK_OBJECT. A question stays open, and is not asked again, whatever happens to the session
- * or the line: it must be answered once. PF_ERR_ARGUMENT: no such question is open, or not with this answer. */
+/* Answers PF_LINK_OFFER or PF_LINK_OBJECT. A question stays open, and is not asked again, whatever happens to the
+ * session or the line: it must be answered once. PF_ERR_ARGUMENT: no such question is open, or not with this answer. */
 pf_status pf_link_answer_object(pf_link *link, uint32_t slot, pf_link_answer answer);
 
 const pf_link_stats *pf_link_get_stats(const pf_link *link);

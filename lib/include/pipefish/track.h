@@ -24,14 +24,14 @@ typedef enum pf_track_status {
 
 typedef enum pf_track_reason {
     PF_TRACK_OK = 0,
-    PF_TRACK_LEFT = 1,      /* its window left the image or the image circle */
-    PF_TRACK_FLAT = 2,      /* too little texture to locate it */
-    PF_TRACK_DIVERGED = 3,  /* the iteration did not settle */
-    PF_TRACK_RESIDUAL = 4,  /* the patch no longer looks the same */
-    PF_TRACK_BACKWARD = 5,  /* forward-backward check failed */
-    PF_TRACK_CROWDED = 6,   /* ran into an older track */
-    PF_TRACK_DRIFT = 7,     /* no longer looks like its template (first sight, renewed as its shape changes), or lies
-                             * elsewhere than the template says */
+    PF_TRACK_LEFT = 1,     /* its window left the image or the image circle */
+    PF_TRACK_FLAT = 2,     /* too little texture to locate it */
+    PF_TRACK_DIVERGED = 3, /* the iteration did not settle */
+    PF_TRACK_RESIDUAL = 4, /* the patch no longer looks the same */
+    PF_TRACK_BACKWARD = 5, /* forward-backward check failed */
+    PF_TRACK_CROWDED = 6,  /* ran into an older track */
+    PF_TRACK_DRIFT = 7,    /* no longer looks like its template (first sight, renewed as its shape changes), or lies
+                            * elsewhere than the template says */
 } pf_track_reason;
 
 typedef struct pf_point_q16 {
@@ -42,8 +42,9 @@ typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
     pf_point_q16 pos; /* in the current frame; last known where lost */
     /* Q12.20 px^2, saturating: covariance of the position against the track's template. With noise sigma in both
-     * patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of (sum J J^T)^-1, J the derivatives
-     * of the template by position and affine warp with gain and bias eliminated; plus the floor. New tracks: g = 1. */
+     * patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of (sum J J^T)^-1, J the
+     * derivatives of the template by position and affine warp with gain and bias eliminated; plus the floor. New
+     * tracks: g = 1. */
     uint32_t cov_xx_q20, cov_yy_q20;
     int32_t cov_xy_q20;
     uint32_t age;     /* frames since detection; 0 = new */
@@ -54,26 +55,26 @@ typedef struct pf_track {
 
 /* Zero means the default in brackets; width and height have none. Bounds are checked by pf_tracker_init. */
 typedef struct pf_tracker_config {
-    uint32_t width, height;        /* frame size, 64..16384 */
-    uint32_t max_tracks;           /* 8..2048 [400] */
-    uint32_t levels;               /* pyramid levels, 1..6 [4] */
-    uint32_t window;               /* KLT window side in pixels, odd, 7..31 [21] */
-    uint32_t iterations;           /* most iterations a level, 1..30 [10] */
-    uint32_t cell;                 /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
-    uint32_t min_eigen;            /* detection: least smaller eigenvalue of the mean structure tensor (11 x 11), grey^2,
-                                    * up to 16384 [8; noise of sigma 2 alone gives 2] */
-    uint32_t fb_q16;               /* most forward-backward distance, Q16.16 px, up to 16 [0.5] */
-    uint32_t min_zncc_q15;         /* least similarity to the previous patch, Q0.15, up to 32767 [0.8]; to the template
-                                    * it is 0.1 less */
-    uint32_t noise_q8;             /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
-    pf_point_q16 circle;           /* centre of the image circle, Q16.16 px, each within +-16384 */
-    uint32_t circle_radius_q16;    /* its radius, up to 16384; 0 = the whole image is used */
+    uint32_t width, height;     /* frame size, 64..16384 */
+    uint32_t max_tracks;        /* 8..2048 [400] */
+    uint32_t levels;            /* pyramid levels, 1..6 [4] */
+    uint32_t window;            /* KLT window side in pixels, odd, 7..31 [21] */
+    uint32_t iterations;        /* most iterations a level, 1..30 [10] */
+    uint32_t cell;              /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
+    uint32_t min_eigen;         /* detection: least smaller eigenvalue of the mean structure tensor (11 x 11), grey^2,
+                                 * up to 16384 [8; noise of sigma 2 alone gives 2] */
+    uint32_t fb_q16;            /* most forward-backward distance, Q16.16 px, up to 16 [0.5] */
+    uint32_t min_zncc_q15;      /* least similarity to the previous patch, Q0.15, up to 32767 [0.8]; to the template
+                                 * it is 0.1 less */
+    uint32_t noise_q8;          /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
+    pf_point_q16 circle;        /* centre of the image circle, Q16.16 px, each within +-16384 */
+    uint32_t circle_radius_q16; /* its radius, up to 16384; 0 = the whole image is used */
 } pf_tracker_config;
 
 typedef struct pf_tracker_stats { /* of the last frame */
     uint32_t live;                /* tracks now alive, new ones included */
     uint32_t tracked, lost, detected;
-    uint32_t lost_by[8];          /* by pf_track_reason */
+    uint32_t lost_by[8]; /* by pf_track_reason */
 } pf_tracker_stats;
 
 /* Opaque; lives in the caller's workspace. */
@@ -129,15 +130,15 @@ typedef enum pf_keyframe_cause {
 } pf_keyframe_cause;
 
 typedef struct pf_keyframe_config { /* zero = default in brackets */
-    uint32_t step_counts;     /* encoder counts between keyframes; 0 = do not use the encoder */
-    uint32_t parallax_urad;   /* micro-radians [174533 = 10 degrees] */
-    uint32_t min_common;      /* forced below so many common tracks [100], or below half of what the last keyframe had
-                               * where that is less: weak texture alone must not force one at every frame */
-    uint32_t min_interval;    /* frames, at least so many between keyframes [2] */
+    uint32_t step_counts;           /* encoder counts between keyframes; 0 = do not use the encoder */
+    uint32_t parallax_urad;         /* micro-radians [174533 = 10 degrees] */
+    uint32_t min_common;   /* forced below so many common tracks [100], or below half of what the last keyframe had
+                            * where that is less: weak texture alone must not force one at every frame */
+    uint32_t min_interval; /* frames, at least so many between keyframes [2] */
 } pf_keyframe_config;
 
 typedef struct pf_keyframe_state { /* private; zero-initialise */
-    uint32_t n;                     /* live tracks of the last keyframe; ids ascending */
+    uint32_t n;                    /* live tracks of the last keyframe; ids ascending */
     uint32_t frames_since;
     bool have_encoder, started;
     int64_t encoder;

@@ -1,0 +1,28 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def real_data() -> Callable[[str], Path]:
+    """Gives a folder or file of the real data, which is not part of the project: in $PIPEFISH_DATA or ../shared/data.
+
+    Where it is not, the test is skipped with a warning."""
+    top = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data")
+
+    def find(name: str) -> Path:
+        if not (top / name).exists():
+            warnings.warn(f"real data are not here: {name} is not in {top}; set PIPEFISH_DATA", stacklevel=2)
+            pytest.skip(f"real data '{name}' are not here: set PIPEFISH_DATA")
+        return top / name
+
+    return find
