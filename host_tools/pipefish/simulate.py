@@ -20,7 +20,6 @@ from pipefish.progress import track
 
 TRUTH_FORMAT = "pipefish-truth"
 TRUTH_VERSION = 1
-LENS_STEPS = 186  # half a degree apart at 92.5 degrees
 
 PRESETS: dict[str, dict[str, Any]] = {
     # 6 m DN300: straight, a bend of 30 degrees with a radius of three diameters to the right, an oval stretch.
@@ -38,8 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {
         "diameter": 0.2,
         "pieces": [{"length": 1.5}],
-        "texture": {"texel": 0.001},
-        "lens": {"width": 320, "height": 240, "focal_px": 78, "c_u": 159.5, "c_v": 119.5},
+        "lens": {"width": 320, "height": 240, "circle_radius": 118, "c_u": 159.5, "c_v": 119.5},
         "motion": {"frames": 20, "metres_per_count": 0.0005},
     },
 }
@@ -101,7 +99,7 @@ class Scene:
         try:
             centre = np.array(truth["poses"][last][5:8], dtype=float)
         except (KeyError, IndexError, TypeError, ValueError):
-            raise FormatError(path, "poses", "must hold s, qw, qx, qy, qz, cx, cy, cz of every frame") from None
+            raise FormatError(path, "poses", "must hold s, qw, qx, qy, qz, cx, cy, cz, driven of every frame") from None
         if not np.allclose(centre, scene.centre(last), atol=1e-9):
             raise FormatError(path, f"poses[{last}]", "this version's simulator drives otherwise: simulate anew")
         return scene
@@ -143,6 +141,10 @@ class Scene:
         """How far along the pipe the camera is, metres."""
         return self._scene.arc_length(frame)
 
+    def driven(self, frame: int) -> float:
+        """How far the crawler has driven since frame 0, metres: what the encoder counts."""
+        return self._scene.driven(frame)
+
     def telemetry(self, frame: int) -> tuple[int, int, float, float]:
         """What the sensors say: time in ns, encoder counts, roll and pitch in radians."""
         return self._scene.telemetry(frame)
@@ -156,8 +158,8 @@ class Scene:
         return self._scene.project(frame, _points(points, 3))
 
     def locate(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle."""
-        return self._scene.locate(_points(points, 3))
+        """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle; NaN far outside the pipe."""
+        return self._scene.locate(_points(points, 3))[0]
 
     def wall(self, s: float, phi: float) -> np.ndarray:
         """The wall point at arc length s and clock angle phi, (3,)."""
@@ -168,14 +170,13 @@ class Scene:
         return self._scene.section(s)
 
     def lens(self) -> dict[str, list[float]]:
-        """The lens as a table: theta (radians), radius (pixels), pupil shift (metres)."""
-        spec = self.spec["lens"]
-        theta = np.linspace(0, spec["theta_max"], LENS_STEPS)
-        pupil = spec["pupil_mm"] * 1e-3 * (1 - np.cos(theta))
+        """The lens as its table: theta (radians), radius (pixels), pupil shift (metres)."""
+        theta = self._scene.lens_nodes
+        radius, pupil = zip(*(self._scene.lens(t) for t in theta), strict=True)
         return {
-            "theta": theta.round(9).tolist(),
-            "radius_px": [round(self._scene.lens_radius(t), 6) for t in theta],
-            "pupil_m": pupil.round(9).tolist(),
+            "theta": [round(t, 12) for t in theta],
+            "radius_px": [round(r, 9) for r in radius],
+            "pupil_m": [round(e, 12) for e in pupil],
         }
 
 
@@ -207,7 +208,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
     poses = []
     for frame in range(scene.frames):
         q = quaternion(scene.pose(frame)[:, :3])
-        row = [scene.arc_length(frame), *q, *scene.centre(frame)]
+        row = [scene.arc_length(frame), *q, *scene.centre(frame), scene.driven(frame)]
         poses.append([round(float(v), 12) for v in row])
     return {
         "format": TRUTH_FORMAT,
@@ -216,7 +217,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
         "scene": scene.spec,
         "pipe_length_m": scene.length,
         "lens": scene.lens(),
-        "pose_columns": ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz"],
+        "pose_columns": ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven"],
         "poses": poses,
     }
 
@@ -230,7 +231,7 @@ def fitted_camera(scene: Scene) -> Any:
 
     spec = scene.spec["lens"]
     theta = np.linspace(0, spec["theta_max"], 1001)[1:]
-    radius = np.array([scene._scene.lens_radius(t) for t in theta])
+    radius = np.array([scene._scene.lens(t)[0] for t in theta])
     powers = theta[:, None] ** np.array([1, 3, 5, 7, 9])
     coefficients = np.linalg.lstsq(powers, radius, rcond=None)[0]
     rms = float(np.sqrt(np.mean((powers @ coefficients - radius) ** 2)))

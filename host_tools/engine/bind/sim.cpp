@@ -10,7 +10,9 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cmath>
+#include <stdexcept>
 #include <string>
 
 namespace nb = nanobind;
@@ -36,7 +38,7 @@ template <typename F> void fields(F &f, OvalStretch &o)
 {
     f("start", o.start, -1000, 1000);
     f("end", o.end, -1000, 1000);
-    f("ramp", o.ramp, 0, 1000);
+    f("ramp", o.ramp, 0.001, 1000);
     f("ovality", o.ovality, 0, 0.5);
     f("clock", o.clock, -kTurn, kTurn);
 }
@@ -53,24 +55,32 @@ template <typename F> void fields(F &f, TextureSpec &t)
     f("seed", t.seed, 0, kMaxSeed);
     f("contrast", t.contrast, 0, 3);
     f("joint_spacing", t.joint_spacing, 0, 100);
-    f("texel", t.texel, 0.0002, 0.01);
+}
+
+template <typename F> void fields(F &f, LensNode &n)
+{
+    f("theta", n.theta, 0, 3);
+    f("radius_px", n.radius_px, 0, 20000);
+    f("pupil_m", n.pupil_m, -0.1, 0.1);
 }
 
 template <typename F> void fields(F &f, LensSpec &l)
 {
     f("width", l.width, 64, 8192);
     f("height", l.height, 64, 8192);
-    f("focal_px", l.focal_px, 10, 10000);
-    f("equisolid", l.equisolid, 0, 1);
-    f("theta_max", l.theta_max, 0.1, 2.4);
     f("c_u", l.c_u, -8192, 16384);
     f("c_v", l.c_v, -8192, 16384);
-    f("pupil_mm", l.pupil_mm, -10, 10);
+    f("theta_max", l.theta_max, 0.1, 3);
+    f("circle_radius", l.circle_radius, 10, 10000);
+    f("pupil_scale", l.pupil_scale, 0, 10);
     f("vignetting", l.vignetting, 0, 1);
+    f("table", l.table);
 }
 
 template <typename F> void fields(F &f, LampSpec &l)
 {
+    f("lamps", l.lamps, 1, 64);
+    f("ring_radius", l.ring_radius, 0, 1);
     f("side", l.side, 0, 10);
     f("forward", l.forward, 0, 10);
     f("exposure", l.exposure, 0, 1e5);
@@ -91,7 +101,9 @@ template <typename F> void fields(F &f, MotionSpec &m)
     f("frame_rate", m.frame_rate, 0.1, 1000);
     f("start", m.start, -100, 1000);
     f("speed", m.speed, 0, 10);
+    f("ramp", m.ramp, 0, 1000);
     f("below_axis", m.below_axis, -1, 1);
+    f("lookahead", m.lookahead, 0.01, 10);
     f("wobble_m", m.wobble_m, 0, 0.1);
     f("wobble_rad", m.wobble_rad, 0, 0.5);
     f("metres_per_count", m.metres_per_count, 1e-6, 1);
@@ -227,16 +239,26 @@ void check_together(const SceneSpec &s)
         const std::string where = "pieces[" + std::to_string(i) + "]";
         if (p.angle == 0 && !(p.length > 0))
             Reader::fail(where, "a straight run needs a length, a bend an angle and a radius");
-        if (p.angle != 0 && !(p.radius > 0.75 * s.diameter))
-            Reader::fail(where + ".radius", "must be above 0.75 diameters, or the wall meets itself");
+        if (p.angle != 0 && !(p.radius > 0.8 * s.diameter))
+            Reader::fail(where + ".radius", "must be above 0.8 diameters, or the wall meets itself");
     }
-    for (size_t i = 0; i < s.ovals.size(); i++)
+    double ovality = 0;
+    for (size_t i = 0; i < s.ovals.size(); i++) {
+        const std::string where = "ovals[" + std::to_string(i) + "]";
         if (!(s.ovals[i].end > s.ovals[i].start))
-            Reader::fail("ovals[" + std::to_string(i) + "].end", "must lie behind start");
+            Reader::fail(where + ".end", "must lie behind start");
+        if (!(s.ovals[i].start + 2 * s.ovals[i].ramp <= s.ovals[i].end))
+            Reader::fail(where + ".ramp", "must be at most half the stretch");
+        ovality += s.ovals[i].ovality;
+        if (ovality > 0.5)
+            Reader::fail(where + ".ovality", "all stretches together must be at most 0.5");
+    }
+    if (s.lamp.ring_radius > 0.25 * s.diameter)
+        Reader::fail("lamp.ring_radius", "must be at most a quarter of the pipe's diameter");
     const double ride = std::abs(s.motion.below_axis) + 2 * s.motion.wobble_m;
     if (ride > 0.4 * s.diameter)
         Reader::fail("motion.below_axis", "the camera would leave the pipe");
-    const double end = s.motion.start + s.motion.speed * s.motion.frames / s.motion.frame_rate;
+    const double end = s.motion.start + s.motion.speed * (s.motion.frames - 1) / s.motion.frame_rate;
     double length = 0;
     for (const Piece &p : s.pieces)
         length += p.angle != 0 ? p.angle * p.radius : p.length;
@@ -277,13 +299,42 @@ int checked_frame(const Scene &scene, int frame)
     return frame;
 }
 
+const FrameState &state(const Scene &scene, int frame)
+{
+    return scene.frames()[static_cast<size_t>(checked_frame(scene, frame))];
+}
+
+// Applies map(frame, in, out) -> ok to each row of the points; rows where it fails are NaN.
+template <size_t In, size_t Out, typename Points, typename Map>
+nb::tuple map_points(int frame, const Points &points, const Map &map)
+{
+    const size_t n = points.shape(0);
+    std::vector<double> out(Out * n, NAN);
+    std::vector<uint8_t> ok(n, 0);
+    for (size_t i = 0; i < n; i++) {
+        double item[Out];
+        ok[i] = map(frame, points.data() + In * i, item);
+        if (ok[i])
+            std::copy(item, item + Out, out.data() + Out * i);
+    }
+    return nb::make_tuple(to_numpy<double>(std::move(out), {n, Out}), ok_mask(std::move(ok)));
+}
+
 } // namespace
 
 void bind_sim(nb::module_ &m)
 {
     nb::class_<Scene>(m, "Scene", "A simulated pipe with a camera driving through it; docs/simulator.md.")
         .def(
-            "__init__", [](Scene *self, const nb::dict &source) { new (self) Scene(read_scene(source)); },
+            "__init__",
+            [](Scene *self, const nb::dict &source) {
+                const SceneSpec spec = read_scene(source);
+                try {
+                    new (self) Scene(spec);
+                } catch (const std::invalid_argument &error) { // what only the lens knows; the rest is checked above
+                    Reader::fail("lens", error.what());
+                }
+            },
             nb::arg("scene"))
         .def_prop_ro("spec",
                      [](const Scene &s) {
@@ -294,83 +345,69 @@ void bind_sim(nb::module_ &m)
                      })
         .def(
             "render",
-            [](Scene &s, int frame, unsigned threads) {
+            [](Scene &s, int frame, int threads) {
                 checked_frame(s, frame);
-                std::vector<uint8_t> image;
+                const size_t height = static_cast<size_t>(s.spec().lens.height);
+                const size_t width = static_cast<size_t>(s.spec().lens.width);
+                std::vector<uint8_t> image(height * width);
                 {
                     nb::gil_scoped_release release;
-                    image = s.render(frame, threads);
+                    s.render(frame, threads, image.data());
                 }
-                const auto &l = s.spec().lens;
-                return to_numpy<uint8_t>(std::move(image),
-                                         {static_cast<size_t>(l.height), static_cast<size_t>(l.width)});
+                return to_numpy<uint8_t>(std::move(image), {height, width});
             },
             nb::arg("frame"), nb::arg("threads"), "(height, width) uint8.")
         .def(
             "pose",
             [](const Scene &s, int frame) {
-                const Pose &p = s.motion().pose(checked_frame(s, frame));
+                const FrameState &f = state(s, frame);
+                const Eigen::Matrix3d rotation = f.world_from_cam.transpose();
                 Eigen::Matrix<double, 3, 4, Eigen::RowMajor> out;
-                out << p.rotation, -p.rotation * p.centre;
+                out << rotation, -rotation * f.centre;
                 return out;
             },
             nb::arg("frame"), "cam_from_world, (3, 4).")
-        .def("arc_length", [](const Scene &s, int frame) { return s.motion().pose(checked_frame(s, frame)).s; })
+        .def(
+            "arc_length", [](const Scene &s, int frame) { return state(s, frame).s; }, nb::arg("frame"),
+            "Of the camera's place along the pipe, metres.")
+        .def(
+            "driven", [](const Scene &s, int frame) { return state(s, frame).arc; }, nb::arg("frame"),
+            "What the crawler has driven since frame 0, metres.")
         .def(
             "telemetry",
             [](const Scene &s, int frame) {
-                const Telemetry &t = s.motion().telemetry(checked_frame(s, frame));
-                return std::make_tuple(t.time_ns, t.encoder_count, t.roll, t.pitch);
+                const FrameState &f = state(s, frame);
+                return std::make_tuple(f.time_ns, f.encoder_count, f.measured_roll, f.measured_pitch);
             },
             nb::arg("frame"), "(time_ns, encoder_count, roll, pitch) as the sensors say.")
         .def(
             "cast",
             [](const Scene &s, int frame, const Points2 &px) {
-                checked_frame(s, frame);
-                const size_t n = px.shape(0);
-                std::vector<double> out(3 * n, NAN);
-                std::vector<uint8_t> ok(n, 0);
-                for (size_t i = 0; i < n; i++) {
-                    const auto hit = s.cast(frame, Vec2(px(i, 0), px(i, 1)));
-                    if (!hit)
-                        continue;
-                    ok[i] = 1;
-                    Eigen::Map<Vec3>(out.data() + 3 * i) = hit->point;
-                }
-                return nb::make_tuple(to_numpy<double>(std::move(out), {n, 3}), ok_mask(std::move(ok)));
+                return map_points<2, 3>(checked_frame(s, frame), px,
+                                        [&s](int f, const double *in, double *out) { return s.cast(f, in, out); });
             },
             nb::arg("frame"), nb::arg("px"), "(N, 2) pixels -> wall points (N, 3) in metres, ok (N,).")
         .def(
             "project",
             [](const Scene &s, int frame, const Points3 &points) {
-                checked_frame(s, frame);
-                const size_t n = points.shape(0);
-                std::vector<double> out(2 * n, NAN);
-                std::vector<uint8_t> ok(n, 0);
-                for (size_t i = 0; i < n; i++) {
-                    const auto px = s.project(frame, Vec3(points(i, 0), points(i, 1), points(i, 2)));
-                    if (!px)
-                        continue;
-                    ok[i] = 1;
-                    Eigen::Map<Vec2>(out.data() + 2 * i) = *px;
-                }
-                return nb::make_tuple(to_numpy<double>(std::move(out), {n, 2}), ok_mask(std::move(ok)));
+                return map_points<3, 2>(checked_frame(s, frame), points,
+                                        [&s](int f, const double *in, double *out) { return s.project(f, in, out); });
             },
             nb::arg("frame"), nb::arg("points"), "World points (N, 3) -> pixels (N, 2), ok (N,).")
         .def(
             "locate",
             [](const Scene &s, const Points3 &points) {
-                const size_t n = points.shape(0);
-                std::vector<double> out(3 * n);
-                for (size_t i = 0; i < n; i++) {
-                    const TubePoint at = s.tube().locate(Vec3(points(i, 0), points(i, 1), points(i, 2)));
-                    out[3 * i] = at.s;
-                    out[3 * i + 1] = at.rho;
-                    out[3 * i + 2] = at.phi;
-                }
-                return to_numpy<double>(std::move(out), {n, 3});
+                return map_points<3, 3>(0, points, [&s](int, const double *in, double *out) {
+                    WallPoint at{};
+                    const bool ok = s.tube().locate(Eigen::Map<const Eigen::Vector3d>(in), at);
+                    out[0] = at.s;
+                    out[1] = at.distance;
+                    out[2] = at.clock;
+                    return ok;
+                });
             },
-            nb::arg("points"), "World points (N, 3) -> arc length, distance from the axis, clock angle (N, 3).")
+            nb::arg("points"),
+            "World points (N, 3) -> arc length, distance from the axis, clock angle (N, 3), ok (N,).")
         .def(
             "wall", [](const Scene &s, double at, double phi) { return s.tube().wall(at, phi); }, nb::arg("s"),
             nb::arg("phi"), "The wall point at arc length s and clock angle phi, (3,).")
@@ -378,11 +415,16 @@ void bind_sim(nb::module_ &m)
             "section",
             [](const Scene &s, double at) {
                 const Section x = s.tube().section(at);
-                return std::make_tuple(2 * x.a, 2 * x.b, x.clock);
+                const double e = std::hypot(x.e_c, x.e_s), clock = e > 0 ? 0.5 * std::atan2(x.e_s, x.e_c) : 0.0;
+                return std::make_tuple(2 * (x.rho + e), 2 * (x.rho - e), clock < 0 ? clock + M_PI : clock);
             },
-            nb::arg("s"), "(D_max, D_min, clock angle of D_max) at arc length s.")
+            nb::arg("s"), "(D_max, D_min, clock angle of D_max in [0, pi)) at arc length s.")
         .def(
-            "lens_radius", [](const Scene &s, double theta) { return s.lens().radius(theta); }, nb::arg("theta"))
+            "lens",
+            [](const Scene &s, double theta) { return std::make_pair(s.lens().radius(theta), s.lens().pupil(theta)); },
+            nb::arg("theta"), "(image radius in pixels, pupil shift in metres) of a field angle.")
+        .def_prop_ro(
+            "lens_nodes", [](const Scene &s) { return s.lens().table().theta; }, "The table's angles.")
         .def_prop_ro("circle_radius", [](const Scene &s) { return s.lens().circle_radius(); })
         .def_prop_ro("length", [](const Scene &s) { return s.tube().length(); });
 }

@@ -1,49 +1,77 @@
-// The simulated lens: a table of field angle, image radius and pupil shift, made from a compound law that no odd
-// polynomial equals. Independent of lib/camera on purpose.
+// The simulator's lens: a table of field angle, image radius and pupil position, interpolated by cubic splines. It
+// shares no code and no formula with lib/camera, so that an error in either shows.
+//
+// A ray that makes the angle theta with the optical axis meets the axis at z = pupil(theta) (metres, pupil(0) = 0: the
+// camera centre is the paraxial entrance pupil) and lands radius(theta) pixels from the principal point.
 #pragma once
 
-#include <Eigen/Core>
-#include <optional>
 #include <vector>
 
 namespace pipefish::sim
 {
 
-using Vec2 = Eigen::Vector2d;
-using Vec3 = Eigen::Vector3d;
-
-struct LensSpec {
-    int width = 1280, height = 800;
-    double focal_px = 262;     // pixels per radian on the axis
-    double equisolid = 0.65;   // share of 2 sin(theta / 2) in the law, the rest is theta
-    double theta_max = 1.6144; // 92.5 degrees
-    double c_u = 643.2, c_v = 397.6;
-    double pupil_mm = 1.5;    // how far the entrance pupil moves back along the axis at 90 degrees
-    double vignetting = 0.25; // share of light lost at the rim
+struct LensNode {
+    double theta = 0.0, radius_px = 0.0, pupil_m = 0.0;
 };
 
-struct Ray {
-    Vec3 origin, direction; // camera frame, metres
+struct LensSpec {
+    int width = 1280, height = 800;  // pixels
+    double c_u = 643.2, c_v = 397.6; // principal point = centre of the image circle
+    double theta_max = 1.6144;       // radians: the field's edge, 92.5 degrees
+    double circle_radius = 395.0;    // pixels, at theta_max
+    double pupil_scale = 1.0;        // size of the traced lens; 0 = a central camera
+    double vignetting = 0.25;        // share of the light lost at the edge, grows with theta^4
+    std::vector<LensNode> table;     // if not empty: the lens, instead of the traced one
+};
+
+struct LensTable {
+    std::vector<double>
+        theta; // radians, starts at 0, increasing, below pi; at least 4 nodes; the last is the field's edge
+    std::vector<double> radius; // pixels, starts at 0, increasing
+    std::vector<double> pupil;  // metres, starts at 0
+};
+
+// A table for a fisheye traced from its own prescription: two negative menisci in front of a stop (which give the pupil
+// shift) and a rear group that maps the chief ray's angle at the stop by a compound law. theta_max in radians (up to
+// 100 degrees), circle_radius in pixels at theta_max; pupil_scale stretches the lens (1: pupil shift 2.8 mm at 92.5
+// degrees, 0: a central camera). Throws std::invalid_argument outside the prescription's field.
+LensTable trace_fisheye(double theta_max, double circle_radius, double pupil_scale);
+
+// Cubic spline through (x, y). At the first node either y'' = 0 (odd functions) or y' = 0 (even); y'' = 0 at the last.
+class Spline
+{
+public:
+    Spline() = default;
+    Spline(const std::vector<double> &x, const std::vector<double> &y, bool even);
+    // Value at t; *slope gets the derivative. Beyond the nodes the end polynomials continue.
+    double operator()(double t, double *slope = nullptr) const;
+
+private:
+    std::vector<double> x_, y_, y2_;
 };
 
 class Lens
 {
 public:
-    explicit Lens(const LensSpec &spec);
-    const LensSpec &spec() const { return spec_; }
+    // Throws std::invalid_argument when the table is not as LensTable says, or its radius is not increasing between
+    // nodes.
+    explicit Lens(LensTable table);
 
-    std::optional<Ray> unproject(const Vec2 &px) const;
-    std::optional<Vec2> project(const Vec3 &point) const;
+    const LensTable &table() const { return table_; }
+    double theta_max() const { return table_.theta.back(); }
+    double circle_radius() const { return table_.radius.back(); }
+    double radius(double theta) const { return radius_(theta); }
+    double pupil(double theta) const { return pupil_(theta); }
 
-    double circle_radius() const { return radius_.back(); }      // pixels, at theta_max
-    double pupil(double theta) const;                            // z of the ray's origin, metres
-    double radius(double theta) const;                           // pixels
-    const std::vector<double> &table() const { return radius_; } // at theta_max * i / (n - 1)
+    // The field angle seen `r` pixels from the principal point, to 1e-14 rad. False beyond the circle.
+    bool theta_of_radius(double r, double &theta) const;
+    // The field angle of the ray through the point (rho, z) (metres, rho >= 0 off the axis), whose origin is the pupil
+    // of that very angle. False outside the field or behind the pupil.
+    bool theta_of_point(double rho, double z, double &theta) const;
 
 private:
-    LensSpec spec_;
-    std::vector<double> radius_;
-    double step_;
+    LensTable table_;
+    Spline radius_, pupil_;
 };
 
 } // namespace pipefish::sim

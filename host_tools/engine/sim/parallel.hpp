@@ -1,27 +1,42 @@
-// Rows of work over a few threads. What a row computes must not depend on the thread.
+// Runs work items on threads. Items are independent and each writes its own memory, so results do not depend on
+// `threads`.
 #pragma once
 
-#include <algorithm>
 #include <atomic>
+#include <exception>
+#include <mutex>
 #include <thread>
 #include <vector>
 
 namespace pipefish::sim
 {
 
-template <typename Row> void parallel_rows(int rows, unsigned threads, const Row &row)
+// Calls body(i) for 0 <= i < items, on the calling thread and threads - 1 others. The first exception is passed on.
+template <typename Body> void parallel_for(int items, int threads, const Body &body)
 {
     std::atomic<int> next{0};
+    std::exception_ptr failure;
+    std::mutex failure_lock;
     const auto work = [&] {
-        for (int y = next++; y < rows; y = next++)
-            row(y);
+        try {
+            for (int i = next++; i < items; i = next++) {
+                body(i);
+            }
+        } catch (...) {
+            const std::lock_guard<std::mutex> guard(failure_lock);
+            failure = std::current_exception();
+        }
     };
-    std::vector<std::thread> helpers;
-    for (unsigned i = 1; i < std::max(1u, threads); i++)
-        helpers.emplace_back(work);
-    work();
-    for (std::thread &t : helpers)
-        t.join();
+    {
+        std::vector<std::jthread> team;
+        for (int k = 1; k < threads && k < items; k++) {
+            team.emplace_back(work);
+        }
+        work();
+    }
+    if (failure) {
+        std::rethrow_exception(failure);
+    }
 }
 
 } // namespace pipefish::sim

@@ -1,32 +1,50 @@
-// Counter-based random numbers: a value depends on its seed and index only, so results do not depend on threads.
+// Counter-based random numbers: every number is a pure function of (seed, stream, counter), so no result depends on the
+// order of evaluation or on the number of threads.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
+#include <numbers>
 
 namespace pipefish::sim
 {
 
-// SplitMix64's finaliser (Steele, Lea & Flood 2014) of seed and index.
-inline uint64_t hash64(uint64_t seed, uint64_t index)
+// SplitMix64's output function (Steele, Lea, Flood, OOPSLA 2014): a bijection with full avalanche.
+inline uint64_t mix64(uint64_t x)
 {
-    uint64_t z = seed * 0xD1342543DE82EF95u + index * 0x9E3779B97F4A7C15u + 0x9E3779B97F4A7C15u;
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
-    return z ^ (z >> 31);
+    x += 0x9e3779b97f4a7c15u;
+    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
+    x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
+    return x ^ (x >> 31);
 }
 
-// Uniform in [0, 1).
-inline double uniform(uint64_t seed, uint64_t index)
+inline uint64_t hash64(uint64_t seed, uint64_t stream, uint64_t a, uint64_t b = 0)
 {
-    return static_cast<double>(hash64(seed, index) >> 11) * 0x1p-53;
+    return mix64(mix64(mix64(seed ^ mix64(stream)) ^ a) ^ b);
 }
 
-// Normal to the eye and to four sigma: the sum of the four 16-bit parts of one hash, mean 0, variance 1.
-inline double normal(uint64_t seed, uint64_t index)
+// Uniform in [0, 1) from the top 53 bits.
+inline double uniform_of(uint64_t bits)
 {
-    const uint64_t h = hash64(seed, index);
-    const auto sum = static_cast<double>((h & 0xFFFF) + (h >> 16 & 0xFFFF) + (h >> 32 & 0xFFFF) + (h >> 48));
-    return (sum - 2 * 65535.0) * (1.7320508075688772 / 65536.0);
+    return static_cast<double>(bits >> 11) * 0x1p-53;
 }
+
+// Standard normal number `counter` of a stream (Box and Muller).
+inline double normal(uint64_t seed, uint64_t stream, uint64_t counter)
+{
+    const double u = 1.0 - uniform_of(hash64(seed, stream, counter, 0));
+    const double v = uniform_of(hash64(seed, stream, counter, 1));
+    return std::sqrt(-2.0 * std::log(u)) * std::cos(2.0 * std::numbers::pi * v);
+}
+
+// Streams in use; a number is never reused for something else, or old scenes would change.
+enum Stream : uint64_t {
+    STREAM_WOBBLE = 1,
+    STREAM_SLIP = 2,
+    STREAM_ROLL = 3,
+    STREAM_PITCH = 4,
+    STREAM_PIXEL = 5,
+    STREAM_SURFACE = 1000, // and up: one a layer of the surface
+};
 
 } // namespace pipefish::sim

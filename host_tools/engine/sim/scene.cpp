@@ -1,10 +1,10 @@
 #include "sim/scene.hpp"
 
-#include "sim/parallel.hpp"
-#include "sim/random.hpp"
+#include "sim/buffers.hpp"
 
 #include <algorithm>
 #include <cmath>
+#include <numbers>
 
 namespace pipefish::sim
 {
@@ -12,138 +12,147 @@ namespace pipefish::sim
 namespace
 {
 
-constexpr double kFarthest = 20; // pipe radii; beyond, less than a tenth of a grey level comes back
-
-// Separable Gaussian of the optics, borders mirrored by clamping (they are black).
-void blur(std::vector<float> &image, int width, int height, double sigma, unsigned threads)
+// A power of two that gives the pixels at the rim, where the wall is sharpest, 0.6 to 1.2 texels each.
+int texels_around(const Lens &lens)
 {
-    const int reach = static_cast<int>(std::ceil(3.5 * sigma));
-    if (reach < 1)
-        return;
-    std::vector<float> kernel;
-    float sum = 0;
-    for (int i = -reach; i <= reach; i++) {
-        kernel.push_back(static_cast<float>(std::exp(-0.5 * i * i / (sigma * sigma))));
-        sum += kernel.back();
+    const double theta = std::min(lens.theta_max(), 0.5 * std::numbers::pi), step = 1e-3;
+    const double pixels = 2.0 * std::numbers::pi * (lens.radius(theta) - lens.radius(theta - step)) / step;
+    int around = 64;
+    while (around < 1.2 * pixels && around < 16384) {
+        around *= 2;
     }
-    for (float &k : kernel)
-        k /= sum;
-    std::vector<float> other(image.size());
-    const auto pass = [&](const std::vector<float> &from, std::vector<float> &to, int step_x, int step_y) {
-        parallel_rows(height, threads, [&](int y) {
-            for (int x = 0; x < width; x++) {
-                float v = 0;
-                for (int i = -reach; i <= reach; i++) {
-                    const int px = std::clamp(x + i * step_x, 0, width - 1);
-                    const int py = std::clamp(y + i * step_y, 0, height - 1);
-                    v += kernel[static_cast<size_t>(i + reach)] *
-                         from[static_cast<size_t>(py) * static_cast<size_t>(width) + static_cast<size_t>(px)];
-                }
-                to[static_cast<size_t>(y) * static_cast<size_t>(width) + static_cast<size_t>(x)] = v;
-            }
-        });
-    };
-    pass(image, other, 1, 0);
-    pass(other, image, 0, 1);
+    return around;
+}
+
+LensTable lens_table(const LensSpec &spec)
+{
+    if (spec.table.empty()) {
+        return trace_fisheye(spec.theta_max, spec.circle_radius, spec.pupil_scale);
+    }
+    LensTable table;
+    for (const LensNode &node : spec.table) {
+        table.theta.push_back(node.theta);
+        table.radius.push_back(node.radius_px);
+        table.pupil.push_back(node.pupil_m);
+    }
+    return table;
 }
 
 } // namespace
 
-Scene::Scene(const SceneSpec &spec)
-    : spec_(spec), tube_(spec.diameter, spec.pieces, spec.ovals), lens_(spec.lens), motion_(spec.motion, tube_)
+// Ahead as far as the lamps light the wall to a tenth of a grey level: the light falls with (radius / distance)^3.
+Scene::Reach Scene::lit_reach(const SceneSpec &spec)
 {
+    const double brightest =
+        spec.lamp.exposure * (spec.lamp.side + spec.lamp.forward) * static_cast<double>(Surface::MEAN);
+    const double radii = std::clamp(std::cbrt(brightest / 0.1), 4.0, 30.0);
+    return {spec.diameter, 0.5 * spec.diameter * radii};
 }
 
-void Scene::prepare(unsigned threads)
+Scene::Scene(const SceneSpec &spec)
+    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(lens_table(spec.lens)),
+      frames_(drive(tube_, spec.motion)), reach_(lit_reach(spec))
 {
-    texture_ = std::make_unique<Texture>(spec_.texture, spec_.diameter / 2, -0.5, tube_.length() + 3, threads);
-    const LensSpec &l = spec_.lens;
-    rays_.assign(static_cast<size_t>(l.width) * static_cast<size_t>(l.height), PixelRay{-1, 0, 0, 0, 0, 0, 0});
-    for (int y = 0; y < l.height; y++) {
-        for (int x = 0; x < l.width; x++) {
-            const auto ray = lens_.unproject(Vec2(x, y));
-            if (!ray)
+    spec_.lens.theta_max = lens_.theta_max();
+    spec_.lens.circle_radius = lens_.circle_radius();
+}
+
+Scene::~Scene() = default;
+
+void Scene::prepare()
+{
+    surface_.emplace(spec_.texture, spec_.markers, 0.5 * spec_.diameter, texels_around(lens_),
+                     reach_.behind + reach_.ahead);
+    make_pixel_table();
+    make_blur_kernel();
+    buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width) *
+                                                           static_cast<size_t>(spec_.lens.height));
+}
+
+void Scene::make_pixel_table()
+{
+    const LensSpec &camera = spec_.lens;
+    for (int y = 0; y < camera.height; y++) {
+        row_offset_.push_back(rays_.size());
+        int from = camera.width, to = 0;
+        for (int x = 0; x < camera.width; x++) {
+            const double px[2] = {static_cast<double>(x), static_cast<double>(y)};
+            PixelRay r{};
+            if (!ray(px, r)) {
                 continue;
-            PixelRay &p = rays_[static_cast<size_t>(y) * static_cast<size_t>(l.width) + static_cast<size_t>(x)];
-            const double theta = std::atan2(std::hypot(ray->direction.x(), ray->direction.y()), ray->direction.z());
-            const double share = theta / l.theta_max;
-            p = {static_cast<float>(theta),
-                 static_cast<float>(ray->direction.x()),
-                 static_cast<float>(ray->direction.y()),
-                 static_cast<float>(ray->direction.z()),
-                 static_cast<float>(ray->origin.z()),
-                 static_cast<float>(1 - l.vignetting * share * share),
-                 static_cast<float>(1 / l.focal_px)};
+            }
+            from = std::min(from, x);
+            to = x + 1;
+            rays_.push_back(r);
+            const double edge = std::acos(std::clamp(r.dz, -1.0, 1.0)) / lens_.theta_max();
+            vignette_.push_back(static_cast<float>(1.0 - camera.vignetting * edge * edge * edge * edge));
         }
+        row_from_.push_back(std::min(from, to));
+        row_to_.push_back(to);
     }
 }
 
-// Grey level, noise and blur apart: lamp intensity x inverse square x cosine x reflectance (Lambert).
-double Scene::shade(const Pose &pose, const PixelRay &ray) const
+void Scene::make_blur_kernel()
 {
-    const Vec3 local(ray.dx, ray.dy, ray.dz);
-    const Vec3 direction = (pose.rotation.transpose() * local).normalized();
-    const Vec3 origin = pose.centre + pose.rotation.transpose() * Vec3(0, 0, ray.oz);
-    const auto hit = tube_.cast(origin, direction, kFarthest * spec_.diameter / 2, pose.piece);
-    if (!hit)
-        return 0;
-    const Vec3 from_lamp = hit->point - pose.centre;
-    const double d2 = from_lamp.squaredNorm(), d = std::sqrt(d2);
-    const double cosine = std::max(0.0, -hit->normal.dot(from_lamp) / d);
-    const double axial = std::max(0.0, pose.rotation.row(2).dot(from_lamp) / d);
-    const double intensity = spec_.lamp.side + spec_.lamp.forward * axial * axial;
-    const double minor = hit->distance * ray.angle;
-    const double major = minor / std::max(0.02, -hit->normal.dot(direction));
-    double reflectance = texture_->sample(hit->at.s, hit->at.phi, minor, major);
-    for (const Marker &m : spec_.markers)
-        if ((hit->point - tube_.wall(m.s, m.phi)).norm() < m.radius)
-            reflectance = 1;
-    const double r = spec_.diameter / 2;
-    return spec_.lamp.exposure * intensity * cosine * r * r / d2 * reflectance * ray.vignette;
+    const double sigma = spec_.sensor.blur_px;
+    const int reach = static_cast<int>(std::ceil(3.5 * sigma));
+    double sum = 0.0;
+    for (int k = -reach; k <= reach; k++) {
+        sum += sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0;
+    }
+    for (int k = 0; k <= reach; k++) {
+        blur_.push_back(static_cast<float>((sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0) / sum));
+    }
 }
 
-std::vector<uint8_t> Scene::render(int frame, unsigned threads)
+bool Scene::on_sensor(const double px[2]) const
 {
-    if (!texture_)
-        prepare(threads);
-    const Pose &pose = motion_.pose(frame);
-    const int width = spec_.lens.width, height = spec_.lens.height;
-    std::vector<float> light(rays_.size(), 0.0f);
-    parallel_rows(height, threads, [&](int y) {
-        const size_t row = static_cast<size_t>(y) * static_cast<size_t>(width);
-        for (size_t i = row; i < row + static_cast<size_t>(width); i++)
-            if (rays_[i].theta >= 0)
-                light[i] = static_cast<float>(shade(pose, rays_[i]));
-    });
-    blur(light, width, height, spec_.sensor.blur_px, threads);
-    std::vector<uint8_t> image(light.size());
-    const uint64_t seed = hash64(spec_.sensor.seed, static_cast<uint64_t>(frame));
-    parallel_rows(height, threads, [&](int y) {
-        const size_t row = static_cast<size_t>(y) * static_cast<size_t>(width);
-        for (size_t i = row; i < row + static_cast<size_t>(width); i++) {
-            const double v = light[i];
-            const double sigma =
-                std::sqrt(spec_.sensor.read_noise * spec_.sensor.read_noise + spec_.sensor.shot_noise * v);
-            image[i] = static_cast<uint8_t>(std::clamp(std::floor(v + sigma * normal(seed, i) + 0.5), 0.0, 255.0));
-        }
-    });
-    return image;
+    return px[0] >= -0.5 && px[1] >= -0.5 && px[0] <= spec_.lens.width - 0.5 && px[1] <= spec_.lens.height - 0.5;
 }
 
-std::optional<Hit> Scene::cast(int frame, const Vec2 &px) const
+bool Scene::ray(const double px[2], PixelRay &ray) const
 {
-    const auto ray = lens_.unproject(px);
-    if (!ray)
-        return std::nullopt;
-    const Pose &pose = motion_.pose(frame);
-    const Eigen::Matrix3d world_from_cam = pose.rotation.transpose();
-    return tube_.cast(pose.centre + world_from_cam * ray->origin, world_from_cam * ray->direction, 1e3, pose.piece);
+    const double u = px[0] - spec_.lens.c_u, v = px[1] - spec_.lens.c_v, r = std::hypot(u, v);
+    double theta = 0.0;
+    if (!on_sensor(px) || !lens_.theta_of_radius(r, theta)) {
+        return false;
+    }
+    const double s = r > 0.0 ? std::sin(theta) / r : 0.0;
+    ray = {s * u, s * v, std::cos(theta), lens_.pupil(theta)};
+    return true;
 }
 
-std::optional<Vec2> Scene::project(int frame, const Vec3 &point) const
+bool Scene::cast(int frame, const double px[2], double world[3]) const
 {
-    const Pose &pose = motion_.pose(frame);
-    return lens_.project(pose.rotation * (point - pose.centre));
+    PixelRay r{};
+    Hit hit{};
+    const FrameState &f = frames_[static_cast<size_t>(frame)];
+    const Tube::View view(tube_, f.world_from_cam, f.centre);
+    if (!ray(px, r) || !view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
+        return false;
+    }
+    const Eigen::Vector3d local(hit.t * r.dx, hit.t * r.dy, r.pupil + hit.t * r.dz);
+    Eigen::Map<Eigen::Vector3d>(world, 3) = f.centre + f.world_from_cam * local;
+    return true;
+}
+
+bool Scene::project(int frame, const double world[3], double px[2]) const
+{
+    const FrameState &f = frames_[static_cast<size_t>(frame)];
+    const Eigen::Vector3d p = f.world_from_cam.transpose() * (Eigen::Map<const Eigen::Vector3d>(world) - f.centre);
+    const double rho = std::hypot(p.x(), p.y());
+    double theta = 0.0;
+    if (!lens_.theta_of_point(rho, p.z(), theta)) {
+        return false;
+    }
+    const double scale = rho > 0.0 ? lens_.radius(theta) / rho : 0.0;
+    const double found[2] = {spec_.lens.c_u + scale * p.x(), spec_.lens.c_v + scale * p.y()};
+    if (!on_sensor(found)) {
+        return false;
+    }
+    px[0] = found[0];
+    px[1] = found[1];
+    return true;
 }
 
 } // namespace pipefish::sim

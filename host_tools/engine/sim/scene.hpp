@@ -1,80 +1,100 @@
-// Everything together: what the camera sees at a frame, and the exact truth behind each pixel.
+// A scene: everything that the simulator needs for a recording, and the recording itself. Frames are pure functions of
+// the description: any order, any number of threads, the same bits.
 #pragma once
 
 #include "sim/lens.hpp"
 #include "sim/motion.hpp"
-#include "sim/texture.hpp"
+#include "sim/surface.hpp"
 #include "sim/tube.hpp"
 
 #include <memory>
+#include <mutex>
 #include <optional>
-#include <vector>
 
 namespace pipefish::sim
 {
 
-// A ring of lamps around the lens. Intensity over the field angle is side + forward cos^2 (forward hemisphere).
+// A ring of small lamps around the lens, in the plane of the camera centre. Each shines with the intensity
+// side + forward cos^2 a at the angle a from the optical axis, and with `side` alone behind it; the ring's mean counts.
 struct LampSpec {
+    int lamps = 8;
+    double ring_radius = 0.03; // metres; 0 = one lamp at the camera centre
     double side = 0.12, forward = 1.0;
-    double exposure = 1150; // grey levels of a white wall under unit intensity at one pipe radius, head on
+    double exposure =
+        1150.0; // linear grey level of a white wall, square to a lamp of unit intensity at the pipe's radius
 };
 
 struct SensorSpec {
     uint64_t seed = 1;
-    double blur_px = 0.55;     // sigma of the optics
-    double read_noise = 1.2;   // grey levels
-    double shot_noise = 0.025; // variance per grey level
-};
-
-// A bright disc on the wall, for tests that need a point whose image is known.
-struct Marker {
-    double s = 0, phi = 0, radius = 0; // metres, radians, metres
+    double blur_px = 0.55;     // pixels, standard deviation of the optics' Gaussian blur
+    double read_noise = 1.2;   // grey levels, standard deviation
+    double shot_noise = 0.025; // variance a grey level of signal
 };
 
 struct SceneSpec {
-    double diameter = 0.3;
+    double diameter = 0.3; // metres
     std::vector<Piece> pieces;
     std::vector<OvalStretch> ovals;
+    std::vector<Marker> markers;
     TextureSpec texture;
     LensSpec lens;
     LampSpec lamp;
     SensorSpec sensor;
     MotionSpec motion;
-    std::vector<Marker> markers;
 };
 
 class Scene
 {
 public:
+    // Ranges are checked where the description is read (bind/sim.cpp). Throws std::invalid_argument for what only the
+    // parts know: a lens table that does not rise, a bend that meets itself.
     explicit Scene(const SceneSpec &spec);
+    ~Scene();
 
     const SceneSpec &spec() const { return spec_; }
     const Tube &tube() const { return tube_; }
     const Lens &lens() const { return lens_; }
-    const Motion &motion() const { return motion_; }
+    const std::vector<FrameState> &frames() const { return frames_; }
 
-    // Row-major width x height grey levels. The texture is baked at the first call. Same bits for any thread count.
-    std::vector<uint8_t> render(int frame, unsigned threads);
+    // Draws a frame into out[height * width] on `threads` threads. One call at a time per scene; others wait.
+    void render(int frame, int threads, uint8_t *out);
 
-    // The wall point behind a pixel; nothing outside the image circle.
-    std::optional<Hit> cast(int frame, const Vec2 &px) const;
-    // The pixel of a world point; nothing beyond the field. Does not ask whether something is in between.
-    std::optional<Vec2> project(int frame, const Vec3 &point) const;
+    // Where the ray of a pixel meets the wall, world. False outside the circle and the sensor.
+    bool cast(int frame, const double px[2], double world[3]) const;
+    // The pixel of a world point, not asking what stands between. False outside the field, the circle and the sensor.
+    bool project(int frame, const double world[3], double px[2]) const;
 
 private:
+    struct PixelRay {
+        double dx, dy, dz, pupil;
+    };
+    struct Buffers;
+    struct Reach {
+        double behind, ahead; // metres of wall that the surface is made for, around the camera
+    };
+    static Reach lit_reach(const SceneSpec &spec);
+    bool ray(const double px[2], PixelRay &ray) const;
+    bool on_sensor(const double px[2]) const;
+    void prepare(); // what only drawing needs, at the first frame
+    void make_pixel_table();
+    void make_blur_kernel();
+    void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void shade_row(int row, Buffers &buffers) const;
+    void develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const;
+
     SceneSpec spec_;
     Tube tube_;
     Lens lens_;
-    Motion motion_;
-    std::unique_ptr<Texture> texture_;
-    struct PixelRay {
-        float theta;                           // < 0 outside the circle
-        float dx, dy, dz, oz, vignette, angle; // direction, origin, light kept, radians a pixel covers
-    };
-    std::vector<PixelRay> rays_;
-
-    void prepare(unsigned threads);
-    double shade(const Pose &pose, const PixelRay &ray) const;
+    std::vector<FrameState> frames_;
+    Reach reach_;
+    std::optional<Surface> surface_;
+    std::vector<PixelRay> rays_;         // of the lit pixels, row by row
+    std::vector<float> vignette_;        // of the same
+    std::vector<int> row_from_, row_to_; // lit pixels of a row: columns [from, to)
+    std::vector<size_t> row_offset_;     // of a row in rays_
+    std::vector<float> blur_;            // half kernel: weights of 0, 1, 2, ... pixels
+    std::unique_ptr<Buffers> buffers_;
+    std::mutex rendering_;
 };
 
 } // namespace pipefish::sim
