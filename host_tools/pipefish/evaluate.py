@@ -14,6 +14,7 @@ import numpy as np
 
 from pipefish.survey import Survey
 
+WINDOW_REACH = 16  # pixels: a point nearer to the rim than this cannot be tracked by the default window
 AGE_EDGES = [1, 6, 11, 21, 41, 81, 161, 1 << 40]  # camera frames since the anchor
 
 
@@ -27,12 +28,8 @@ class Truth(Protocol):
         """(N,3) metres in the world -> (N,2) pixels in camera frame `frame`, (N,) ok."""
 
 
-def track_errors(survey: Survey, truth: Truth) -> dict[str, np.ndarray]:
-    """Errors of all observations after each track's anchor.
-
-    Returns error (M,) pixels, age (M,) camera frames since the anchor, frame (M,) keyframe index, track (M,).
-    Observations that the truth cannot judge (anchor misses the wall) are left out.
-    """
+def anchor_points(survey: Survey, truth: Truth) -> np.ndarray:
+    """The true wall point of each track, from its first observation: (K, 3) metres, NaN where the truth has none."""
     tracks = survey.tracks()
     sequence = {k.index: k.message.frame_sequence for k in survey.keyframes}
     anchor = tracks.bounds[:-1]
@@ -42,6 +39,41 @@ def track_errors(survey: Survey, truth: Truth) -> dict[str, np.ndarray]:
         here = np.flatnonzero(anchor_frame == index)
         xyz, ok = truth.cast(sequence[int(index)], tracks.pixels[anchor[here]])
         points[here[ok]] = xyz[ok]
+    return points
+
+
+def survival(survey: Survey, truth: Truth) -> float | None:
+    """Of the tracks seen in a keyframe whose wall point can still be tracked in the next one, the share seen there.
+
+    It can be tracked if it lies WINDOW_REACH pixels inside the field. A tracker that drops whatever is difficult has few
+    errors, and a low share here. None if there is no such track."""
+    tracks = survey.tracks()
+    points = anchor_points(survey, truth)
+    kept = possible = 0
+    for first, second in pairwise(survey.keyframes):
+        if first.boot != second.boot:
+            continue
+        here = tracks.track[tracks.frame == first.index]
+        here = here[np.isfinite(points[here, 0])]
+        frame = second.message.frame_sequence
+        pixels, visible = truth.project(frame, points[here])
+        for offset in ((WINDOW_REACH, 0), (-WINDOW_REACH, 0), (0, WINDOW_REACH), (0, -WINDOW_REACH)):
+            visible &= truth.cast(frame, np.nan_to_num(pixels, nan=-1e9) + offset)[1]
+        possible += int(visible.sum())
+        kept += int(np.isin(here[visible], tracks.track[tracks.frame == second.index]).sum())
+    return kept / possible if possible else None
+
+
+def track_errors(survey: Survey, truth: Truth) -> dict[str, np.ndarray]:
+    """Errors of all observations after each track's anchor.
+
+    Returns error (M,) pixels, age (M,) camera frames since the anchor, frame (M,) keyframe index, track (M,).
+    Observations that the truth cannot judge (anchor misses the wall) are left out.
+    """
+    tracks = survey.tracks()
+    sequence = {k.index: k.message.frame_sequence for k in survey.keyframes}
+    anchor = tracks.bounds[:-1]
+    points = anchor_points(survey, truth)
     later = np.ones(len(tracks.track), dtype=bool)
     later[anchor] = False
     error = np.full(len(tracks.track), np.nan)
@@ -70,8 +102,8 @@ def percentile(error: np.ndarray, share: float) -> float | None:
 def evaluate(survey: Survey, truth: Truth) -> dict[str, Any] | None:
     """Figures of `track_errors` as plain values; None if no track was seen twice.
 
-    within_1px: share of observations; median_px, p95_px; by_age: list of age_low, age_high, count, within_1px and
-    median_px.
+    within_1px: share of observations; median_px, p95_px, p99_px, max_px; survival: see there; by_age: list of age_low,
+    age_high, count, within_1px and median_px.
     """
     result = track_errors(survey, truth)
     error, age = result["error"], result["age"]
@@ -95,5 +127,8 @@ def evaluate(survey: Survey, truth: Truth) -> dict[str, Any] | None:
         "within_1px": float(np.mean(error <= 1.0)),
         "median_px": percentile(error, 50),
         "p95_px": percentile(error, 95),
+        "p99_px": percentile(error, 99),
+        "max_px": percentile(error, 100),
+        "survival": survival(survey, truth),
         "by_age": by_age,
     }

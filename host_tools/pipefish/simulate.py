@@ -6,6 +6,7 @@ The simulator shares no code with the camera model that everything else uses: it
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import math
 import os
@@ -70,6 +71,8 @@ class Scene:
 
         Raises FormatError that names the key (and the file `source`) for one unknown or out of range.
         """
+        if not isinstance(scene, dict):
+            raise FormatError(source, None, "a scene must be an object")
         try:
             self._scene = _engine.Scene(scene)
         except ValueError as error:
@@ -223,15 +226,18 @@ def truth_of(scene: Scene) -> dict[str, Any]:
 
 
 def fitted_camera(scene: Scene) -> Any:
-    """The p9 camera closest to the scene's lens: least squares of its radius over field angle. A pipefish.Camera.
+    """The p9 camera closest to the scene's lens at the wall of its pipe: least squares of image radius over angle.
 
-    The lens's pupil shift is left out: this version's camera model is central.
+    This version's camera model is central and the lens is not, so the fit holds at one distance: wall points at the
+    pipe's radius, seen from the camera centre. `rms_px` is the residual there. A pipefish.Camera.
     """
     from pipefish.camera import Camera
 
     spec = scene.spec["lens"]
-    theta = np.linspace(0, spec["theta_max"], 1001)[1:]
-    radius = np.array([scene._scene.lens(t)[0] for t in theta])
+    ray = np.linspace(0, spec["theta_max"], 1001)[1:]
+    radius, pupil = np.array([scene._scene.lens(t) for t in ray]).T
+    wall = scene.spec["diameter"] / 2
+    theta = np.arctan2(wall, pupil + wall / np.tan(ray))  # of the wall point on that ray, from the camera centre
     powers = theta[:, None] ** np.array([1, 3, 5, 7, 9])
     coefficients = np.linalg.lstsq(powers, radius, rcond=None)[0]
     rms = float(np.sqrt(np.mean((powers @ coefficients - radius) ** 2)))
@@ -248,20 +254,21 @@ def fitted_camera(scene: Scene) -> Any:
         k3=k3,
         k4=k4,
         k5=k5,
-        theta_max=spec["theta_max"],
+        theta_max=float(theta[-1]),
         circle_u=spec["c_u"],
         circle_v=spec["c_v"],
         circle_radius=scene.circle_radius,
         name="simulated fisheye",
         source="simulated",
         rms_px=rms,
-        theta_covered=spec["theta_max"],
+        theta_covered=float(theta[-1]),
     )
 
 
 def scene_key(name: str) -> dict[str, Any]:
-    """What a recording of this preset depends on, besides the software's version."""
-    return Scene.load(name).spec
+    """What a recording of this preset depends on: the scene, and the very engine that draws it."""
+    engine = hashlib.sha256(Path(_engine.__file__).read_bytes()).hexdigest()
+    return {"scene": Scene.load(name).spec, "engine": engine}
 
 
 def simulate(

@@ -109,7 +109,7 @@ int main(void)
         tracked += pf_tracker_last_stats(tracker)->tracked;
     }
     report("track.pyramid", time_ms[PF_STAGE_PYRAMID]);
-    report("track.klt", time_ms[PF_STAGE_TRACK]);
+    report("track.klt_light", time_ms[PF_STAGE_TRACK]);
     report("track.detect", time_ms[PF_STAGE_DETECT]);
     report("track.frame", time_ms[PF_STAGES]);
     printf("{\"name\": \"track.tracked_per_frame\", \"value\": %.1f, \"unit\": \"tracks\"}\n",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from pipefish.evaluate import evaluate, track_errors
+from pipefish.evaluate import evaluate, survival, track_errors
 from pipefish.survey import Survey
 from synthetic import write_survey
 
@@ -54,3 +55,26 @@ def opened_again(tmp_path) -> Survey:
 def test_a_track_that_cannot_be_there_is_wrong(tmp_path):
     result = evaluate(opened(tmp_path), Flat(blind_after=0))
     assert result["within_1px"] == 0.0
+
+
+class Rim(Flat):
+    """The same world with a rim: the field ends `reach` pixels from (80, 60)."""
+
+    def __init__(self, reach: float) -> None:
+        super().__init__()
+        self.reach = reach
+
+    def cast(self, frame, pixels):
+        points, _ = super().cast(frame, pixels)
+        return points, np.linalg.norm(pixels - [80, 60], axis=1) < self.reach
+
+
+def test_survival_counts_only_tracks_that_could_go_on(tmp_path):
+    survey = opened(tmp_path)
+    tracks = survey.tracks()
+    gone = len(tracks.id) - np.sum(
+        tracks.frame == tracks.frame.max()
+    )  # a track each that a keyframe has and the next not
+    pairs = 11 * 40  # 12 keyframes of 40 tracks
+    assert survival(survey, Flat()) == pytest.approx(1 - gone / pairs)
+    assert survival(survey, Rim(1)) is None  # everything leaves the field: nobody is to blame

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipefish.camera import Camera
 from pipefish.errors import FormatError, PipefishError
 from pipefish.simulate import PRESETS, Scene, quaternion, simulate
 
@@ -308,6 +309,28 @@ def test_a_bad_scene_file_is_refused_with_file_and_place(tmp_path: Path) -> None
     assert [p.name for p in tmp_path.iterdir()] == ["scene.json"]
 
 
+def test_a_scene_that_is_no_object_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "scene.json"
+    file.write_text("[]")
+    with pytest.raises(FormatError, match=r"scene\.json: a scene must be an object"):
+        Scene.load(file)
+
+
 def test_every_preset_is_a_valid_scene() -> None:
     for name in PRESETS:
         assert Scene.load(name).frames > 0
+
+
+def test_the_fitted_profile_sees_the_wall_where_the_lens_does(tmp_path: Path) -> None:
+    simulate("straight", tmp_path / "s", frames=1, quiet=True)
+    scene, camera = Scene.from_truth(tmp_path / "s.truth.json"), Camera.load(tmp_path / "s.profile.json")
+    points, ok = scene.cast(0, pixels_in_circle(scene, 2000, 1))
+    pose = scene.pose(0)
+    pixels, seen = camera.project(points[ok] @ pose[:, :3].T + pose[:, 3])
+    truth, _ = scene.project(0, points[ok])
+    error = np.linalg.norm(pixels - truth, axis=1)[seen]
+    assert seen.mean() > 0.99
+    # The camera rides 12 mm under the axis, so walls are 138 to 162 mm away, not 150: a pupil shift of 2.7 mm at the
+    # rim is off by 2.7 x 12 / 150 / 150 rad there, 0.34 px at 235 px a radian.
+    assert np.median(error) < 0.1
+    assert error.max() < 0.6
