@@ -45,7 +45,7 @@ def anchor_points(survey: Survey, truth: Truth) -> np.ndarray:
 def survival(survey: Survey, truth: Truth) -> float | None:
     """Of the tracks seen in a keyframe whose wall point can still be tracked in the next one, the share seen there.
 
-    It can be tracked if it lies WINDOW_REACH pixels inside the field. A tracker that drops whatever is difficult has few
+    It can be tracked if it lies WINDOW_REACH pixels inside the field. A tracker that drops whatever is hard has few
     errors, and a low share here. None if there is no such track."""
     tracks = survey.tracks()
     points = anchor_points(survey, truth)
