@@ -38,5 +38,5 @@ def test_a_folder_of_real_images_becomes_a_survey(real_data, tmp_path: Path, nam
         np.linalg.norm(np.ptp(tracks.pixels[a:b], axis=0)) for a, b in itertools.pairwise(tracks.bounds) if b - a >= 4
     ]
     assert len(moved) >= 30
-    # Seen: medians of 0.17 and 0.33 px; the rest is people at the camera's stand, and a few tracks that follow the board.
+    # Seen: medians of 0.17 and 0.33 px; the rest is people near the camera, and a few tracks on the board.
     assert np.mean(np.array(moved) < 2.0) > 0.9
