@@ -73,6 +73,7 @@ template <typename F> void fields(F &f, LensSpec &l)
     f("theta_max", l.theta_max, 0.1, 3);
     f("circle_radius", l.circle_radius, 10, 10000);
     f("pupil_scale", l.pupil_scale, 0, 10);
+    f("zonal_px", l.zonal_px, 0, 2);
     f("vignetting", l.vignetting, 0, 1);
     f("table", l.table);
 }

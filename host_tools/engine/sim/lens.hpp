@@ -20,6 +20,7 @@ struct LensSpec {
     double theta_max = 1.6144;       // radians: the field's edge, 92.5 degrees
     double circle_radius = 395.0;    // pixels, at theta_max
     double pupil_scale = 1.0;        // size of the traced lens; 0 = a central camera
+    double zonal_px = 0.1;           // height of the zonal error of the image radius near the rim, pixels
     double vignetting = 0.25;        // share of the light lost at the edge, grows with theta^4
     std::vector<LensNode> table;     // if not empty: the lens, instead of the traced one
 };

@@ -27,7 +27,14 @@ int texels_around(const Lens &lens)
 LensTable lens_table(const LensSpec &spec)
 {
     if (spec.table.empty()) {
-        return trace_fisheye(spec.theta_max, spec.circle_radius, spec.pupil_scale);
+        LensTable table = trace_fisheye(spec.theta_max, spec.circle_radius, spec.pupil_scale);
+        // Zones left by the polishing of the front lens: three and a half waves between axis and rim, growing outwards,
+        // which no polynomial of degree 9 follows.
+        for (size_t i = 0; i < table.theta.size(); i++) {
+            const double share = table.theta[i] / spec.theta_max;
+            table.radius[i] += spec.zonal_px * share * share * std::sin(7.0 * std::numbers::pi * share);
+        }
+        return table;
     }
     LensTable table;
     for (const LensNode &node : spec.table) {
