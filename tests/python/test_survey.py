@@ -84,6 +84,31 @@ def test_tracks_are_sorted_and_distinct_over_boots(tmp_path):
     assert survey.info["boots"] == 2
 
 
+def test_chainage_goes_on_over_a_restart_with_the_scale_of_each_boot(tmp_path):
+    """The second boot counts from zero, twice as finely; its first keyframe has no count yet."""
+
+    def counted(index: int, count: int | None, **options):
+        message = pb.Keyframe.FromString(keyframe(index, **options)[2])
+        message.telemetry.Clear()
+        if count is not None:
+            message.telemetry.encoder_count = count
+        return as_object(2, message)
+
+    second = pb.SurveyStart.FromString(start(boot=BOOT + 1)[2])
+    second.encoder.metres_per_count = 0.0005
+    options = dict(boot=BOOT + 1, first=3)
+    objects = [
+        *(start(), counted(0, 1000), counted(1, 1200), counted(2, 1500)),
+        *(as_object(1, second), counted(3, None, **options), counted(4, 10, **options), counted(5, 210, **options)),
+        end(6, boot=BOOT + 1),
+    ]
+    write_survey(tmp_path / "a.mcap", objects=objects)
+    survey = Survey.open(tmp_path / "a.mcap")
+    np.testing.assert_allclose(survey.chainage(), [0, 0.2, 0.5, np.nan, 0.5, 0.6])
+    assert [(b["index"], b["restart"]) for b in survey.breaks] == [(3, True)]
+    assert survey.info["length_m"] == pytest.approx(0.6)
+
+
 def cut_points(data: bytes) -> list[int]:
     """Every byte of the last object, and a spread of the rest."""
     return sorted({*range(0, len(data), 997), *range(len(data) - 2000, len(data), 13), *range(12)})
