@@ -45,6 +45,9 @@ def test_a_short_demo_runs_through_the_whole_chain(folder):
     assert summary["keyframes_sent"] == summary["keyframes_received"] > 1
     assert summary["within_1px"] >= 0.95
     assert page.stat().st_size < 15 << 20
+    text = page.read_text()
+    assert all(f">{label}<" in text for label in ("tracking time", "transfer time"))
+    assert ">goodput of the line over the transfer<" in text and "while surveying" not in text
     assert Survey.open(folder / "survey.mcap").complete
 
 
