@@ -345,7 +345,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("scene", metavar="SCENE", help="demo, straight, tiny, or a JSON file (docs/simulator.md)")
     p.add_argument("-o", "--output", required=True, metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
     p.add_argument("--frames", type=positive, help="stop after so many frames")
-    p.add_argument("--seed", type=int, help="of texture and noise [the scene's]")
+    p.add_argument("--seed", type=int, help="of texture, noise and motion [the scene's]")
 
     p = add_command(
         commands,
