@@ -345,7 +345,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("scene", metavar="SCENE", help="demo, straight, tiny, or a JSON file (docs/simulator.md)")
     p.add_argument("-o", "--output", required=True, metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
     p.add_argument("--frames", type=positive, help="stop after so many frames")
-    p.add_argument("--seed", type=int, help="of texture and noise [the scene's]")
+    p.add_argument("--seed", type=int, help="of texture, noise and motion [the scene's]")
 
     p = add_command(
         commands,
@@ -358,13 +358,13 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument(
         "-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete"
     )
-    p.add_argument("--overwrite", action="store_true", help="start anew even if FILE or FILE.partial is there")
+    p.add_argument("--overwrite", action="store_true", help="start anew; FILE stays until the new survey is complete")
     p.add_argument(
         "--timeout",
         type=not_negative,
         default=30.0,
         metavar="S",
-        help="give up after S seconds without a device [30]; 0: never",
+        help="give up after S seconds without a device [30]; 0: wait for ever",
     )
 
     p = add_command(commands, "info", run_info, "Tell what is in a survey file.", "pipefish info survey.mcap")
@@ -385,7 +385,9 @@ def build_parser() -> argparse.ArgumentParser:
         commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"
     )
     add_device(p)
-    p.add_argument("--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]")
+    p.add_argument(
+        "--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]; 0: wait for ever"
+    )
 
     add_profile(commands)
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import select
 import time
@@ -87,6 +88,8 @@ class Client:
         self.reconnections = 0
         self.replies: dict[int, pb.Reply] = {}
         self._open = False
+        self._was_open = False
+        self._open_error = ""  # why the line could not be opened, "" while it is open
         self._backlog = b""  # bytes of the link that the line has not taken
         # Objects whose answer is due: slot, name, kind, bytes. The link asks once, whatever happens to the line.
         self._pending: list[tuple[int, bytes, int, bytes]] = []
@@ -97,9 +100,15 @@ class Client:
         self.down_since_ns = time.monotonic_ns()
 
     def open(self) -> None:
-        """Opens the line. Raises TransportClosed if that fails the first time: a wrong name should say so at once."""
-        self.transport.open()
-        self._open = True
+        """Opens the line. Raises TransportClosed if that fails now; `run` and `step` then try again."""
+        try:
+            self.transport.open()
+        except TransportClosed as error:
+            self._open_error = str(error)
+            raise
+        if self._was_open:
+            self.reconnections += 1
+        self._open, self._was_open, self._open_error = True, True, ""
 
     def close(self) -> None:
         """Closes the line."""
@@ -121,7 +130,8 @@ class Client:
             self.step(IDLE_S)
             silent_s = (time.monotonic_ns() - self.down_since_ns) / 1e9
             if not self.up and timeout_s and silent_s > timeout_s:
-                raise NoDevice(f"no device answers on {self.transport.name} (waited {timeout_s:g} s)")
+                why = f": {self._open_error}" if self._open_error else ""
+                raise NoDevice(f"no device answers on {self.transport.name} (waited {timeout_s:g} s){why}")
 
     def step(self, most_s: float) -> None:
         """One turn: waits for bytes or a deadline, at most `most_s` seconds, and serves what happened."""
@@ -225,10 +235,12 @@ class Client:
         return request.id
 
     def answer_to(self, timeout_s: float, **what: Any) -> pb.Reply:
-        """Sends a request, serves the link until its reply. Raises PipefishError: no answer, or the device's text."""
+        """Sends a request, serves the link until its reply (timeout_s = 0: waits for ever).
+
+        Raises PipefishError: no answer, or the device's text."""
         self.run(lambda: self.up, timeout_s)
         wanted = self.ask(**what)
-        end = time.monotonic() + timeout_s
+        end = time.monotonic() + (timeout_s or math.inf)
         self.run(lambda: wanted in self.replies or time.monotonic() > end, timeout_s)
         if wanted not in self.replies:
             raise NoDevice(f"the device on {self.transport.name} did not reply within {timeout_s:g} s")
@@ -260,9 +272,7 @@ class Client:
             time.sleep(min(pause_s, most_s))
             return
         try:
-            self.transport.open()
-            self._open = True
-            self.reconnections += 1
+            self.open()
         except TransportClosed:
             self._retry_ns = time.monotonic_ns() + int(self._backoff_s * 1e9)
             self._backoff_s = min(2 * self._backoff_s, BACKOFF_S[1])

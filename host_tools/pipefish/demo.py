@@ -114,7 +114,7 @@ def last_lines(log: Path) -> str:
 
 
 def config_text(recording: Recording, profile: Path, run: Path) -> str:
-    """pipefishd's configuration for the demo: as fast as the link takes it, nothing dropped."""
+    """pipefishd's configuration for the demo: frames as fast as they are tracked, not in real time; none is dropped."""
     truth = json.loads(recording.truth.read_text())
     sections: dict[str, dict[str, Any]] = {
         "survey": {"name": "demo pipe", "nominal_diameter_mm": round(truth["scene"]["diameter"] * 1000)},
@@ -195,12 +195,17 @@ def link_goodput(bench: Path | None, quiet: bool) -> dict[str, float]:
 def link_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """The page's table about the link."""
     link, cable = summary["received"]["link"], summary["received"]["cable"]
-    goodput = link["goodput_bytes_per_s"] or 0
+    goodput, fps = link["goodput_bytes_per_s"] or 0, summary["fps"]
     share = f" ({100 * goodput / (BAUD / 10):.0f} % of the line)" if goodput else ""
     rows = [
         ("line", f"emulated serial cable, {BAUD / 1e6:g} Mbaud"),
-        ("objects delivered", f"{link['objects']}, {link['bytes'] / 1e6:.2f} MB in {link['duration_s']:.1f} s"),
-        ("goodput while surveying", f"{goodput / 1000:.1f} kB/s{share}"),
+        ("objects delivered", f"{link['objects']}, {link['bytes'] / 1e6:.2f} MB"),
+        *([("tracking time", f"{summary['frames'] / fps:.1f} s, {fps:.1f} frames per second")] if fps else []),
+        (
+            "transfer time",
+            f"{link['duration_s']:.1f} s from the first object to the last",
+        ),
+        ("goodput of the line over the transfer", f"{goodput / 1000:.1f} kB/s{share}"),
         ("fragments sent again", f"{link['fragments_resent']} of {link['fragments_received']}"),
         ("damaged frames", f"{link['crc_errors_host']} at the host, {link['crc_errors_device']} at the device"),
         ("round trip", f"{link['rtt_ms']:.1f} ms"),
@@ -279,6 +284,9 @@ def figures(summary: dict[str, Any]) -> str:
     def percent(name: str) -> str | None:
         return f"{100 * summary[name]:.2f} %" if summary.get(name) is not None else None
 
+    def camera_frames(name: str) -> str | None:
+        return f"{summary[name]:.0f} camera frames" if summary.get(name) is not None else None
+
     return table(
         [
             ("frames", summary["frames"]),
@@ -287,8 +295,8 @@ def figures(summary: dict[str, Any]) -> str:
             ("keyframes received", summary["keyframes_received"]),
             ("bytes", f"{summary['bytes']} ({size_text(summary['bytes'])})"),
             ("CRC errors", summary["crc_errors"]),
-            ("track length, median", f"{summary['track_length_median']:.0f} camera frames"),
-            ("track length, 90th percentile", f"{summary['track_length_p90']:.0f} camera frames"),
+            ("track length, median", camera_frames("track_length_median")),
+            ("track length, 90th percentile", camera_frames("track_length_p90")),
             ("tracked points within 1 px of the truth", percent("within_1px")),
             ("link goodput, clean", percent("link_goodput_clean")),
             ("link goodput, 1 % of frames lost", percent("link_goodput_1pct")),

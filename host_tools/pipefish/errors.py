@@ -37,3 +37,10 @@ class ProfileError(FormatError):
     def key(self) -> str | int | None:
         """The entry at fault; the same as position."""
         return self.position
+
+
+def file_error(error: Exception, path: str | os.PathLike[str]) -> Exception:
+    """An OSError as one about the file that the user knows; any other exception as it is."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return OSError(error.errno, error.strerror, os.fspath(path))
+    return error

@@ -94,7 +94,10 @@ class Page:
             }
         ]
         live = [len(k.observations.id) for k in self.survey.keyframes]
-        common = [k.message.common_tracks or np.nan for k in self.survey.keyframes]
+        unbroken = [i > 0 and not k.after_break for i, k in enumerate(self.survey.keyframes)]  # else: none before
+        common = [
+            k.message.common_tracks if u else np.nan for k, u in zip(self.survey.keyframes, unbroken, strict=True)
+        ]
         charts.append(
             {
                 "id": "live",
@@ -266,7 +269,7 @@ class Page:
             )
         goodput = self.extra.get("goodput_bytes_per_s")
         if goodput:
-            tiles.append((f"{goodput / 1000:.0f}", "kB/s", "keyframes delivered"))
+            tiles.append((f"{goodput / 1000:.0f}", "kB/s", "over the line during the transfer"))
         return tiles
 
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable
@@ -9,15 +10,28 @@ from pathlib import Path
 from typing import Any
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.client import ACCEPT, AGAIN, REFUSE, STORED, Client, Handlers, NoDevice
+from pipefish.client import ACCEPT, AGAIN, STORED, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.progress import Progress
-from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, BootClock, SurveyStore
+from pipefish.surveystore import SurveyStore
+from pipefish.surveywrite import (
+    OBJECT_END,
+    OBJECT_KEYFRAME,
+    OBJECT_START,
+    BootClock,
+    Content,
+    partial_of,
+    read_content,
+)
 from pipefish.transport import Transport, TransportClosed
 
 FIRST_ANSWERS_S = 2.0  # the first object waits this long for the device's clock and the name of its survey
 LINGER_S = 3.0  # most time after the end for the device to take in the last acknowledgement
 SURVEY_KINDS = (OBJECT_START, OBJECT_KEYFRAME, OBJECT_END)
+
+
+ASK_AGAIN_S = 0.5  # pause between the questions whether anything is left
+MISSING_NAMED = 10  # indices in a message
 
 
 class Interrupted(PipefishError):
@@ -31,7 +45,6 @@ class Receiver(Handlers):
         self.store = store
         self.client = Client(transport, self, wants_objects=True, link=link)
         self.status: pb.Status | None = None
-        self.refused = 0
         self.again = 0
         self.received = 0
         self.received_bytes = 0
@@ -43,6 +56,7 @@ class Receiver(Handlers):
         self._last_object: float | None = None
         self._clock_told = False
         self._quiet = quiet
+        self._asked_rest: tuple[int | None, int, float] = (None, 0, 0.0)  # request, objects received then, when
 
     # ---- handlers
 
@@ -54,8 +68,11 @@ class Receiver(Handlers):
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int:
         if kind not in SURVEY_KINDS:
-            self.refused += 1
-            return REFUSE
+            # A refusal would make the device delete it.
+            raise PipefishError(
+                f"the device offers an object of kind {kind}, which this version of pipefish does not know; it stays "
+                "on the device, update pipefish"
+            )
         return STORED if self.store.has(name) else ACCEPT
 
     def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
@@ -66,7 +83,7 @@ class Receiver(Handlers):
         if waited < FIRST_ANSWERS_S and (self.client.clock is None or self._info_id is not None):
             return None
         stored = self.store.store(name, kind, data, self._clocks, time.time_ns())
-        if stored is None:
+        if not stored:
             self.again += 1
             return AGAIN
         now = time.monotonic()
@@ -127,11 +144,55 @@ class Receiver(Handlers):
                 self._learn()
                 completed, total = self._progress()
                 bar.update(completed, self._note(start), total)
-                return self.complete or stop()
+                if self.complete or stop():
+                    return True
+                self._check_rest()
+                return False
 
             self.client.run(done, timeout_s)
         if self.complete:
             self._linger()
+
+    def _check_rest(self) -> None:
+        """Raises PipefishError if the device has nothing more to send and yet the survey is not all here.
+
+        Asks for the device's counters where that may be so; the reply is newer than all that has been received."""
+        asked, received, when = self._asked_rest
+        reply = self.client.replies.pop(asked, None) if asked is not None else None
+        if reply is not None and reply.HasField("status"):
+            self._asked_rest = (None, 0, when)
+            state, waiting = reply.status.state, reply.status.spool.objects
+            if waiting == 0 and received == self.received and (state == "idle" or self._has_end()):
+                raise PipefishError(self._rest_text())
+        elif self.client.up and time.monotonic() - when > ASK_AGAIN_S and self._may_be_over():
+            self._asked_rest = (self._ask(get_status=pb.Nothing()), self.received, time.monotonic())
+
+    def _has_end(self) -> bool:
+        writer = self.store.writers.get(self.store.primary or b"")
+        return writer is not None and writer.content.end is not None
+
+    def _may_be_over(self) -> bool:
+        return self._has_end() or (self.status is not None and self.status.state == "idle")
+
+    def _rest_text(self) -> str:
+        """What is missing of the survey, and which other file has a part of it."""
+        primary = self.store.primary or b""
+        writer = self.store.writers.get(primary)
+        have = writer.content if writer is not None else Content()
+        missing = [what for what, part in (("its start", have.start), ("its end", have.end)) if part is None]
+        if have.missing:
+            some = ", ".join(map(str, have.missing[:MISSING_NAMED])) + (", ..." * (len(have.missing) > MISSING_NAMED))
+            missing.append(f"{len(have.missing)} keyframes ({some})")
+        if writer is None:
+            file = partial_of(self.store.path)
+            text = "the device has nothing to send: its last survey has been received before"
+        else:
+            file, what = writer.partial, ", ".join(missing)
+            text = f"the device has nothing more to send, but the survey in {file} is not complete: {what} missing"
+        others = [str(p) for p in sorted(file.parent.glob("*.partial")) if p != file and _is_of(p, primary)]
+        if others:
+            text += f"; {' and '.join(others)} of an earlier reception of this survey may hold that"
+        return text
 
     def _linger(self) -> None:
         """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure."""
@@ -175,12 +236,18 @@ class Receiver(Handlers):
             "fragments_duplicate": stats["fragments_duplicate"],
             "fragments_resent": device.fragments_resent if self.status else None,
             "damaged_objects": self.again,
-            "refused_objects": self.refused,
             "sessions": stats["sessions"],
             "reconnections": self.client.reconnections,
             "rtt_ms": stats["rtt_us"] / 1000,
             "line": self.client.transport.name,
         }
+
+
+def _is_of(partial: Path, survey_id: bytes) -> bool:
+    try:
+        return read_content(partial).survey_id == survey_id
+    except (OSError, PipefishError):
+        return False
 
 
 def receive(
@@ -195,7 +262,7 @@ def receive(
 ) -> dict[str, Any]:
     """Receives one survey into `path` (docs/survey.md). Returns the summary: figures of the link and of each file.
 
-    timeout_s  give up when no device answers for so long; 0 = never
+    timeout_s  give up when no device answers for so long; 0 = wait for ever
     stop       asked several times a second; True ends the reception early
     Raises PipefishError (also when stopped early: Interrupted), OSError. What has arrived stays in `<path>.partial`.
     """
@@ -208,6 +275,8 @@ def receive(
             try:
                 receiver.client.open()
             except TransportClosed as error:  # it may be about to start, or about to be plugged in
+                if error.is_forbidden:
+                    raise
                 if not quiet:
                     print(f"{error}; waiting for it", file=sys.stderr, flush=True)
             receiver.run(timeout_s, stop)
@@ -215,29 +284,43 @@ def receive(
         why = "interrupted"
     except NoDevice as error:
         why = str(error)
-    finally:
+    except BaseException:
         receiver.client.close()
-        summary = receiver.summary()
-        keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
-        lost = {w.path: len(w.content.end.lost_index) if w.content.end else 0 for w in store.writers.values()}
-        damaged = [str(w.damaged) for w in store.writers.values() if w.damaged]
+        with contextlib.suppress(OSError, PipefishError):  # the first error is the one to tell
+            store.finish_complete({})
+        store.close()
+        raise
+    receiver.client.close()
+    summary = receiver.summary()
+    keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
+    lost = {w.path: len(w.content.end.lost_index) if w.content.end else 0 for w in store.writers.values()}
+    damaged = [str(w.damaged) for w in store.writers.values() if w.damaged]
+    try:
         finished = store.finish_complete({key: str(value) for key, value in summary.items()})
+    finally:
         partial = store.close()
-    if path not in finished:
-        raise Interrupted(f"{why}: {_resume_text(partial, sum(keyframes.values()))}")
+    file = store.finished.get(store.primary or b"")
+    if file is None:
+        raise Interrupted(f"{why}: {_resume_text(finished, partial, keyframes)}")
+    if file not in keyframes:  # it was complete before, under another name
+        content = read_content(file)
+        keyframes[file], lost[file] = len(content.indices), len(content.end.lost_index) if content.end else 0
     return {
-        "file": str(path),
-        "keyframes": keyframes[path],
-        "lost": lost[path],
+        "file": str(file),
+        "keyframes": keyframes[file],
+        "lost": lost[file],
         "recovered_objects": recovered,
         "damaged_copies": damaged,
-        "other_surveys": [{"file": str(f), "keyframes": keyframes[f]} for f in finished if f != path],
+        "other_surveys": [{"file": str(f), "keyframes": keyframes[f]} for f in finished if f != file],
         "incomplete_surveys": [str(p) for p in partial],
         "link": summary,
     }
 
 
-def _resume_text(partial: list[Path], keyframes: int) -> str:
-    if not partial:
-        return "nothing has arrived yet"
-    return f"{keyframes} keyframes are safe in {partial[0]}; the same command goes on from there"
+def _resume_text(finished: list[Path], partial: list[Path], keyframes: dict[Path, int]) -> str:
+    """What is in which file after an interruption."""
+    count = {partial_of(path): number for path, number in keyframes.items()}
+    done = [f"{keyframes[p]} keyframes of an earlier survey are complete in {p}" for p in finished]
+    safe = [f"{count[p]} keyframes are safe in {p}" for p in partial]
+    again = "the same command goes on from there" if safe else "the same command waits for the rest"
+    return "; ".join([*done, *safe, again]) if done or safe else "nothing has arrived yet"

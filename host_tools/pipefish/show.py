@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pipefish.colours import AGE_MAX, age_colours, age_position, scale_colours
-from pipefish.errors import PipefishError
+from pipefish.errors import PipefishError, file_error
 from pipefish.progress import track as progress_over
 from pipefish.survey import Keyframe, Survey, Tracks
 
@@ -161,11 +162,10 @@ def animation(
     legend: bool = True,
     quiet: bool = True,
 ) -> bytes:
-    """The keyframes one after the other, tracks drawn, at most `frames` of them and `limit` bytes."""
+    """The keyframes one after the other, tracks drawn: at most `frames`, spread evenly over all, and `limit` bytes."""
     count = len(painter.survey.keyframes)
-    step = max(1, count // frames)
     style = Style(width, legend, line=1.1, dot=1.6)
-    positions = list(range(0, count, step))[:frames]
+    positions = spread(count, frames)
     pictures = [painter.draw(p, style) for p in progress_over(positions, "drawing", len(positions), quiet)]
     quality = 60
     while True:
@@ -182,13 +182,16 @@ def animation(
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file that is there as a whole or not at all."""
+    """Writes a file that is there as a whole or not at all. Raises OSError that names `path`."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_bytes(data)
         os.replace(temporary, path)
+    except OSError as error:
+        raise file_error(error, path) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the folder may be no folder
+            temporary.unlink(missing_ok=True)
 
 
 def show(survey: Survey, out: Path, keyframe: int | None = None, quiet: bool = False) -> dict[str, object]:

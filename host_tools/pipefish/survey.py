@@ -326,13 +326,25 @@ class Survey:
         return result
 
     def chainage(self) -> np.ndarray:
-        """(K,) metres travelled at each keyframe by the encoder, from the first; NaN where there is no count."""
-        per_count = self.start.encoder.metres_per_count if self.start else 0.0
-        counts = np.array([np.nan if k.encoder_count is None else k.encoder_count for k in self.keyframes], dtype=float)
-        if not per_count or not len(counts):
-            return np.full(len(counts), np.nan)
-        valid = counts[~np.isnan(counts)]
-        return (counts - valid[0]) * per_count if len(valid) else counts
+        """(K,) metres travelled at each keyframe by the encoder, from the first; NaN where there is no count.
+
+        Counts start anew with each boot of the device, and each boot has its own scale. The first counted keyframe of a
+        later boot stands where the last one before it stood: what was driven in between nobody counted. Those places
+        are the `breaks` with restart = True."""
+        scales = {s.time.boot_id: s.encoder.metres_per_count for s in self.starts}
+        scale = self.start.encoder.metres_per_count if self.start else 0.0
+        chainage = np.full(len(self.keyframes), np.nan)
+        boot, zero, base, reached = None, None, 0.0, 0.0
+        for i, frame in enumerate(self.keyframes):
+            if frame.boot != boot:
+                boot, zero = frame.boot, None
+                scale = scales.get(boot, scale)  # not received yet: most likely that of the boot before
+            if frame.encoder_count is None or not scale:
+                continue
+            if zero is None:
+                zero, base = frame.encoder_count, reached
+            reached = chainage[i] = base + (frame.encoder_count - zero) * scale
+        return chainage
 
     def tracks(self) -> Tracks:
         """All observations of all keyframes."""

@@ -6,7 +6,8 @@ whatever the moment of a power cut: a chunk carries its length and checksum.
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
+import fcntl
 import os
 import time
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from mcap.writer import CompressionType, Writer
 from pipefish import __version__
 from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
-from pipefish.errors import FormatError, PipefishError
+from pipefish.errors import FormatError, PipefishError, file_error
 from pipefish.mcapscan import McapScan
 from pipefish.survey import UNKNOWN_ERROR_NS, Observations
 
@@ -69,6 +70,41 @@ def fsync_folder(path: Path) -> None:
         os.close(handle)
 
 
+class BusyError(PipefishError):
+    """Another process is writing the file."""
+
+
+def locked(path: Path, create: bool = False) -> IO[bytes]:
+    """Opens a file that is being received, locked against another `pipefish receive`; closing it unlocks.
+
+    create  the file must not exist yet
+    Raises BusyError when another process writes it; OSError.
+    """
+    while True:
+        try:
+            file: IO[bytes] = open(path, "xb" if create else "r+b")  # noqa: SIM115 - lives as long as its writer
+        except FileExistsError:
+            raise BusyError(f"another pipefish receive is writing {path}") from None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            if isinstance(error, BlockingIOError):
+                raise BusyError(f"another pipefish receive is writing {path}") from None
+            raise OSError(error.errno, f"cannot be locked: {error.strerror}", str(path)) from error
+        if create or is_at(file, path):
+            return file
+        file.close()  # recovered by another process between our open and our lock: take what is there now
+
+
+def is_at(file: IO[bytes], path: Path) -> bool:
+    """Whether `path` still names this open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
 def annotations(observations: Observations, timestamp_ns: int) -> ImageAnnotations:
     """The tracks of one keyframe as points coloured by age, for Foxglove's image panel."""
     message = ImageAnnotations()
@@ -106,9 +142,14 @@ class Content:
     @property
     def complete(self) -> bool:
         """Whether nothing more is to come: start, end, and every keyframe that the device did not lose."""
-        if self.start is None or self.end is None:
-            return False
-        return set(range(self.end.keyframes)) <= self.indices | set(self.end.lost_index)
+        return self.start is not None and self.end is not None and not self.missing
+
+    @property
+    def missing(self) -> list[int]:
+        """Keyframes that the device made and did not lose, and that are not here; [] before the survey's end."""
+        if self.end is None:
+            return []
+        return sorted(set(range(self.end.keyframes)) - self.indices - set(self.end.lost_index))
 
     def note(self, topic: str, data: bytes) -> None:
         """Takes in one message of the file. Raises DecodeError."""
@@ -139,23 +180,52 @@ class SurveyWriter:
     `path` is the final name; the file is `<path>.partial` until `finish`. An existing partial file is recovered: every
     whole object is kept, a torn tail dropped. `recovered` then counts the objects found, and `damaged` names the copy
     of the old file that is kept when it was damaged elsewhere than at its end.
+
+    The partial file is locked from here to `finish` or `close`: two receptions cannot write one file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        """`overwrite`: begin anew in place of an old partial file, and let `finish` replace an old survey.
+
+        Raises PipefishError when another process writes the file, or `path` is a finished survey; OSError."""
         self.path = path
-        self.partial = path.with_name(path.name + ".partial")
+        self.partial = partial_of(path)
         self.content = Content()
         self.recovered = 0
         self.damaged: Path | None = None
-        if self.partial.exists():
-            self._recover()
-        else:
+        self._overwrite = overwrite
+        self._failed = False
+        self._refuse_finished()
+        if not self.partial.exists():
             self._create(self.partial)
             self._sync()
             fsync_folder(self.partial)
+            return
+        with locked(self.partial):
+            fresh = self.partial.with_name(self.partial.name + ".recover")
+            fresh.unlink(missing_ok=True)  # of a recovery that was interrupted; the lock makes it ours
+            self._create(fresh)
+            try:
+                if overwrite:
+                    self._sync()
+                else:
+                    self._recover()
+                os.replace(fresh, self.partial)
+            except BaseException as error:
+                self._failed = True
+                self.close()
+                fresh.unlink(missing_ok=True)
+                if isinstance(error, OSError):
+                    raise file_error(error, self.partial) from error
+                raise
+            fsync_folder(self.partial)
+
+    def _refuse_finished(self) -> None:
+        if not self._overwrite and self.path.exists():
+            raise PipefishError(f"{self.path} exists already; choose another name or pass --overwrite")
 
     def _create(self, path: Path) -> None:
-        self._file: IO[bytes] = open(path, "wb")  # noqa: SIM115 - lives as long as the writer
+        self._file = locked(path, create=True)
         # No compression: JPEG does not shrink. The chunk size only bounds what `flush` has not yet closed.
         self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.NONE)
         self._writer.start(profile="", library=f"pipefish {__version__}")
@@ -170,21 +240,12 @@ class SurveyWriter:
         os.fsync(self._file.fileno())
 
     def _recover(self) -> None:
-        """Copies the whole chunks of the old partial file into a new one that takes its place."""
-        fresh = self.partial.with_name(self.partial.name + ".recover")
-        self._create(fresh)
-        try:
-            scan = self._copy_whole_objects()
-        except BaseException:
-            self._file.close()
-            fresh.unlink()
-            raise
+        """Copies the whole chunks of the old partial file into the new one, which is about to take its place."""
+        scan = self._copy_whole_objects()
         if any(not damage.tail for damage in scan.damage):
             self.damaged = self.partial.with_name(self.partial.name + ".damaged")
             self.damaged.unlink(missing_ok=True)
             os.link(self.partial, self.damaged)
-        os.replace(fresh, self.partial)
-        fsync_folder(self.partial)
         self.recovered = len(self.content.names)
 
     def _copy_whole_objects(self) -> McapScan:
@@ -234,6 +295,7 @@ class SurveyWriter:
         message   the parsed SurveyStart, Keyframe or SurveyEnd; its own survey id has been looked at by the caller
         size      bytes of the object on the wire
         measured  clock of the boot that the message is from, if the link has measured it
+        Raises PipefishError, with the file and the reason, if it cannot be written: the object stays on the device.
         """
         time_of = message.time
         clock = self.clock(time_of.boot_id, measured, time_of.monotonic_ns, now_unix_ns)
@@ -250,9 +312,26 @@ class SurveyWriter:
         receipt.clock.error_ns = clock.error_ns
         receipt_data = receipt.SerializeToString()
         self._add("/receipt", log_time, now_unix_ns, len(self.content.names), receipt_data)
-        self._sync()
+        try:
+            self._sync()
+        except OSError as error:
+            self._failed = True
+            raise PipefishError(
+                f"{self.partial}: {error.strerror}; {len(self.content.indices)} keyframes are safe in it, what is not "
+                "stays on the device; the same command goes on from there"
+            ) from error
+        self._check_place()
         self.content.note(topic, data)
         self.content.note("/receipt", receipt_data)
+
+    def _check_place(self) -> None:
+        """Raises PipefishError if the file that we write is no longer the one of that name."""
+        if not is_at(self._file, self.partial):
+            self._failed = True
+            raise PipefishError(
+                f"{self.partial} was removed or replaced by another program while it was written; what it held is "
+                "no longer on the device"
+            )
 
     def _keyframe(self, message: pb.Keyframe, log_time: int, now_unix_ns: int) -> bytes:
         """Adds picture and annotations; returns the message without the picture."""
@@ -271,7 +350,11 @@ class SurveyWriter:
         self._add("/status", max(0, log_time), now_unix_ns, 0, status.SerializeToString())
 
     def finish(self, notes: dict[str, str]) -> None:
-        """Closes the file and gives it its final name. `notes` join the metadata record "pipefish"."""
+        """Closes the file and gives it its final name. `notes` join the metadata record "pipefish".
+
+        Raises PipefishError, OSError; what was stored then stays in the partial file."""
+        self._check_place()
+        self._refuse_finished()
         start, end = self.content.start, self.content.end
         self._writer.flush()
         about = {
@@ -293,14 +376,22 @@ class SurveyWriter:
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
-        self._file.close()
         os.replace(self.partial, self.path)
         fsync_folder(self.path)
+        self._file.close()  # only now: this unlocks
+
+    @property
+    def can_finish(self) -> bool:
+        """Whether all of the survey is here, in a file that could be written so far."""
+        return self.content.complete and not self._failed
 
     def close(self) -> None:
-        """Leaves the file partial, to be resumed."""
-        self._sync()
-        self._file.close()
+        """Leaves the file partial, to be resumed. Objects are on disk already, so that a full disk is no error here."""
+        with contextlib.suppress(OSError):
+            if not self._failed:
+                self._sync()
+        with contextlib.suppress(OSError):
+            self._file.close()
 
 
 def profile_json(binary: bytes) -> str | None:
@@ -313,113 +404,22 @@ def profile_json(binary: bytes) -> str | None:
         return None
 
 
-class SurveyStore:
-    """The survey files of one `pipefish receive`.
+def partial_of(path: Path) -> Path:
+    """The name of a survey file while it is being received."""
+    return path.with_name(path.name + ".partial")
 
-    A device may first deliver what is left of earlier surveys. The survey that the device is working on (`primary`)
-    gets the name that the user gave; every other one gets a name beside it: survey-2.mcap, survey-3.mcap, ...
-    """
 
-    def __init__(self, path: Path, overwrite: bool = False) -> None:
-        """Raises PipefishError if `path` exists already and must not be overwritten."""
-        self.path = path
-        self.writers: dict[bytes, SurveyWriter] = {}
-        self.finished: dict[bytes, Path] = {}
-        self.primary: bytes | None = None
-        self._names: set[bytes] = set()
-        if overwrite:
-            for old in (path, path.with_name(path.name + ".partial")):
-                old.unlink(missing_ok=True)
-        elif path.exists():
-            raise PipefishError(f"{path} exists already; choose another name or pass --overwrite")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for number in range(1, 1000):
-            candidate = self._numbered(number)
-            partial = candidate.with_name(candidate.name + ".partial")
-            if partial.exists():
-                writer = SurveyWriter(candidate)
-                self._names |= writer.content.names
-                self.writers[writer.content.survey_id] = writer
-                if number == 1:
-                    self.primary = writer.content.survey_id or None
-            elif number > 1 and not candidate.exists():
-                break
-
-    def _numbered(self, number: int) -> Path:
-        return self.path if number == 1 else self.path.with_name(f"{self.path.stem}-{number}{self.path.suffix}")
-
-    def choose_primary(self, survey_id: bytes) -> None:
-        """Tells which survey the given name is for; the first call that is not empty holds."""
-        if survey_id and self.primary is None:
-            self.primary = survey_id
-
-    def has(self, name: bytes) -> bool:
-        """Whether the object is stored durably."""
-        return name in self._names
-
-    @property
-    def recovered(self) -> int:
-        """Objects found in files of an earlier, interrupted run."""
-        return sum(w.recovered for w in self.writers.values())
-
-    def writer(self, survey_id: bytes) -> SurveyWriter:
-        """The file of a survey; created at its first object."""
-        if survey_id in self.writers:
-            return self.writers[survey_id]
-        self.choose_primary(survey_id)
-        if b"" in self.writers and survey_id == self.primary:  # an empty partial file of this name
-            self.writers[survey_id] = self.writers.pop(b"")
-            return self.writers[survey_id]
-        number = 1
-        if survey_id != self.primary:
-            number = 2
-            while self._numbered(number).exists() or any(
-                w.path == self._numbered(number) for w in self.writers.values()
-            ):
-                number += 1
-        self.writers[survey_id] = SurveyWriter(self._numbered(number))
-        return self.writers[survey_id]
-
-    def store(
-        self, name: bytes, kind: int, data: bytes, measured: dict[int, BootClock], now_unix_ns: int
-    ) -> tuple[SurveyWriter, Any] | None:
-        """Stores one object durably. Returns its file and message, or None if the bytes do not match the name.
-
-        measured  clocks that the link has measured, by boot id
-        Raises PipefishError for an object that this version does not understand: it stays on the device.
-        """
-        if hashlib.sha256(data).digest() != name:
-            return None
-        kinds = {OBJECT_START: pb.SurveyStart, OBJECT_KEYFRAME: pb.Keyframe, OBJECT_END: pb.SurveyEnd}
-        try:
-            message = kinds[kind].FromString(data)
-            if kind == OBJECT_KEYFRAME:
-                Observations.from_message(message.observations)
-            if not message.survey_id:
-                raise ValueError("no survey id")
-        except (KeyError, DecodeError, ValueError) as error:
-            raise PipefishError(
-                f"the device sent an object (kind {kind}, {name.hex()[:16]}...) that this version of pipefish cannot "
-                f"read: {error}; it stays on the device, update pipefish on both ends"
-            ) from error
-        writer = self.writer(message.survey_id)
-        writer.store(name, kind, message, len(data), measured.get(message.time.boot_id), now_unix_ns)
-        self._names.add(name)
-        return writer, message
-
-    def finish_complete(self, notes: dict[str, str]) -> list[Path]:
-        """Gives every complete file its final name. Returns the new names."""
-        done = []
-        for survey_id, writer in list(self.writers.items()):
-            if writer.content.complete:
-                writer.finish(notes)
-                self.finished[survey_id] = writer.path
-                del self.writers[survey_id]
-                done.append(writer.path)
-        return done
-
-    def close(self) -> list[Path]:
-        """Leaves what is not complete as partial files. Returns their names."""
-        for writer in self.writers.values():
-            writer.close()
-        return [writer.partial for writer in self.writers.values()]
+def read_content(path: Path) -> Content:
+    """What a survey file holds, finished or partial, as far as it can be read. Raises FormatError, OSError."""
+    content = Content()
+    topics: dict[int, str] = {}
+    for item in McapScan(path):
+        for record in item.chunk or []:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                try:
+                    content.note(topics.get(record.channel_id, ""), record.data)
+                except DecodeError as error:
+                    raise FormatError(path, f"offset {item.offset}", str(error)) from error
+    return content

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -18,7 +19,13 @@ CONNECT_TIMEOUT_S = 5.0
 
 
 class TransportClosed(PipefishError):
-    """The line is gone: cable out, adapter removed, peer closed the connection. Reopening may help."""
+    """The line is gone: cable out, adapter removed, peer closed the connection. Reopening may help.
+
+    is_forbidden: the system denies us the device, which waiting does not change."""
+
+    def __init__(self, text: str, cause: Exception | None = None) -> None:
+        super().__init__(text)
+        self.is_forbidden = getattr(cause, "errno", None) in (errno.EACCES, errno.EPERM)
 
 
 def _reason(error: Exception) -> str:
@@ -74,7 +81,7 @@ class SerialTransport(Transport):
             self._port = serial.Serial(self.path, self.baud, timeout=0, write_timeout=0, exclusive=True)
             self._port.reset_input_buffer()
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-            raise TransportClosed(f"{self.path}: {_reason(error)}") from error
+            raise TransportClosed(f"{self.path}: {_reason(error)}", error) from error
 
     def fileno(self) -> int:
         return self._port.fileno() if self._port is not None else -1
@@ -122,7 +129,7 @@ class TcpTransport(Transport):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setblocking(False)
         except OSError as error:
-            raise TransportClosed(f"{self.name}: {_reason(error)}") from error
+            raise TransportClosed(f"{self.name}: {_reason(error)}", error) from error
 
     def fileno(self) -> int:
         return self._socket.fileno() if self._socket is not None else -1

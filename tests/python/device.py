@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import select
 import socket
+import sys
 import threading
 import time
 
@@ -23,6 +24,8 @@ class Device(threading.Thread):
     cut_after      bytes sent after which the connection is closed, again and again
     corrupt_every  one byte in so many is flipped on its way to the host
     survey_id      what Info and Status tell; b"" tells nothing
+    state          what Status tells
+    most           so many objects are given to the link, over all connections; may be raised at any time
     """
 
     def __init__(
@@ -34,6 +37,7 @@ class Device(threading.Thread):
         cut_after: int = 0,
         corrupt_every: int = 0,
         nonce: int = 7,
+        state: str = "draining",
     ) -> None:
         super().__init__(daemon=True)
         self.spool = {name: (kind, data) for name, kind, data in objects}
@@ -41,6 +45,8 @@ class Device(threading.Thread):
         self.refused: list[bytes] = []
         self.survey_id, self.boot = survey_id, boot
         self.cut_after, self.corrupt_every = cut_after, corrupt_every
+        self.state = state
+        self.most = sys.maxsize
         self.clock: pb.ClockSync | None = None
         self.connections = 0
         self._sent = 0
@@ -78,7 +84,8 @@ class Device(threading.Thread):
         sent_here = 0
         while not self._done.is_set():
             for name, (kind, data) in list(self.spool.items()):
-                if name not in self._under_way and self.link.free_send_slots():
+                is_held = len(self._under_way) >= self.most
+                if name not in self._under_way and not is_held and self.link.free_send_slots():
                     self._under_way.add(name)
                     self.link.send_object(name, kind, data)
             now = time.monotonic_ns()
@@ -118,7 +125,7 @@ class Device(threading.Thread):
             self.link.send_latest(0, self.status().SerializeToString())
 
     def status(self) -> pb.Status:
-        status = pb.Status(survey_id=self.survey_id, state="draining", frames=60, keyframes=12, fps=30.0)
+        status = pb.Status(survey_id=self.survey_id, state=self.state, frames=60, keyframes=12, fps=30.0)
         status.time.boot_id, status.time.monotonic_ns = self.boot, time.monotonic_ns()
         status.spool.objects = len(self.spool)
         return status

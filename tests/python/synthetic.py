@@ -10,7 +10,8 @@ import numpy as np
 from PIL import Image
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, BootClock, SurveyStore
+from pipefish.surveystore import SurveyStore
+from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, BootClock
 
 SURVEY = bytes(range(16))
 BOOT = 0xFEDCBA9876543210
@@ -99,7 +100,7 @@ CLOCK = {BOOT: BootClock(1_700_000_000_000_000_000, 50_000)}
 
 def store_all(store: SurveyStore, objects: list[Object], now: int = 1_700_000_100_000_000_000) -> None:
     for i, (name, kind, data) in enumerate(objects):
-        assert store.store(name, kind, data, CLOCK, now + i * 1_000_000) is not None
+        assert store.store(name, kind, data, CLOCK, now + i * 1_000_000)
 
 
 def write_survey(path, keyframes: int = 12, objects: list[Object] | None = None) -> None:

@@ -68,7 +68,8 @@ def test_show_writes_what_it_says(survey, tmp_path, capsys):
     [
         (["info", "nothing.mcap"], "nothing.mcap: No such file"),
         (["info", "junk.mcap"], "junk.mcap: offset 0: not an MCAP file"),
-        (["show", "a.mcap", "-o", "no/such/folder/o.png"], "No such file"),
+        (["show", "a.mcap", "-o", "no/such/folder/o.png"], "pipefish: no/such/folder/o.png: No such file"),
+        (["show", "a.mcap", "-o", "a.mcap/o.png"], "pipefish: a.mcap/o.png: Not a directory"),
         (["receive", "http://x", "-o", "b.mcap"], "'http://x' is no device"),
         (["receive", "tcp://127.0.0.1:1", "-o", "a.mcap"], "a.mcap exists already"),
         (["status", "tcp://127.0.0.1:1"], "Connection refused"),

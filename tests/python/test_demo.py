@@ -1,4 +1,5 @@
-"""The demo, short: simulator, daemon, emulated cable, reception, evaluation, page. Needs what `make build` builds."""
+"""The demo, short: simulator, daemon, emulated cable, reception, evaluation, page. Needs what `make build` builds, and
+fails without it."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipefish.demo import demo, find_programs
+from pipefish.demo import demo
 from pipefish.errors import PipefishError
 from pipefish.survey import Survey
 
@@ -19,24 +20,12 @@ DOORS = (
 )
 
 
-def built() -> bool:
-    try:
-        find_programs(BUILD)
-    except PipefishError:
-        return False
-    return True
-
-
-needs_programs = pytest.mark.skipif(not built(), reason="pipefishd and pipefish-line are not built (make build)")
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """One folder for all: the recording is simulated once."""
     return tmp_path_factory.mktemp("demo")
 
 
-@needs_programs
 def test_a_short_demo_runs_through_the_whole_chain(folder):
     summary, page = demo(folder, frames=16, build_dir=BUILD, quiet=True)
     assert json.loads((folder / "summary.json").read_text()) == summary
@@ -45,10 +34,12 @@ def test_a_short_demo_runs_through_the_whole_chain(folder):
     assert summary["keyframes_sent"] == summary["keyframes_received"] > 1
     assert summary["within_1px"] >= 0.95
     assert page.stat().st_size < 15 << 20
+    text = page.read_text()
+    assert all(f">{label}<" in text for label in ("tracking time", "transfer time"))
+    assert ">goodput of the line over the transfer<" in text and "while surveying" not in text
     assert Survey.open(folder / "survey.mcap").complete
 
 
-@needs_programs
 def test_a_daemon_that_fails_shows_its_log(folder, monkeypatch):
     import pipefish.demo as module
 
@@ -58,7 +49,6 @@ def test_a_daemon_that_fails_shows_its_log(folder, monkeypatch):
         demo(folder, frames=16, build_dir=BUILD, quiet=True)
 
 
-@needs_programs
 def test_the_same_recording_is_used_again_and_only_that(folder, monkeypatch):
     import pipefish.simulate
     from pipefish.demo import simulated

@@ -92,6 +92,17 @@ def test_a_survey_without_encoder_or_end_still_has_a_page(tmp_path):
     assert not Outline((tmp_path / "p.html").read_text()).open
 
 
+def test_no_track_in_common_is_a_zero_and_no_keyframe_before_is_a_gap(tmp_path):
+    objects = [start()]
+    for index, (common, after_break) in enumerate([(0, True), (30, False), (0, False), (0, True)]):
+        message = pb.Keyframe.FromString(keyframe(index)[2])
+        message.common_tracks, message.after_break = common, after_break
+        objects.append(as_object(2, message))
+    data = data_of(page_of(tmp_path / "p.html", [*objects, end(4)]))
+    live = next(c for c in data["charts"] if c["id"] == "live")
+    assert live["data"][1]["y"] == [None, 30, 0, None]
+
+
 def test_the_head_shows_sent_and_received(tmp_path):
     objects = [start(), keyframe(0), keyframe(1), end(3, lost=(2,))]
     text = page_of(tmp_path / "p.html", objects)

@@ -5,6 +5,7 @@ Does not prove: behaviour of a real serial adapter that is pulled out.
 
 from __future__ import annotations
 
+import errno
 import re
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from device import Device
 from pipefish.errors import PipefishError
 from pipefish.receive import Interrupted, receive
 from pipefish.survey import Survey
-from pipefish.transport import SerialTransport, TcpTransport, open_transport
+from pipefish.transport import SerialTransport, TcpTransport, TransportClosed, open_transport
 from synthetic import BOOT, SURVEY, end, keyframe, name_of, start, survey_objects
 
 
@@ -88,25 +89,28 @@ def test_what_is_stored_already_is_not_sent_again(tmp_path):
 
 
 def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path):
-    """kill -9 of the receiving process, several times, with the device going on."""
-    path = tmp_path / "a.mcap"
+    """kill -9 of the receiving process after so many acknowledgements, with more objects under way."""
+    path, partial = tmp_path / "a.mcap", tmp_path / "a.mcap.partial"
     objects = survey_objects(60)
+    code = "import sys; from pipefish.cli import main; sys.exit(main(sys.argv[1:]))"
     with Device(objects, SURVEY, cut_after=60_000) as device:
-        code = "import sys; from pipefish.cli import main; sys.exit(main(sys.argv[1:]))"
         command = [sys.executable, "-c", code, "receive", device.address, "-o", str(path), "--json"]
-        for pause in (0.35, 0.45, 0.4, 0.5):
+        for kill_at in (0, 1, 5, 13, 26, 41):
+            device.most = kill_at + 4  # no further: the kill hits a reception that is not over
+            connections = device.connections
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            time.sleep(pause)
+            deadline = time.monotonic() + 60
+            while len(device.acknowledged) < kill_at or device.connections == connections:
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.001)
             process.send_signal(signal.SIGKILL)
             process.wait()
             gone = set(device.acknowledged)
-            if path.exists():
-                break
-            partial = tmp_path / "a.mcap.partial"
+            assert kill_at <= len(gone) <= kill_at + 4 and not path.exists()
             stored = {r.sha256 for r in Survey.open(partial).receipts} if partial.exists() else set()
             assert gone <= stored
-        if not path.exists():
-            receive_from(device, path)
+        device.most = len(objects)
+        receive_from(device, path)
     names = [r.sha256 for r in Survey.open(path).receipts]
     assert sorted(names) == sorted(n for n, _, _ in objects)
 
@@ -162,7 +166,7 @@ def test_an_object_whose_bytes_do_not_match_is_asked_for_again(tmp_path, monkeyp
     """The device's memory flips once; the second transfer is right."""
     import hashlib
 
-    import pipefish.surveywrite as surveywrite
+    import pipefish.surveystore as surveystore
 
     failed = []
 
@@ -179,26 +183,132 @@ def test_an_object_whose_bytes_do_not_match_is_asked_for_again(tmp_path, monkeyp
     class Hashes:
         sha256 = Once
 
-    monkeypatch.setattr(surveywrite, "hashlib", Hashes)
+    monkeypatch.setattr(surveystore, "hashlib", Hashes)
     with Device(survey_objects(3), SURVEY) as device:
         summary = receive_from(device, tmp_path / "a.mcap")
     assert summary["link"]["damaged_objects"] == 1
     assert Survey.open(tmp_path / "a.mcap").complete
 
 
-def test_objects_of_unknown_kind_are_refused_and_counted(tmp_path):
+def test_an_object_of_unknown_kind_stops_reception_and_stays_on_the_device(tmp_path):
+    """A refusal would make the device delete it."""
     strange = (name_of(b"raw frame"), 5, b"raw frame")
-    with Device([strange, *survey_objects(2)], SURVEY) as device:
-        summary = receive_from(device, tmp_path / "a.mcap")
-        assert device.refused == [strange[0]]
-    assert summary["link"]["refused_objects"] == 1
+    with Device([*survey_objects(2), strange], SURVEY) as device:
+        with pytest.raises(PipefishError, match=r"kind 5.*stays on the device, update pipefish"):
+            receive_from(device, tmp_path / "a.mcap")
+        assert not device.refused and strange[0] in device.spool
 
 
 def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
     for device, why in (("tcp://127.0.0.1:1", "Connection refused"), (str(tmp_path / "ttyUSB9"), "No such file")):
-        with pytest.raises(Interrupted, match=r"no device answers .*nothing has arrived"):
-            receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0.3)
-        assert re.search(f"{why}.*waiting for it", capsys.readouterr().err)
+        for quiet in (False, True):
+            with pytest.raises(Interrupted, match=rf"no device answers .*{why}.*nothing has arrived"):
+                receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0.3, quiet=quiet)
+            captured = capsys.readouterr()
+            assert captured.out == "" and bool(re.search(f"{why}.*waiting for it", captured.err)) != quiet
+
+
+def test_a_line_that_we_may_not_open_fails_at_once(tmp_path, monkeypatch):
+    import serial
+
+    def denied(*_, **__):
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", denied)
+    with pytest.raises(TransportClosed, match="ttyUSB0: Permission denied"):
+        receive(open_transport("/dev/ttyUSB0"), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+
+
+def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
+    with Device(survey_objects(2), SURVEY) as device:
+        transport = open_transport(device.address)
+        real, calls = transport.open, []
+
+        def late() -> None:
+            calls.append(1)
+            if len(calls) < 3:
+                raise TransportClosed("not yet")
+            real()
+
+        transport.open = late
+        summary = receive(transport, tmp_path / "a.mcap", timeout_s=10, quiet=True)
+    assert len(calls) == 3 and summary["link"]["reconnections"] == 0
+
+
+def test_a_survey_whose_rest_is_in_another_file_ends_with_its_name(tmp_path):
+    objects = survey_objects(6)
+    with Device(objects[:4], SURVEY) as device, pytest.raises(Interrupted):
+        receive_from(device, tmp_path / "a.mcap", stop=lambda: not device.spool)
+    with Device(objects[4:], SURVEY, nonce=8) as device, pytest.raises(PipefishError) as caught:
+        receive_from(device, tmp_path / "b.mcap")
+    text = str(caught.value)
+    assert "b.mcap.partial is not complete: its start, 3 keyframes (0, 1, 2) missing" in text
+    assert f"{tmp_path / 'a.mcap.partial'} of an earlier reception" in text
+    assert len(Survey.open(tmp_path / "b.mcap.partial").keyframes) == 3
+
+
+def test_a_device_that_is_idle_and_empty_is_not_waited_for(tmp_path):
+    """The survey's end went into another file: nothing of it is here, nothing more will come."""
+    with (
+        Device(survey_objects(6)[:4], SURVEY, state="idle") as device,
+        pytest.raises(PipefishError, match=r"nothing more to send.*its end missing"),
+    ):
+        receive_from(device, tmp_path / "a.mcap")
+
+
+def test_a_survey_that_was_received_before_is_said(tmp_path):
+    with Device([], SURVEY, state="idle") as device, pytest.raises(PipefishError, match="has been received before"):
+        receive_from(device, tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_receptions_do_not_write_one_file(tmp_path):
+    path = tmp_path / "a.mcap"
+    objects = survey_objects(6)
+    with Device(objects, SURVEY) as device, Device(objects, SURVEY, boot=BOOT + 1) as other:
+        refused = []
+
+        def stop() -> bool:
+            if device.acknowledged and not refused:
+                with pytest.raises(PipefishError, match=r"another pipefish receive is writing .*a\.mcap\.partial"):
+                    receive_from(other, path)
+                refused.append(1)
+            return False
+
+        device.most = 3  # the reception is under way, and not over before the other one has tried
+        stopper = lambda: (stop(), setattr(device, "most", 99) if refused else None)[0]  # noqa: E731
+        receive_from(device, path, stop=stopper)
+        assert refused and not other.acknowledged
+    assert len(Survey.open(path).receipts) == len(objects)
+
+
+def test_a_full_disk_names_the_file_and_keeps_what_was_acknowledged(tmp_path):
+    path = tmp_path / "a.mcap"
+    code = (
+        "import resource, sys; from pipefish.cli import main; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000)); sys.exit(main(sys.argv[1:]))"
+    )
+    with Device(survey_objects(60), SURVEY) as device:
+        command = [sys.executable, "-c", code, "receive", device.address, "-o", str(path), "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        acknowledged = set(device.acknowledged)
+        assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
+        stored = {r.sha256 for r in Survey.open(tmp_path / "a.mcap.partial").receipts}
+        keyframes = len(Survey.open(tmp_path / "a.mcap.partial").keyframes)
+        assert f"{path}.partial: File too large; {keyframes} keyframes are safe in it" in done.stderr
+        assert acknowledged and acknowledged <= stored
+        receive_from(device, path)
+    assert Survey.open(path).complete
+
+
+def test_interruption_counts_the_keyframes_of_each_file(tmp_path):
+    old = bytes(15) + b"\x09"
+    objects = [*survey_objects(4, survey=old)[:-1], *survey_objects(5)[:-1]]
+    with Device(objects, SURVEY) as device, pytest.raises(Interrupted) as caught:
+        receive_from(device, tmp_path / "a.mcap", stop=lambda: not device.spool)
+    text = str(caught.value)
+    assert f"5 keyframes are safe in {tmp_path}/a.mcap.partial" in text
+    assert f"4 keyframes are safe in {tmp_path}/a-2.mcap.partial" in text
 
 
 def test_a_silent_line_ends_with_the_timeout(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -43,6 +45,20 @@ def test_an_animation_has_all_keyframes_and_stays_small(survey, tmp_path, name):
     picture = Image.open(tmp_path / name)
     assert written["kind"] == "animation" and picture.n_frames == 12
     assert (tmp_path / name).stat().st_size < 10 << 20
+
+
+def test_an_animation_is_spread_over_the_whole_survey():
+    class Many:
+        survey = SimpleNamespace(keyframes=[None] * 150)
+        drawn: ClassVar[list[int]] = []
+
+        def draw(self, position, style):
+            self.drawn.append(position)
+            return Image.new("RGB", (8, 8), (position, 0, 0))
+
+    animation(Many())
+    assert len(Many.drawn) == 80 and Many.drawn[0] == 0 and Many.drawn[-1] == 149
+    assert set(np.diff(Many.drawn)) <= {1, 2}
 
 
 def test_an_animation_is_thinned_until_it_fits(survey):

@@ -14,7 +14,8 @@ from mcap.reader import make_reader
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError, PipefishError
 from pipefish.survey import Observations, Survey
-from pipefish.surveywrite import SurveyStore, SurveyWriter
+from pipefish.surveystore import SurveyStore
+from pipefish.surveywrite import SurveyWriter
 from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 
@@ -81,6 +82,31 @@ def test_tracks_are_sorted_and_distinct_over_boots(tmp_path):
     assert tracks.length_frames.max() == 10  # two keyframes of five frames
     assert [b["index"] for b in survey.breaks] == [3] and survey.breaks[0]["restart"]
     assert survey.info["boots"] == 2
+
+
+def test_chainage_goes_on_over_a_restart_with_the_scale_of_each_boot(tmp_path):
+    """The second boot counts from zero, twice as finely; its first keyframe has no count yet."""
+
+    def counted(index: int, count: int | None, **options):
+        message = pb.Keyframe.FromString(keyframe(index, **options)[2])
+        message.telemetry.Clear()
+        if count is not None:
+            message.telemetry.encoder_count = count
+        return as_object(2, message)
+
+    second = pb.SurveyStart.FromString(start(boot=BOOT + 1)[2])
+    second.encoder.metres_per_count = 0.0005
+    options = dict(boot=BOOT + 1, first=3)
+    objects = [
+        *(start(), counted(0, 1000), counted(1, 1200), counted(2, 1500)),
+        *(as_object(1, second), counted(3, None, **options), counted(4, 10, **options), counted(5, 210, **options)),
+        end(6, boot=BOOT + 1),
+    ]
+    write_survey(tmp_path / "a.mcap", objects=objects)
+    survey = Survey.open(tmp_path / "a.mcap")
+    np.testing.assert_allclose(survey.chainage(), [0, 0.2, 0.5, np.nan, 0.5, 0.6])
+    assert [(b["index"], b["restart"]) for b in survey.breaks] == [(3, True)]
+    assert survey.info["length_m"] == pytest.approx(0.6)
 
 
 def cut_points(data: bytes) -> list[int]:
@@ -184,9 +210,9 @@ def test_random_damage_never_crashes_the_reader(tmp_path):
 def test_the_bytes_must_match_the_name(tmp_path):
     store = SurveyStore(tmp_path / "a.mcap")
     name, kind, data = keyframe(0)
-    assert store.store(name, kind, data[:-1] + b"x", CLOCK, 1) is None
+    assert store.store(name, kind, data[:-1] + b"x", CLOCK, 1) is False
     assert not store.has(name) and not store.writers
-    assert store.store(name, kind, data, CLOCK, 1) is not None and store.has(name)
+    assert store.store(name, kind, data, CLOCK, 1) and store.has(name)
 
 
 def test_an_object_of_another_schema_stays_on_the_device(tmp_path):
@@ -277,3 +303,91 @@ def test_pictures_survive_recompression_by_other_tools(tmp_path):
     one, two = Survey.open(path), Survey.open(tmp_path / "b.mcap")
     assert [k.jpeg for k in one.keyframes] == [k.jpeg for k in two.keyframes]
     assert [k.time_ns for k in one.keyframes] == [k.time_ns for k in two.keyframes]
+
+
+def test_a_partial_file_is_locked_until_it_has_its_name(tmp_path):
+    path = tmp_path / "a.mcap"
+    store = SurveyStore(path)
+    store_all(store, survey_objects(2)[:-1])
+    for overwrite in (False, True):
+        with pytest.raises(PipefishError, match=r"another pipefish receive is writing .*a\.mcap\.partial"):
+            SurveyStore(path, overwrite)
+    store.close()
+    again = SurveyStore(path)  # recovery puts a new file in place: that one is locked too
+    with pytest.raises(PipefishError, match="another pipefish receive"):
+        SurveyStore(path)
+    store_all(again, survey_objects(2)[-1:])
+    assert again.finish_complete({}) == [path] and Survey.open(path).complete
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_partial_file_that_was_taken_away_is_not_written_on(tmp_path, replaced):
+    path, partial = tmp_path / "a.mcap", tmp_path / "a.mcap.partial"
+    store = SurveyStore(path)
+    store_all(store, survey_objects(2)[:2])
+    partial.unlink()
+    if replaced:
+        partial.write_bytes(b"another")
+    with pytest.raises(PipefishError, match="removed or replaced by another program"):
+        store_all(store, survey_objects(2)[2:])
+    assert store.finish_complete({}) == [] and not path.exists()
+    store.close()
+
+
+def test_overwrite_keeps_the_old_files_until_there_is_something_new(tmp_path):
+    path, partial = tmp_path / "a.mcap", tmp_path / "a.mcap.partial"
+    other = bytes(15) + b"\x0a"
+    write_survey(path, 2)
+    partial.write_bytes(b"what an earlier reception left")
+    before = path.read_bytes()
+    SurveyStore(path, overwrite=True).close()
+    assert path.read_bytes() == before and partial.read_bytes() == b"what an earlier reception left"
+    store = SurveyStore(path, overwrite=True)
+    store_all(store, survey_objects(3, survey=other)[:-1])
+    assert path.read_bytes() == before and len(Survey.open(partial).keyframes) == 3
+    store_all(store, survey_objects(3, survey=other)[-1:])
+    assert store.finish_complete({}) == [path]
+    assert Survey.open(path).survey_id == other.hex() and [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_survey_that_appeared_meanwhile_is_not_replaced(tmp_path):
+    path = tmp_path / "a.mcap"
+    store = SurveyStore(path)
+    store_all(store, survey_objects(2))
+    path.write_bytes(b"of another program")
+    with pytest.raises(PipefishError, match="exists already"):
+        store.finish_complete({})
+    store.close()
+    assert path.read_bytes() == b"of another program" and Survey.open(tmp_path / "a.mcap.partial").complete
+
+
+def test_an_empty_partial_file_of_a_sibling_does_not_receive_the_primary_survey(tmp_path):
+    SurveyWriter(tmp_path / "a-2.mcap").close()
+    store = SurveyStore(tmp_path / "a.mcap")
+    store.choose_primary(SURVEY)
+    other = bytes(15) + b"\x0b"
+    store_all(store, [*survey_objects(2, survey=other), *survey_objects(2)])
+    store.finish_complete({})
+    assert Survey.open(tmp_path / "a.mcap").survey_id == SURVEY.hex()
+    assert Survey.open(tmp_path / "a-2.mcap").survey_id == other.hex()
+    assert {p.name for p in tmp_path.iterdir()} == {"a.mcap", "a-2.mcap"}
+
+
+def test_a_hole_in_the_numbers_does_not_split_a_survey(tmp_path):
+    """a-2.mcap was moved elsewhere; a-3.mcap.partial goes on, and what a-4.mcap holds is not stored again."""
+    third, fourth = bytes(15) + b"\x03", bytes(15) + b"\x04"
+    for survey_id, number, objects in ((third, 3, 3), (fourth, 4, 4)):
+        store = SurveyStore(tmp_path / f"a-{number}.mcap")
+        store_all(store, survey_objects(2, survey=survey_id)[:objects])
+        store.finish_complete({})
+        store.close()
+    assert {p.name for p in tmp_path.iterdir()} == {"a-3.mcap.partial", "a-4.mcap"}
+    store = SurveyStore(tmp_path / "a.mcap")
+    store.choose_primary(SURVEY)
+    assert store.has(start(survey=third)[0])
+    store_all(store, [*survey_objects(2, survey=third)[3:], *survey_objects(2, survey=fourth)[2:], start()])
+    assert store.has(survey_objects(2, survey=fourth)[0][0]), "known after the first object of it"
+    store.finish_complete({})
+    store.close()
+    assert {p.name for p in tmp_path.iterdir()} == {"a-3.mcap", "a-4.mcap", "a.mcap.partial"}
+    assert Survey.open(tmp_path / "a-3.mcap").complete
