@@ -311,6 +311,7 @@ static void *run(void *argument)
         if (quit_at == UINT64_MAX && atomic_load(&c->is_quitting)) {
             quit_at = pf_link_is_up(c->link) ? now + LINGER_NS : now;
             c->status_due = now;
+            pf_log(PF_LOG_DEBUG, "the link closes");
         }
         service(c, now);
         read_stream(c, now);

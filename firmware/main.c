@@ -207,30 +207,23 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
 static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
-    bool is_terminated = false;
+    bool is_terminated = false, must_exit = false;
     for (;;) {
         struct pollfd fd = {.fd = signals, .events = POLLIN};
-        bool is_ended, is_drained, was_terminated = is_terminated;
+        bool is_drained, had_to_exit = must_exit;
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         note_status(d, &status_due, false);
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
             continue;
-        /* From the end of the survey, or from the signal if that comes later. */
-        if (drain_end == 0 || is_terminated != was_terminated)
+        must_exit = is_terminated || atomic_load(&d->stop) == PF_STOP_SHUTDOWN;
+        /* From the end of the survey, or from the signal or the request if that comes later. */
+        if (drain_end == 0 || must_exit != had_to_exit)
             drain_end = pf_now() + drain_ns;
-        is_ended = pf_pipeline_is_done(pipeline);
-        is_drained = is_ended && pf_store_is_drained(d->store);
+        is_drained = pf_pipeline_is_done(pipeline) && pf_store_is_drained(d->store);
         if (is_drained)
             atomic_store(&d->state, PF_STATE_IDLE);
-        if (!is_terminated && atomic_load(&d->stop) == PF_STOP_SHUTDOWN) {
-            if (is_drained)
-                return;
-            continue;
-        }
-        if (!is_terminated && !d->config.daemon.exit_when_done)
-            continue;
-        if (is_drained || pf_now() >= drain_end)
+        if ((must_exit || d->config.daemon.exit_when_done) && (is_drained || pf_now() >= drain_end))
             return;
     }
 }
@@ -265,11 +258,14 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
         supervise(d, pipeline, signals);
     else
         pf_log(PF_LOG_ERROR, "%s", error);
-    pf_store_quit(d->store);
+    /* The time to drain limits only the sending: every keyframe that was made, and the survey's end, are stored first.
+     * The store ends last, for what the host acknowledges while the courier lingers must be removed. */
+    pf_store_flush(d->store);
     if (pipeline != NULL)
         is_good = pf_pipeline_close(pipeline) && is_good;
     if (courier != NULL)
         pf_courier_close(courier);
+    pf_store_quit(d->store);
     note_status(d, &status_due, true);
     pf_store_get_stats(d->store, &stats);
     if (stats.spool.objects > 0)

@@ -454,8 +454,7 @@ static void store_end(pf_pipeline *p, const char *reason)
                              .reason = reason,
                              .last_status = &status,
                              .lost_index = survey.lost};
-    if (!pf_store_settle(d->store))
-        return;
+    pf_store_settle(d->store);
     pf_daemon_status(d, &status);
     pf_store_get_survey(d->store, &survey);
     memcpy(end.survey_id, d->survey_id, sizeof end.survey_id);
@@ -470,7 +469,7 @@ static void store_end(pf_pipeline *p, const char *reason)
     }
     job->kind = PF_OBJECT_SURVEY_END;
     pf_store_give(d->store, job);
-    (void)pf_store_settle(d->store);
+    pf_store_settle(d->store);
 }
 
 static void *run(void *argument)

@@ -20,8 +20,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
 bool pf_pipeline_start(pf_pipeline *pipeline, char *error, size_t n);
 bool pf_pipeline_is_done(pf_pipeline *pipeline);
 
-/* Joins the thread (pf_store_quit must have been called, or is_done be true) and frees all. False: the camera failed.
- */
+/* Joins the thread and frees all; the survey must have been stopped or over, and pf_store_flush been called, lest it
+ * wait for a host. False: the camera failed. */
 bool pf_pipeline_close(pf_pipeline *pipeline);
 
 #endif

@@ -13,6 +13,8 @@
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/link.h"
 
+#define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
+
 enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
 
 struct pf_store {
@@ -28,13 +30,15 @@ struct pf_store {
     uint32_t free_count;
     pf_job **queue; /* ring, oldest first */
     uint32_t queue_first, queue_count;
-    bool is_blocked; /* the oldest job waits for room in the spool */
-    bool has_more;   /* the spool may hold an object after `cursor` */
-    uint64_t cursor; /* row of the last object that went into a slot */
+    bool is_blocked;   /* the oldest job waits for room in the spool */
+    uint64_t retry_ns; /* when to try again at the latest */
+    bool has_more;     /* the spool may hold an object after `cursor` */
+    uint64_t cursor;   /* row of the last object that went into a slot */
     pf_slot *slots;
     size_t slot_capacity;
-    bool is_hurried, is_quitting;
+    bool is_hurried, is_flushing, is_quitting;
     pf_store_stats stats;
+    bool was_blocked; /* the thread's own: said that it waits for room */
 };
 
 /* ---- the thread's work: each is called without the mutex */
@@ -61,6 +65,19 @@ static void lose(pf_store *s, uint32_t index)
     pf_survey_lose(&s->survey, index);
 }
 
+static void lose_job(pf_store *s, const pf_job *job)
+{
+    if (is_keyframe(job))
+        lose(s, job->index);
+    else
+        s->stats.has_failed = true;
+}
+
+static const char *what(const pf_job *job)
+{
+    return is_keyframe(job) ? "a keyframe" : "the survey's start or end";
+}
+
 static void free_job(pf_store *s, pf_job *job)
 {
     s->free_job[s->free_count++] = job;
@@ -81,15 +98,26 @@ static void do_job(pf_store *s)
     const pf_job *job = s->queue[s->queue_first];
     pf_survey survey = s->survey;
     uint64_t start = pf_now();
-    bool was_blocked = s->is_blocked;
+    bool may_wait = !s->is_flushing && (s->config.is_patient || !is_keyframe(job));
+    bool is_waiting;
     pf_status status;
 
     if (is_keyframe(job))
         survey.next_index = job->index + 1;
     pthread_mutex_unlock(&s->mutex);
     status = store_object(s, job, &survey);
+    is_waiting = status == PF_ERR_SPACE && may_wait;
+    if (is_waiting && !s->was_blocked)
+        pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
+    else if (status != PF_OK && !is_waiting)
+        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self), what(job));
+    s->was_blocked = is_waiting;
     pthread_mutex_lock(&s->mutex);
-    s->is_blocked = false;
+    if (is_waiting) {
+        s->is_blocked = !s->is_flushing;
+        s->retry_ns = pf_now() + RETRY_NS;
+        return;
+    }
     if (status == PF_OK) {
         s->has_more = true;
         s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
@@ -98,18 +126,8 @@ static void do_job(pf_store *s)
             s->stats.store_ns += pf_now() - start;
             s->stats.stored++;
         }
-    } else if (status == PF_ERR_SPACE && (s->config.is_patient || !is_keyframe(job))) {
-        if (!was_blocked)
-            pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
-        s->is_blocked = true;
-        return;
     } else {
-        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self),
-               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
-        if (is_keyframe(job))
-            lose(s, job->index);
-        else
-            s->stats.has_failed = true;
+        lose_job(s, job);
     }
     pop_job(s);
 }
@@ -202,24 +220,13 @@ static void *run(void *argument)
         if (s->is_quitting)
             break;
         if (s->is_blocked) { /* room may come from elsewhere, too: a full disk that someone has cleaned up */
-            struct timespec until;
-            (void)clock_gettime(CLOCK_MONOTONIC, &until);
-            until.tv_sec += 1;
-            if (pthread_cond_timedwait(&s->work, &s->mutex, &until) != 0)
+            const struct timespec until = {(time_t)(s->retry_ns / 1000000000u), (long)(s->retry_ns % 1000000000u)};
+            (void)pthread_cond_timedwait(&s->work, &s->mutex, &until);
+            if (pf_now() >= s->retry_ns)
                 s->is_blocked = false;
         } else {
             pthread_cond_wait(&s->work, &s->mutex);
         }
-    }
-    while (s->queue_count > 0) {
-        const pf_job *job = s->queue[s->queue_first];
-        pf_log(PF_LOG_ERROR, "no room in the spool: %s is lost",
-               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
-        if (is_keyframe(job))
-            lose(s, job->index);
-        else
-            s->stats.has_failed = true;
-        pop_job(s);
     }
     pthread_mutex_unlock(&s->mutex);
     return NULL;
@@ -318,16 +325,16 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
 void pf_store_quit(pf_store *s)
 {
     pthread_mutex_lock(&s->mutex);
-    s->is_quitting = true;
-    s->is_hurried = true;
+    s->is_quitting = s->is_hurried = s->is_flushing = true;
+    s->is_blocked = false;
     pthread_cond_broadcast(&s->work);
     pthread_cond_broadcast(&s->change);
     pthread_mutex_unlock(&s->mutex);
+    (void)pthread_join(s->thread, NULL);
 }
 
 void pf_store_close(pf_store *s)
 {
-    (void)pthread_join(s->thread, NULL);
     pthread_cond_destroy(&s->work);
     pthread_cond_destroy(&s->change);
     pthread_mutex_destroy(&s->mutex);
@@ -355,10 +362,19 @@ pf_job *pf_store_take(pf_store *s)
 
 void pf_store_give(pf_store *s, pf_job *job)
 {
+    bool is_late;
     pthread_mutex_lock(&s->mutex);
-    s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
-    pthread_cond_signal(&s->work);
+    is_late = s->is_quitting;
+    if (is_late) {
+        lose_job(s, job);
+        free_job(s, job);
+    } else {
+        s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
+        pthread_cond_signal(&s->work);
+    }
     pthread_mutex_unlock(&s->mutex);
+    if (is_late)
+        pf_log(PF_LOG_ERROR, "the store has quit: %s is lost", what(job));
 }
 
 void pf_store_give_back(pf_store *s, pf_job *job)
@@ -383,15 +399,22 @@ void pf_store_hurry(pf_store *s)
     pthread_mutex_unlock(&s->mutex);
 }
 
-bool pf_store_settle(pf_store *s)
+void pf_store_flush(pf_store *s)
 {
-    bool is_settled;
     pthread_mutex_lock(&s->mutex);
-    while (s->queue_count > 0 && !s->is_quitting)
-        pthread_cond_wait(&s->change, &s->mutex);
-    is_settled = s->queue_count == 0;
+    s->is_hurried = s->is_flushing = true;
+    s->is_blocked = false;
+    pthread_cond_broadcast(&s->work);
+    pthread_cond_broadcast(&s->change);
     pthread_mutex_unlock(&s->mutex);
-    return is_settled;
+}
+
+void pf_store_settle(pf_store *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    while (s->queue_count > 0)
+        pthread_cond_wait(&s->change, &s->mutex);
+    pthread_mutex_unlock(&s->mutex);
 }
 
 /* ---- the courier's side */

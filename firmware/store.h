@@ -54,8 +54,11 @@ void pf_store_lose(pf_store *store, uint32_t index);
 /* From now on take() does not wait: the survey is being stopped. */
 void pf_store_hurry(pf_store *store);
 
-/* Waits until every job is stored or dropped. False: pf_store_quit came first. */
-bool pf_store_settle(pf_store *store);
+/* From now on nothing waits for room in the spool: what does not fit is lost, and counted. */
+void pf_store_flush(pf_store *store);
+
+/* Waits until every job is stored or dropped: for room in the spool as well, unless pf_store_flush was called. */
+void pf_store_settle(pf_store *store);
 
 /* A slot whose object is to be sent, or NULL; and its return: the host has it, or has refused it for ever. */
 pf_slot *pf_store_next_slot(pf_store *store);
@@ -67,7 +70,8 @@ bool pf_store_is_drained(pf_store *store);
 void pf_store_get_stats(pf_store *store, pf_store_stats *stats);
 void pf_store_get_survey(pf_store *store, pf_survey *survey);
 
-/* The thread ends after what it does now; jobs that still wait for room are lost. Then close joins it and frees all. */
+/* Flushes, stores what is queued, removes what was released, and ends the thread. Nothing may come after it: what does
+ * counts as lost. Then close frees all. */
 void pf_store_quit(pf_store *store);
 void pf_store_close(pf_store *store);
 

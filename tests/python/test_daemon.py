@@ -8,6 +8,7 @@ import os
 import random
 import signal
 import socket
+import sqlite3
 import subprocess
 import time
 from collections import Counter
@@ -200,6 +201,12 @@ def wait_for_log(crawler: Crawler, text: str) -> None:
     while text not in crawler.text():
         assert time.monotonic() < end, crawler.text()
         time.sleep(0.02)
+
+
+def spooled(crawler: Crawler) -> Counter[int]:
+    """How many objects of each kind the spool of a daemon that has ended holds."""
+    with contextlib.closing(sqlite3.connect(crawler.config.parent / "spool.db")) as database:
+        return Counter(kind for (kind,) in database.execute("SELECT kind FROM object"))
 
 
 def receive_all(crawler: Crawler, store: Store) -> int:
@@ -454,6 +461,49 @@ def test_what_could_not_be_sent_is_delivered_by_the_next_start_before_its_new_su
     order = list(store.objects.values())
     old_end = next(i for i, (kind, _) in enumerate(order) if kind == END)
     assert old_end <= 21 + 3
+
+
+def test_without_time_to_drain_every_keyframe_made_and_the_end_are_still_stored(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=0", "--set", "camera.loops=0", *EVERY_FRAME)
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.terminate()
+    assert crawler.wait() == 0
+    made = int(crawler.text().split("survey ends: terminated; ")[1].split()[0])
+    assert spooled(crawler) == {START: 1, KEYFRAME: made, END: 1}
+
+
+class LateStore(Store):
+    """A host that takes the survey's end in, but acknowledges it only when `may_acknowledge` says so."""
+
+    may_acknowledge = False
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        return None if kind == END and not self.may_acknowledge else super().on_object(name, kind, data)
+
+
+def test_an_acknowledgement_at_the_last_moment_still_empties_the_spool(crawler: Crawler):
+    store = LateStore(crawler.port)
+    crawler.start("--set", "daemon.drain_s=1", "--set", "daemon.log_level=debug")
+    with store.client() as client:
+        serve(crawler, client, lambda: "the link closes" in crawler.text())
+        store.may_acknowledge = True
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    assert len(store.ends) == 1
+    assert spooled(crawler) == {}
+
+
+def test_a_shutdown_waits_for_a_host_that_takes_nothing_only_as_long_as_a_signal_does(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=1", "--set", "daemon.exit_when_done=false")
+    with contextlib.closing(Client(TcpTransport("127.0.0.1", crawler.port), Handlers(), wants_objects=False)) as client:
+        wait_for_log(crawler, "survey ends")
+        client.open()
+        serve(crawler, client, lambda: client.up)
+        client.ask(shutdown=pb.Nothing())
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    assert spooled(crawler) == {START: 1, KEYFRAME: 20, END: 1}
 
 
 def test_a_second_sigterm_exits_at_once(crawler: Crawler):
