@@ -453,13 +453,14 @@ static void store_end(pf_pipeline *p, const char *reason)
                              .boots = p->boots,
                              .reason = reason,
                              .last_status = &status,
-                             .lost_index = survey.lost};
+                             .lost_first = survey.lost_first,
+                             .lost_count = survey.lost_count};
     pf_store_settle(d->store);
     pf_daemon_status(d, &status);
     pf_store_get_survey(d->store, &survey);
     memcpy(end.survey_id, d->survey_id, sizeof end.survey_id);
     end.frames = status.frames;
-    end.lost_count = survey.lost_count;
+    end.lost_ranges = survey.lost_ranges;
     job = pf_store_take(d->store);
     if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
         pf_log(PF_LOG_ERROR, "cannot make the survey's end message");

@@ -219,7 +219,7 @@ def receive(
         receiver.client.close()
         summary = receiver.summary()
         keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
-        lost = {w.path: len(w.content.end.lost_index) if w.content.end else 0 for w in store.writers.values()}
+        lost = {w.path: w.content.lost for w in store.writers.values()}
         damaged = [str(w.damaged) for w in store.writers.values() if w.damaged]
         finished = store.finish_complete({key: str(value) for key, value in summary.items()})
         partial = store.close()

@@ -27,7 +27,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
 from pipefish.errors import FormatError, PipefishError
 from pipefish.mcapscan import McapScan
-from pipefish.survey import UNKNOWN_ERROR_NS, Observations
+from pipefish.survey import UNKNOWN_ERROR_NS, Observations, lost_indices
 
 FORMAT_VERSION = 1  # of the layout in docs/survey.md
 OBJECT_START, OBJECT_KEYFRAME, OBJECT_END = 1, 2, 3  # pf_object_kind
@@ -108,7 +108,12 @@ class Content:
         """Whether nothing more is to come: start, end, and every keyframe that the device did not lose."""
         if self.start is None or self.end is None:
             return False
-        return set(range(self.end.keyframes)) <= self.indices | set(self.end.lost_index)
+        return set(range(self.end.keyframes)) <= self.indices | lost_indices(self.end)
+
+    @property
+    def lost(self) -> int:
+        """Number of keyframes that the device lost."""
+        return len(lost_indices(self.end) - self.indices) if self.end else 0
 
     def note(self, topic: str, data: bytes) -> None:
         """Takes in one message of the file. Raises DecodeError."""
@@ -272,7 +277,7 @@ class SurveyWriter:
 
     def finish(self, notes: dict[str, str]) -> None:
         """Closes the file and gives it its final name. `notes` join the metadata record "pipefish"."""
-        start, end = self.content.start, self.content.end
+        start = self.content.start
         self._writer.flush()
         about = {
             "format": str(FORMAT_VERSION),
@@ -281,7 +286,7 @@ class SurveyWriter:
             "name": start.name if start else "",
             "device_software": start.software if start else "",
             "keyframes": str(len(self.content.indices)),
-            "keyframes_lost": str(len(end.lost_index) if end else 0),
+            "keyframes_lost": str(self.content.lost),
         }
         self._writer.add_metadata("pipefish", {**about, **notes})
         if start is not None and start.profile:

@@ -325,7 +325,7 @@ static bool write_numbers(pb_ostream_t *stream, const pb_field_t *field, void *c
 pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *e, uint8_t *out, size_t capacity, size_t *n)
 {
     pipefish_v1_SurveyEnd m = pipefish_v1_SurveyEnd_init_zero;
-    numbers_view lost = {e->lost_index, e->lost_count};
+    numbers_view lost_first = {e->lost_first, e->lost_ranges}, lost_count = {e->lost_count, e->lost_ranges};
 
     memcpy(m.survey_id, e->survey_id, sizeof m.survey_id);
     m.has_time = true;
@@ -337,8 +337,9 @@ pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *e, uint8_t *out, siz
     m.has_last_status = e->last_status != NULL;
     if (e->last_status)
         set_status(&m.last_status, e->last_status);
-    m.lost_index.funcs.encode = write_numbers;
-    m.lost_index.arg = &lost;
+    m.lost_first.funcs.encode = m.lost_count.funcs.encode = write_numbers;
+    m.lost_first.arg = &lost_first;
+    m.lost_count.arg = &lost_count;
     return encode(pipefish_v1_SurveyEnd_fields, &m, out, capacity, n);
 }
 

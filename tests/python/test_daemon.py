@@ -22,6 +22,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import ACCEPT, STORED, Client, Handlers
+from pipefish.survey import lost_indices
 from pipefish.transport import TcpTransport, TransportClosed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -325,7 +326,7 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     assert {start.survey_id} == {k.survey_id for k in keyframes} | {end.survey_id}
     assert [k.index for k in keyframes] == list(range(20))
     assert end.reason == "end of recording"
-    assert (end.keyframes, end.frames, end.boots, list(end.lost_index)) == (20, 40, 1, [])
+    assert (end.keyframes, end.frames, end.boots, list(end.lost_first)) == (20, 40, 1, [])
     assert set(store.arrivals.values()) == {1}
 
     boot = start.time.boot_id
@@ -587,7 +588,7 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
-    assert list(end_message.lost_index) == []
+    assert list(end_message.lost_first) == []
 
 
 def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
@@ -597,7 +598,7 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
     wait_for_log(crawler, "survey ends")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
-    lost, got = set(end_message.lost_index), {k.index for k in store.keyframes}
+    lost, got = lost_indices(end_message), {k.index for k in store.keyframes}
     assert lost
     assert lost & got == set()
     assert lost | got == set(range(end_message.keyframes))
@@ -612,7 +613,7 @@ def check_everything_arrived_once(store: Store, kills: int) -> None:
     [end] = store.ends
     assert {k.survey_id for k in store.keyframes} == {end.survey_id}
     assert [k.index for k in store.keyframes] == list(range(end.keyframes))
-    assert list(end.lost_index) == []
+    assert list(end.lost_first) == []
     assert 1 < end.boots <= kills + 1
     # One start for each boot that came to store it; each boot's first keyframe is marked.
     boots = [s.time.boot_id for s in store.starts]

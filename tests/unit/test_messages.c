@@ -248,7 +248,7 @@ static pf_msg_survey_start sample_start(void)
     return s;
 }
 
-static const uint32_t lost[] = {3, 300, 4294967295u};
+static const uint32_t lost_first[] = {3, 300, 4294967295u}, lost_count[] = {290, 1, 1};
 
 static pf_msg_survey_end sample_end(const pf_msg_status *status)
 {
@@ -258,8 +258,9 @@ static pf_msg_survey_end sample_end(const pf_msg_status *status)
                            .frames = 1234567890123u,
                            .reason = "terminated",
                            .last_status = status,
-                           .lost_index = lost,
-                           .lost_count = 3};
+                           .lost_first = lost_first,
+                           .lost_count = lost_count,
+                           .lost_ranges = 3};
     memcpy(e.survey_id, survey_id, 16);
     return e;
 }
@@ -439,7 +440,11 @@ static void test_survey_end_status_and_preview_round_trip(void)
     check_status(bytes(m, 7));
     packed = bytes(m, 8);
     for (int i = 0; i < 3; i++)
-        TEST_ASSERT_EQUAL_UINT64(lost[i], varint(&packed));
+        TEST_ASSERT_EQUAL_UINT64(lost_first[i], varint(&packed));
+    TEST_ASSERT_EQUAL_size_t(0, packed.n);
+    packed = bytes(m, 9);
+    for (int i = 0; i < 3; i++)
+        TEST_ASSERT_EQUAL_UINT64(lost_count[i], varint(&packed));
     TEST_ASSERT_EQUAL_size_t(0, packed.n);
 
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_preview(&p, out, sizeof out, &n));

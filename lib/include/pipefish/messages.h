@@ -107,9 +107,9 @@ typedef struct pf_msg_survey_end {
     uint32_t keyframes, boots;
     uint64_t frames;
     const char *reason;
-    const pf_msg_status *last_status; /* NULL = none */
-    const uint32_t *lost_index;       /* lost_count of them */
-    uint32_t lost_count;
+    const pf_msg_status *last_status;        /* NULL = none */
+    const uint32_t *lost_first, *lost_count; /* lost_ranges of each */
+    uint32_t lost_ranges;
 } pf_msg_survey_end;
 
 typedef struct pf_msg_preview {
