@@ -176,6 +176,25 @@ static bool open_random(pf_daemon *d, char *error, size_t n)
     return true;
 }
 
+/* What one survey has in common over all its boots: with another pipe, camera, lens or wheel it is another survey. */
+static bool hash_setup(const pf_daemon *d, uint8_t hash[32])
+{
+    enum { LINES_MAX = 16 };
+    char text[LINES_MAX * PF_CONFIG_LINE_MAX], line[PF_CONFIG_LINE_MAX];
+    const pf_camera_info *info = d->camera.ops->info(d->camera.self);
+    size_t n = (size_t)snprintf(text, sizeof text, "%s\n%u x %u\n", d->source, info->width, info->height);
+    for (uint32_t i = 0; i < pf_config_keys(); i++) {
+        (void)pf_config_line(&d->config, i, line, sizeof line);
+        if (strncmp(line, "survey.", 7) != 0 && strncmp(line, "encoder.", 8) != 0)
+            continue;
+        if (n + sizeof line + sizeof d->profile_sha256 > sizeof text)
+            return false;
+        n += (size_t)sprintf(text + n, "%s\n", line);
+    }
+    memcpy(text + n, d->profile_sha256, sizeof d->profile_sha256);
+    return pf_sha256(text, n + sizeof d->profile_sha256, hash) == PF_OK;
+}
+
 /* Writes the status file if it is due. */
 static void note_status(pf_daemon *d, uint64_t *due, bool is_last)
 {
@@ -228,7 +247,7 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
     }
 }
 
-static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
+static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *before, int signals)
 {
     const pf_config *c = &d->config;
     char error[1024];
@@ -248,7 +267,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
         return FAILED;
     }
     if (pf_courier_open(&courier, d, error, sizeof error) &&
-        pf_pipeline_open(&pipeline, d, courier, survey, error, sizeof error)) {
+        pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
                survey->boots, survey->is_resumed ? "goes on" : "begins");
@@ -281,7 +300,8 @@ static int open_and_run(pf_daemon *d, int signals)
     const pf_config *c = &d->config;
     char error[1024] = "";
     pf_spool_config spool = {c->spool.path, (uint64_t)(c->spool.quota_mb * 1e6)};
-    pf_survey survey;
+    pf_survey survey, before;
+    uint8_t setup[32];
     int code = FAILED;
 
     d->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
@@ -289,12 +309,14 @@ static int open_and_run(pf_daemon *d, int signals)
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
-    if (pf_gpio_none_open(&d->gpio) == PF_OK) {
+    if (!hash_setup(d, setup))
+        (void)snprintf(error, sizeof error, "the setup cannot be hashed");
+    else if (pf_gpio_none_open(&d->gpio) == PF_OK) {
         if (open_transport(d, error, sizeof error)) {
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
-                if (pf_survey_open(&survey, &d->spool, error, sizeof error)) {
+                if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {
                     memcpy(d->survey_id, survey.id, sizeof d->survey_id);
-                    code = run_survey(d, &survey, signals);
+                    code = run_survey(d, &survey, &before, signals);
                     error[0] = '\0';
                 }
                 d->spool.ops->close(d->spool.self);

@@ -178,6 +178,31 @@ static bool store_start(pf_pipeline *p, char *error, size_t n)
     return ok;
 }
 
+/* The end of a survey that had none when another began. */
+static bool store_end_of(pf_pipeline *p, const pf_survey *before, char *error, size_t n)
+{
+    pf_daemon *d = p->daemon;
+    pf_job *job = pf_store_take(d->store);
+    pf_msg_survey_end end = {.time = {d->boot_id, pf_now()},
+                             .keyframes = before->next_index,
+                             .boots = before->boots,
+                             .reason = "interrupted; another survey began",
+                             .lost_first = before->lost_first,
+                             .lost_count = before->lost_count,
+                             .lost_ranges = before->lost_ranges};
+    memcpy(end.survey_id, before->id, sizeof end.survey_id);
+    if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
+        (void)snprintf(error, n, "cannot make the end of the survey before");
+        return false;
+    }
+    pf_log(PF_LOG_WARNING,
+           "survey %02x%02x%02x%02x was interrupted with %u keyframes, and its setup has changed: it ends",
+           before->id[0], before->id[1], before->id[2], before->id[3], before->next_index);
+    job->kind = PF_OBJECT_SURVEY_END;
+    pf_store_give(d->store, job);
+    return true;
+}
+
 static void release(pf_pipeline *p)
 {
     pf_jpeg_close(p->jpeg);
@@ -187,7 +212,7 @@ static void release(pf_pipeline *p)
 }
 
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
-                      char *error, size_t n)
+                      const pf_survey *before, char *error, size_t n)
 {
     pf_pipeline *p = calloc(1, sizeof *p);
     if (p == NULL) {
@@ -200,7 +225,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) || !store_start(p, error, n)) {
+    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) ||
+        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
         release(p);
         return false;
     }

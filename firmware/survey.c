@@ -6,7 +6,7 @@
 #include <sys/random.h>
 
 #define FORMAT 2u  /* of the packed survey: its first byte */
-#define HEADER 29u /* bytes before the ranges */
+#define HEADER 61u /* bytes before the ranges */
 
 static void put_u32(uint8_t *out, uint32_t value)
 {
@@ -24,26 +24,28 @@ size_t pf_survey_pack(const pf_survey *s, uint8_t *out)
     uint32_t n = 0;
     out[0] = FORMAT;
     memcpy(out + 1, s->id, 16);
-    put_u32(out + 17, s->boots);
-    put_u32(out + 21, s->next_index);
+    memcpy(out + 17, s->setup, 32);
+    put_u32(out + 49, s->boots);
+    put_u32(out + 53, s->next_index);
     for (; n < s->lost_ranges && s->lost_first[n] < s->next_index; n++) {
         uint32_t before = s->next_index - s->lost_first[n];
         put_u32(out + HEADER + 8 * n, s->lost_first[n]);
         put_u32(out + HEADER + 8 * n + 4, s->lost_count[n] < before ? s->lost_count[n] : before);
     }
-    put_u32(out + 25, n);
+    put_u32(out + 57, n);
     return HEADER + 8 * (size_t)n;
 }
 
 static bool unpack(pf_survey *s, const uint8_t *in, size_t n)
 {
-    if (n < HEADER || in[0] != FORMAT || get_u32(in + 25) > PF_SURVEY_LOST_MAX ||
-        n != HEADER + 8 * (size_t)get_u32(in + 25))
+    if (n < HEADER || in[0] != FORMAT || get_u32(in + 57) > PF_SURVEY_LOST_MAX ||
+        n != HEADER + 8 * (size_t)get_u32(in + 57))
         return false;
     memcpy(s->id, in + 1, 16);
-    s->boots = get_u32(in + 17);
-    s->next_index = get_u32(in + 21);
-    s->lost_ranges = get_u32(in + 25);
+    memcpy(s->setup, in + 17, 32);
+    s->boots = get_u32(in + 49);
+    s->next_index = get_u32(in + 53);
+    s->lost_ranges = get_u32(in + 57);
     for (uint32_t i = 0; i < s->lost_ranges; i++) {
         s->lost_first[i] = get_u32(in + HEADER + 8 * i);
         s->lost_count[i] = get_u32(in + HEADER + 8 * i + 4);
@@ -51,22 +53,27 @@ static bool unpack(pf_survey *s, const uint8_t *in, size_t n)
     return true;
 }
 
-bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_t n)
+bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,
+                    size_t n)
 {
     uint8_t bytes[PF_SURVEY_BYTES];
     size_t size = 0;
     pf_status status = spool->ops->get(spool->self, PF_SURVEY_KEY, bytes, sizeof bytes, &size);
     memset(survey, 0, sizeof *survey);
+    memset(before, 0, sizeof *before);
     if (status == PF_OK && unpack(survey, bytes, size)) {
-        survey->is_resumed = true;
-        survey->boots++;
-        return true;
-    }
-    if (status == PF_OK) {
+        if (memcmp(survey->setup, setup, sizeof survey->setup) == 0) {
+            survey->is_resumed = true;
+            survey->boots++;
+            return true;
+        }
+        *before = *survey;
+        memset(survey, 0, sizeof *survey);
+    } else if (status == PF_OK) {
         (void)snprintf(error, n, "the survey that the spool remembers was written by another version");
         return false;
     }
-    if (status != PF_ERR_END) {
+    if (status != PF_OK && status != PF_ERR_END) {
         (void)snprintf(error, n, "%s", spool->ops->error(spool->self));
         return false;
     }
@@ -74,6 +81,7 @@ bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_
         (void)snprintf(error, n, "no random numbers: %s", strerror(errno));
         return false;
     }
+    memcpy(survey->setup, setup, sizeof survey->setup);
     survey->boots = 1;
     return true;
 }

@@ -10,10 +10,11 @@
 
 #define PF_SURVEY_KEY      "survey"
 #define PF_SURVEY_LOST_MAX 1024u /* ranges of lost keyframes that are remembered */
-#define PF_SURVEY_BYTES    (1u + 16u + 3u * 4u + 8u * PF_SURVEY_LOST_MAX)
+#define PF_SURVEY_BYTES    (1u + 16u + 32u + 3u * 4u + 8u * PF_SURVEY_LOST_MAX)
 
 typedef struct pf_survey {
     uint8_t id[16];
+    uint8_t setup[32];    /* SHA-256 of what must not change within a survey */
     uint32_t boots;       /* starts of the daemon so far, this one included */
     uint32_t next_index;  /* of the next keyframe */
     uint32_t lost_ranges; /* ascending, with a keyframe between any two */
@@ -21,9 +22,11 @@ typedef struct pf_survey {
     bool is_resumed; /* not the survey's first boot */
 } pf_survey;
 
-/* Goes on with the survey that the spool remembers, or begins one with a random id. False: error[n] says what failed.
- */
-bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_t n);
+/* Goes on with the survey that the spool remembers if it has the same setup, or begins one with a random id. *before
+ * gets the survey of another setup that was interrupted, and must be ended; boots = 0: there is none. False: error[n]
+ * says what failed. */
+bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,
+                    size_t n);
 
 /* The survey as the spool keeps it; returns its bytes, PF_SURVEY_BYTES at most. Lost keyframes from next_index on are
  * left out: the next boot uses their numbers again. */

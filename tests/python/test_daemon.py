@@ -643,6 +643,24 @@ def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path,
     check_everything_arrived_once(store, kills)
 
 
+@pytest.mark.parametrize("change", ["survey.name=the next pipe", "encoder.metres_per_count=0.0002"])
+def test_after_kill_9_another_setup_begins_another_survey_and_ends_the_old_one(crawler: Crawler, change: str):
+    crawler.start("--set", "camera.loops=0")
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.kill()
+    store = Store(crawler.port)
+    crawler.start("--set", change)
+    assert receive_all(crawler, store) == 0
+    ends = {e.reason: e for e in store.ends}
+    old, new = ends["interrupted; another survey began"], ends["end of recording"]
+    assert [s.survey_id for s in store.starts] == [old.survey_id, new.survey_id]
+    for end in (old, new):
+        assert [k.index for k in store.keyframes if k.survey_id == end.survey_id] == list(range(end.keyframes))
+        assert (end.boots, list(end.lost_first)) == (1, [])
+    assert not next(k for k in store.keyframes if k.survey_id == new.survey_id).after_break
+
+
 def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(
     tmp_path: Path, crawler: Crawler
 ):

@@ -7,7 +7,8 @@
 /* A spool that holds one value. */
 static uint8_t kept[PF_SURVEY_BYTES + 1];
 static size_t kept_n;
-static pf_survey survey;
+static pf_survey survey, before;
+static const uint8_t setup[32] = {1, 2, 3}, other_setup[32] = {1, 2, 4};
 static char error[512];
 
 static pf_status get(void *self, const char *key, void *bytes, size_t capacity, size_t *n)
@@ -28,6 +29,7 @@ static const pf_spool spool = {NULL, &ops};
 void setUp(void)
 {
     memset(&survey, 0, sizeof survey);
+    memcpy(survey.setup, setup, sizeof setup);
     kept_n = 0;
 }
 
@@ -42,8 +44,9 @@ static void keep(const pf_survey *s)
 static void reopen(void)
 {
     keep(&survey);
-    TEST_ASSERT_TRUE_MESSAGE(pf_survey_open(&survey, &spool, error, sizeof error), error);
+    TEST_ASSERT_TRUE_MESSAGE(pf_survey_open(&survey, &before, &spool, setup, error, sizeof error), error);
     TEST_ASSERT_TRUE(survey.is_resumed);
+    TEST_ASSERT_EQUAL_UINT32(0, before.boots);
 }
 
 static bool is_listed(uint32_t index)
@@ -118,10 +121,33 @@ static void test_a_full_list_and_a_foreign_value(void)
     reopen();
     TEST_ASSERT_EQUAL_UINT32(PF_SURVEY_LOST_MAX, survey.lost_ranges);
     kept[0] ^= 0x40;
-    TEST_ASSERT_FALSE(pf_survey_open(&survey, &spool, error, sizeof error));
+    TEST_ASSERT_FALSE(pf_survey_open(&survey, &before, &spool, setup, error, sizeof error));
     kept[0] ^= 0x40;
     kept_n--;
-    TEST_ASSERT_FALSE(pf_survey_open(&survey, &spool, error, sizeof error));
+    TEST_ASSERT_FALSE(pf_survey_open(&survey, &before, &spool, setup, error, sizeof error));
+}
+
+/* Proves: another setup begins another survey and hands back the one that was interrupted, with its losses. */
+static void test_another_setup_is_another_survey(void)
+{
+    survey.boots = 3;
+    survey.next_index = 10;
+    memset(survey.id, 0xA5, sizeof survey.id);
+    pf_survey_lose(&survey, 4);
+    keep(&survey);
+    TEST_ASSERT_TRUE_MESSAGE(pf_survey_open(&survey, &before, &spool, other_setup, error, sizeof error), error);
+    TEST_ASSERT_FALSE(survey.is_resumed);
+    TEST_ASSERT_EQUAL_UINT32(1, survey.boots);
+    TEST_ASSERT_EQUAL_UINT32(0, survey.next_index);
+    TEST_ASSERT_EQUAL_UINT32(0, survey.lost_ranges);
+    TEST_ASSERT_TRUE(memcmp(survey.id, before.id, 16) != 0);
+    TEST_ASSERT_EQUAL_UINT32(3, before.boots);
+    TEST_ASSERT_EQUAL_UINT32(10, before.next_index);
+    TEST_ASSERT_EQUAL_UINT32(1, before.lost_ranges);
+    TEST_ASSERT_EQUAL_UINT32(4, before.lost_first[0]);
+    keep(&survey);
+    TEST_ASSERT_TRUE_MESSAGE(pf_survey_open(&survey, &before, &spool, other_setup, error, sizeof error), error);
+    TEST_ASSERT_TRUE(survey.is_resumed);
 }
 
 int main(void)
@@ -131,5 +157,6 @@ int main(void)
     RUN_TEST(test_no_number_of_losses_is_too_large);
     RUN_TEST(test_losses_to_come_are_not_kept);
     RUN_TEST(test_a_full_list_and_a_foreign_value);
+    RUN_TEST(test_another_setup_is_another_survey);
     return UNITY_END();
 }
