@@ -262,6 +262,11 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     uint64_t status_due = 0;
     bool is_good = false;
 
+    if (c->spool.quota_mb > 0 && (double)store.capacity > c->spool.quota_mb * 1e6) {
+        pf_log(PF_LOG_ERROR, "spool.quota_mb = %g: an object of this camera may have %.2f MB", c->spool.quota_mb,
+               (double)store.capacity / 1e6);
+        return FAILED;
+    }
     if (!pf_store_open(&d->store, &d->spool, survey, &store, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;

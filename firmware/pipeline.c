@@ -29,8 +29,8 @@ struct pf_pipeline {
     uint64_t preview_due;
     uint32_t next_index;
     uint32_t boots;
-    char break_reason[128]; /* "" = tracks go on */
-    pf_frame previous;      /* the tracker's reference */
+    char break_reason[PF_BREAK_REASON_MAX]; /* "" = tracks go on */
+    pf_frame previous;                      /* the tracker's reference */
     bool has_previous;
     bool has_failed;
 };
@@ -278,8 +278,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
                          .jpeg_quality = d->config.keyframe.jpeg_quality,
                          .cause = cause,
                          .telemetry = *telemetry,
-                         .common_tracks = common,
-                         .break_reason = p->break_reason[0] ? p->break_reason : NULL};
+                         .common_tracks = common};
     pf_job *job = pf_store_take(d->store);
     if (job == NULL) {
         pf_log(PF_LOG_WARNING, "the disk is too slow: keyframe %u is dropped", k.index);
@@ -305,6 +304,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
     }
     job->kind = PF_OBJECT_KEYFRAME;
     job->index = k.index;
+    memcpy(job->break_reason, p->break_reason, sizeof job->break_reason);
     pf_store_give(d->store, job);
     return true;
 }

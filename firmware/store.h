@@ -7,11 +7,14 @@
 
 #include "survey.h"
 
+#define PF_BREAK_REASON_MAX 128u /* bytes, with the zero */
+
 typedef struct pf_job {
     uint8_t *bytes; /* capacity of pf_store_capacity() */
     size_t n;
-    uint32_t kind;  /* pf_object_kind */
-    uint32_t index; /* of a keyframe */
+    uint32_t kind;                          /* pf_object_kind */
+    uint32_t index;                         /* of a keyframe */
+    char break_reason[PF_BREAK_REASON_MAX]; /* of a keyframe; "" = tracks go on from the one before. Not in `bytes` */
 } pf_job;
 
 typedef struct pf_slot {
@@ -43,8 +46,11 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
                    char *error, size_t n);
 size_t pf_store_capacity(const pf_store *store);
 
-/* A job to fill; NULL: none is free (when patient: only after pf_store_hurry). Goes on with give or give_back. */
+/* A job to fill, all but its bytes zero; NULL: none is free (when patient: only after pf_store_hurry). Goes on with
+ * give or give_back. */
 pf_job *pf_store_take(pf_store *store);
+/* The store adds the break reason to a keyframe's message when it stores it: if the keyframe is lost, the next one that
+ * is stored carries it. */
 void pf_store_give(pf_store *store, pf_job *job);
 void pf_store_give_back(pf_store *store, pf_job *job);
 

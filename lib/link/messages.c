@@ -252,9 +252,19 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     m.has_observations = true;
     set_observations(&m.observations, columns, k->tracks, k->n_tracks);
     m.common_tracks = k->common_tracks;
-    m.after_break = k->break_reason != NULL;
-    m.break_reason = text(k->break_reason);
     return encode(pipefish_v1_Keyframe_fields, &m, out, capacity, n);
+}
+
+/* A message of Protocol Buffers followed by fields is that message with these fields. */
+pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity, size_t *n)
+{
+    pb_ostream_t stream = pb_ostream_from_buffer(out + *n, capacity - *n);
+    if (!pb_encode_tag(&stream, PB_WT_VARINT, pipefish_v1_Keyframe_after_break_tag) || !pb_encode_varint(&stream, 1) ||
+        !pb_encode_tag(&stream, PB_WT_STRING, pipefish_v1_Keyframe_break_reason_tag) ||
+        !pb_encode_string(&stream, (const uint8_t *)reason, strlen(reason)))
+        return PF_ERR_SPACE;
+    *n += stream.bytes_written;
+    return PF_OK;
 }
 
 typedef struct lines_view {

@@ -591,6 +591,12 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
     assert list(end_message.lost_first) == []
 
 
+def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
+    done = run("--config", crawler.config, "--set", "spool.quota_mb=0.05")
+    assert done.returncode == 1
+    assert "spool.quota_mb = 0.05: an object of this camera may have" in done.stderr
+
+
 def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
     write_recording(tmp_path / "survey.y4m", 40, rate=20)
     store = Store(crawler.port)

@@ -216,8 +216,7 @@ static pf_msg_keyframe sample_keyframe(const pf_track *tracks)
                          .telemetry = sample_telemetry(),
                          .tracks = tracks,
                          .n_tracks = TRACKS,
-                         .common_tracks = 44,
-                         .break_reason = "restart"};
+                         .common_tracks = 44};
     memcpy(k.survey_id, survey_id, 16);
     memset(k.frame_sha256, 0xAB, 32);
     return k;
@@ -319,6 +318,8 @@ static void test_keyframe_round_trip(void)
     sample_tracks(tracks);
     k = sample_keyframe(tracks);
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_append_break("restart", out, n + 10, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break("restart", out, n + 11, &n));
     m = (view){out, n};
     TEST_ASSERT_EQUAL_MEMORY(survey_id, bytes(m, 1).data, 16);
     TEST_ASSERT_EQUAL_UINT64(12, number(m, 2));
@@ -372,7 +373,6 @@ static void test_unmeasured_telemetry_is_absent(void)
     sample_tracks(tracks);
     k = sample_keyframe(tracks);
     k.telemetry = (pf_msg_telemetry){.time = {1, 2}, .has_attitude = true};
-    k.break_reason = NULL;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
     t = bytes((view){out, n}, 11);
     TEST_ASSERT_TRUE(has(t, 3));
@@ -573,10 +573,10 @@ static void test_keyframe_bound_holds_for_the_largest_numbers(void)
     reason[256] = '\0';
     k = sample_keyframe(tracks);
     k.n_tracks = PF_TRACKS_MAX;
-    k.break_reason = reason;
     k.index = k.width = k.height = k.jpeg_quality = k.common_tracks = UINT32_MAX;
     k.frame_sequence = k.time.monotonic_ns = UINT64_MAX;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break(reason, out, sizeof out, &n));
     TEST_ASSERT_GREATER_THAN_size_t(sizeof out * 9 / 10, n);
 }
 
