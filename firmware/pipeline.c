@@ -69,6 +69,12 @@ static bool open_tracker(pf_pipeline *p, char *error, size_t n)
     const pf_config *c = &d->config;
     const pf_camera_info *info = d->camera.ops->info(d->camera.self);
     double u, v, radius = circle_radius(d, &u, &v);
+    /* A circle further out than this has no border in any image, and would not fit into Q16.16. */
+    if (!(radius <= 2.0 * PF_IMAGE_SIZE_MAX && fabs(u) <= PF_IMAGE_SIZE_MAX && fabs(v) <= PF_IMAGE_SIZE_MAX)) {
+        (void)snprintf(error, n, "image circle (%g, %g), radius %g: must be within %u px, the radius within %u", u, v,
+                       radius, PF_IMAGE_SIZE_MAX, 2 * PF_IMAGE_SIZE_MAX);
+        return false;
+    }
     pf_tracker_config t = {.width = info->width,
                            .height = info->height,
                            .max_tracks = c->tracker.max_tracks,
@@ -261,6 +267,8 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
         m.has_lamp = true;
         m.lamp = (float)lamp;
     }
+    if (d->gpio.ops->stopped(d->gpio.self, &m.emergency_stop) != PF_OK)
+        m.emergency_stop = false;
     return m;
 }
 

@@ -173,6 +173,7 @@ static void set_telemetry(pipefish_v1_Telemetry *out, const pf_msg_telemetry *in
     out->gain = in->gain;
     out->has_lamp = in->has_lamp;
     out->lamp = in->lamp;
+    out->emergency_stop = in->emergency_stop;
 }
 
 static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)

@@ -561,6 +561,37 @@ def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawle
     assert crawler.wait() == 0
 
 
+def wake_ups_per_second(crawler: Crawler, seconds: float) -> float:
+    """How often the daemon's threads have gone to sleep, a second."""
+
+    def count() -> int:
+        tasks = Path(f"/proc/{crawler.process.pid}/task").glob("*/status")
+        return sum(int(t.read_text().split("voluntary_ctxt_switches:")[1].split()[0]) for t in tasks)
+
+    first, begin = count(), time.monotonic()
+    time.sleep(seconds)
+    return (count() - first) / (time.monotonic() - begin)
+
+
+def test_a_daemon_without_a_host_sleeps(crawler: Crawler):
+    crawler.start()
+    wait_for_log(crawler, "survey ends")
+    assert wake_ups_per_second(crawler, 1) < 200  # it looks around 20 times a second, the rest is spare
+
+
+def test_a_host_that_reads_nothing_counts_as_gone_and_costs_no_wake_ups(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 600)
+    store = Store(crawler.port)
+    full_line = ("--set", "link.window=1048576", "--set", "link.send_slots=16")
+    crawler.start("--set", "link.keepalive_ms=200", *full_line, *EVERY_FRAME)
+    with store.client() as client:
+        client.transport._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # it fills up at once
+        serve(crawler, client, lambda: len(store.objects) > 3)
+        wait_for_log(crawler, "host has gone")  # from here on it reads nothing
+        wait_for_log(crawler, "survey ends")
+        assert wake_ups_per_second(crawler, 1) < 1500
+
+
 def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Path, crawler: Crawler):
     recording = tmp_path / "survey.y4m"
     csv = recording.with_suffix(".csv")

@@ -146,7 +146,8 @@ static pf_msg_telemetry sample_telemetry(void)
                               .attitude_sigma_rad = 0.0625f,
                               .exposure_us = 8000,
                               .gain = 2.5f,
-                              .lamp = 0.75f};
+                              .lamp = 0.75f,
+                              .emergency_stop = true};
 }
 
 static pf_msg_status sample_status(void)
@@ -278,6 +279,7 @@ static void check_telemetry(view t)
     TEST_ASSERT_EQUAL_FLOAT(2.5f, real32(t, 7));
     TEST_ASSERT_EQUAL_FLOAT(0.75f, real32(t, 8));
     TEST_ASSERT_EQUAL_UINT64(3, number(t, 9));
+    TEST_ASSERT_EQUAL_UINT64(1, number(t, 10));
 }
 
 static void check_status(view s)
@@ -378,7 +380,7 @@ static void test_unmeasured_telemetry_is_absent(void)
     TEST_ASSERT_TRUE(has(t, 3));
     TEST_ASSERT_TRUE(has(t, 4));
     TEST_ASSERT_FALSE(has(t, 2));
-    for (uint32_t field = 5; field <= 9; field++)
+    for (uint32_t field = 5; field <= 10; field++)
         TEST_ASSERT_FALSE(has(t, field));
     TEST_ASSERT_FALSE(has((view){out, n}, 14));
     TEST_ASSERT_FALSE(has((view){out, n}, 15));
@@ -495,7 +497,7 @@ static void test_largest_status_fits_a_control_message(void)
     memset(&s, 0xFF, sizeof s);
     s.state = "surveying";
     s.link_up = s.has_clock = s.telemetry.has_encoder = s.telemetry.has_attitude = s.telemetry.has_exposure = true;
-    s.telemetry.has_gain = s.telemetry.has_lamp = true;
+    s.telemetry.has_gain = s.telemetry.has_lamp = s.telemetry.emergency_stop = true;
     s.telemetry.attitude_sigma_rad = 1.0f;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 }

@@ -30,6 +30,7 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     float attitude_sigma_rad; /* 0 = not stated */
     uint32_t exposure_us;
     float gain, lamp;
+    bool emergency_stop;
 } pf_msg_telemetry;
 
 typedef struct pf_msg_keyframe {
