@@ -281,17 +281,23 @@ static void send_objects(pf_courier *c)
     }
 }
 
-static void wait_for_work(pf_courier *c, uint64_t deadline, bool is_full)
+/* Waits until `deadline`, or longer if the line takes nothing, but not past `latest`. */
+static void wait_for_work(pf_courier *c, uint64_t deadline, uint64_t latest, bool is_full)
 {
     pf_transport *t = &c->daemon->transport;
     uint64_t now = pf_now(), count, wait;
     struct timespec timeout;
     struct pollfd fds[2] = {{.fd = c->daemon->wake_fd, .events = POLLIN},
                             {.fd = t->ops->fd(t->self), .events = POLLIN}};
-    if (c->out_at < c->out_n)
+    if (c->out_at < c->out_n) {
+        /* Nothing can be sent before the line takes these; only silence is to be noticed, after four of such times. */
         fds[1].events |= POLLOUT;
-    else if (is_full && deadline > now + MS)
+        deadline = now + c->daemon->config.link.keepalive_ms * MS;
+    } else if (is_full && deadline < now + MS) {
         deadline = now + MS; /* no descriptor tells when the line has room again */
+    }
+    if (deadline > latest)
+        deadline = latest;
     /* A deadline that has passed although nothing could be sent must not become a busy loop. */
     wait = deadline > now + MS / 4 ? deadline - now : MS / 4;
     timeout = (struct timespec){(time_t)(wait / 1000000000u), (long)(wait % 1000000000u)};
@@ -311,9 +317,11 @@ static void *run(void *argument)
         if (quit_at == UINT64_MAX && atomic_load(&c->is_quitting)) {
             quit_at = pf_link_is_up(c->link) ? now + LINGER_NS : now;
             c->status_due = now;
+            pf_log(PF_LOG_DEBUG, "the link closes");
         }
         service(c, now);
         read_stream(c, now);
+        (void)pf_link_input(c->link, NULL, 0, now); /* a full line gets no output, and silence must be noticed */
         take_events(c, now);
         if (pf_link_is_up(c->link)) {
             if (now >= c->status_due)
@@ -328,13 +336,11 @@ static void *run(void *argument)
         if (now >= quit_at || (quit_at != UINT64_MAX && !pf_link_is_up(c->link)))
             break;
         deadline = pf_link_deadline(c->link, now);
-        if (!c->has_stream && deadline > now + PF_TRANSPORT_RETRY_MS * MS)
+        if (!c->has_stream) /* the link has its hello ready all the time */
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
         if (pf_link_is_up(c->link) && c->status_due < deadline)
             deadline = c->status_due;
-        if (quit_at < deadline)
-            deadline = quit_at;
-        wait_for_work(c, deadline, is_full);
+        wait_for_work(c, deadline, quit_at, is_full);
     }
     publish(c, pf_now());
     return NULL;

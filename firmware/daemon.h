@@ -22,7 +22,7 @@ _Static_assert(PF_VERSION_MAJOR == 0 && PF_VERSION_MINOR == 1 && PF_VERSION_PATC
 typedef enum pf_stop {
     PF_STOP_NO = 0,
     PF_STOP_OPERATOR,   /* stop_survey */
-    PF_STOP_SHUTDOWN,   /* shutdown: exit when the spool is empty, however long that takes */
+    PF_STOP_SHUTDOWN,   /* shutdown: exit when the spool is empty, at the latest after daemon.drain_s */
     PF_STOP_TERMINATED, /* SIGTERM, SIGINT */
 } pf_stop;
 

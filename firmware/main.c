@@ -176,6 +176,25 @@ static bool open_random(pf_daemon *d, char *error, size_t n)
     return true;
 }
 
+/* What one survey has in common over all its boots: with another pipe, camera, lens or wheel it is another survey. */
+static bool hash_setup(const pf_daemon *d, uint8_t hash[32])
+{
+    enum { LINES_MAX = 16 };
+    char text[LINES_MAX * PF_CONFIG_LINE_MAX], line[PF_CONFIG_LINE_MAX];
+    const pf_camera_info *info = d->camera.ops->info(d->camera.self);
+    size_t n = (size_t)snprintf(text, sizeof text, "%s\n%u x %u\n", d->source, info->width, info->height);
+    for (uint32_t i = 0; i < pf_config_keys(); i++) {
+        (void)pf_config_line(&d->config, i, line, sizeof line);
+        if (strncmp(line, "survey.", 7) != 0 && strncmp(line, "encoder.", 8) != 0)
+            continue;
+        if (n + sizeof line + sizeof d->profile_sha256 > sizeof text)
+            return false;
+        n += (size_t)sprintf(text + n, "%s\n", line);
+    }
+    memcpy(text + n, d->profile_sha256, sizeof d->profile_sha256);
+    return pf_sha256(text, n + sizeof d->profile_sha256, hash) == PF_OK;
+}
+
 /* Writes the status file if it is due. */
 static void note_status(pf_daemon *d, uint64_t *due, bool is_last)
 {
@@ -207,35 +226,28 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
 static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
-    bool is_terminated = false;
+    bool is_terminated = false, must_exit = false;
     for (;;) {
         struct pollfd fd = {.fd = signals, .events = POLLIN};
-        bool is_ended, is_drained, was_terminated = is_terminated;
+        bool is_drained, had_to_exit = must_exit;
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         note_status(d, &status_due, false);
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
             continue;
-        /* From the end of the survey, or from the signal if that comes later. */
-        if (drain_end == 0 || is_terminated != was_terminated)
+        must_exit = is_terminated || atomic_load(&d->stop) == PF_STOP_SHUTDOWN;
+        /* From the end of the survey, or from the signal or the request if that comes later. */
+        if (drain_end == 0 || must_exit != had_to_exit)
             drain_end = pf_now() + drain_ns;
-        is_ended = pf_pipeline_is_done(pipeline);
-        is_drained = is_ended && pf_store_is_drained(d->store);
+        is_drained = pf_pipeline_is_done(pipeline) && pf_store_is_drained(d->store);
         if (is_drained)
             atomic_store(&d->state, PF_STATE_IDLE);
-        if (!is_terminated && atomic_load(&d->stop) == PF_STOP_SHUTDOWN) {
-            if (is_drained)
-                return;
-            continue;
-        }
-        if (!is_terminated && !d->config.daemon.exit_when_done)
-            continue;
-        if (is_drained || pf_now() >= drain_end)
+        if ((must_exit || d->config.daemon.exit_when_done) && (is_drained || pf_now() >= drain_end))
             return;
     }
 }
 
-static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
+static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *before, int signals)
 {
     const pf_config *c = &d->config;
     char error[1024];
@@ -250,12 +262,17 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
     uint64_t status_due = 0;
     bool is_good = false;
 
+    if (c->spool.quota_mb > 0 && (double)store.capacity > c->spool.quota_mb * 1e6) {
+        pf_log(PF_LOG_ERROR, "spool.quota_mb = %g: an object of this camera may have %.2f MB", c->spool.quota_mb,
+               (double)store.capacity / 1e6);
+        return FAILED;
+    }
     if (!pf_store_open(&d->store, &d->spool, survey, &store, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
     if (pf_courier_open(&courier, d, error, sizeof error) &&
-        pf_pipeline_open(&pipeline, d, courier, survey, error, sizeof error)) {
+        pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
                survey->boots, survey->is_resumed ? "goes on" : "begins");
@@ -265,11 +282,14 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, int signals)
         supervise(d, pipeline, signals);
     else
         pf_log(PF_LOG_ERROR, "%s", error);
-    pf_store_quit(d->store);
+    /* The time to drain limits only the sending: every keyframe that was made, and the survey's end, are stored first.
+     * The store ends last, for what the host acknowledges while the courier lingers must be removed. */
+    pf_store_flush(d->store);
     if (pipeline != NULL)
         is_good = pf_pipeline_close(pipeline) && is_good;
     if (courier != NULL)
         pf_courier_close(courier);
+    pf_store_quit(d->store);
     note_status(d, &status_due, true);
     pf_store_get_stats(d->store, &stats);
     if (stats.spool.objects > 0)
@@ -285,7 +305,8 @@ static int open_and_run(pf_daemon *d, int signals)
     const pf_config *c = &d->config;
     char error[1024] = "";
     pf_spool_config spool = {c->spool.path, (uint64_t)(c->spool.quota_mb * 1e6)};
-    pf_survey survey;
+    pf_survey survey, before;
+    uint8_t setup[32];
     int code = FAILED;
 
     d->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
@@ -293,12 +314,14 @@ static int open_and_run(pf_daemon *d, int signals)
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
-    if (pf_gpio_none_open(&d->gpio) == PF_OK) {
+    if (!hash_setup(d, setup))
+        (void)snprintf(error, sizeof error, "the setup cannot be hashed");
+    else if (pf_gpio_none_open(&d->gpio) == PF_OK) {
         if (open_transport(d, error, sizeof error)) {
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
-                if (pf_survey_open(&survey, &d->spool, error, sizeof error)) {
+                if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {
                     memcpy(d->survey_id, survey.id, sizeof d->survey_id);
-                    code = run_survey(d, &survey, signals);
+                    code = run_survey(d, &survey, &before, signals);
                     error[0] = '\0';
                 }
                 d->spool.ops->close(d->spool.self);

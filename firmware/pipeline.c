@@ -29,8 +29,8 @@ struct pf_pipeline {
     uint64_t preview_due;
     uint32_t next_index;
     uint32_t boots;
-    char break_reason[128]; /* "" = tracks go on */
-    pf_frame previous;      /* the tracker's reference */
+    char break_reason[PF_BREAK_REASON_MAX]; /* "" = tracks go on */
+    pf_frame previous;                      /* the tracker's reference */
     bool has_previous;
     bool has_failed;
 };
@@ -69,6 +69,12 @@ static bool open_tracker(pf_pipeline *p, char *error, size_t n)
     const pf_config *c = &d->config;
     const pf_camera_info *info = d->camera.ops->info(d->camera.self);
     double u, v, radius = circle_radius(d, &u, &v);
+    /* A circle further out than this has no border in any image, and would not fit into Q16.16. */
+    if (!(radius <= 2.0 * PF_IMAGE_SIZE_MAX && fabs(u) <= PF_IMAGE_SIZE_MAX && fabs(v) <= PF_IMAGE_SIZE_MAX)) {
+        (void)snprintf(error, n, "image circle (%g, %g), radius %g: must be within %u px, the radius within %u", u, v,
+                       radius, PF_IMAGE_SIZE_MAX, 2 * PF_IMAGE_SIZE_MAX);
+        return false;
+    }
     pf_tracker_config t = {.width = info->width,
                            .height = info->height,
                            .max_tracks = c->tracker.max_tracks,
@@ -178,6 +184,31 @@ static bool store_start(pf_pipeline *p, char *error, size_t n)
     return ok;
 }
 
+/* The end of a survey that had none when another began. */
+static bool store_end_of(pf_pipeline *p, const pf_survey *before, char *error, size_t n)
+{
+    pf_daemon *d = p->daemon;
+    pf_job *job = pf_store_take(d->store);
+    pf_msg_survey_end end = {.time = {d->boot_id, pf_now()},
+                             .keyframes = before->next_index,
+                             .boots = before->boots,
+                             .reason = "interrupted; another survey began",
+                             .lost_first = before->lost_first,
+                             .lost_count = before->lost_count,
+                             .lost_ranges = before->lost_ranges};
+    memcpy(end.survey_id, before->id, sizeof end.survey_id);
+    if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
+        (void)snprintf(error, n, "cannot make the end of the survey before");
+        return false;
+    }
+    pf_log(PF_LOG_WARNING,
+           "survey %02x%02x%02x%02x was interrupted with %u keyframes, and its setup has changed: it ends",
+           before->id[0], before->id[1], before->id[2], before->id[3], before->next_index);
+    job->kind = PF_OBJECT_SURVEY_END;
+    pf_store_give(d->store, job);
+    return true;
+}
+
 static void release(pf_pipeline *p)
 {
     pf_jpeg_close(p->jpeg);
@@ -187,7 +218,7 @@ static void release(pf_pipeline *p)
 }
 
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
-                      char *error, size_t n)
+                      const pf_survey *before, char *error, size_t n)
 {
     pf_pipeline *p = calloc(1, sizeof *p);
     if (p == NULL) {
@@ -200,7 +231,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) || !store_start(p, error, n)) {
+    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) ||
+        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
         release(p);
         return false;
     }
@@ -235,6 +267,8 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
         m.has_lamp = true;
         m.lamp = (float)lamp;
     }
+    if (d->gpio.ops->stopped(d->gpio.self, &m.emergency_stop) != PF_OK)
+        m.emergency_stop = false;
     return m;
 }
 
@@ -252,8 +286,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
                          .jpeg_quality = d->config.keyframe.jpeg_quality,
                          .cause = cause,
                          .telemetry = *telemetry,
-                         .common_tracks = common,
-                         .break_reason = p->break_reason[0] ? p->break_reason : NULL};
+                         .common_tracks = common};
     pf_job *job = pf_store_take(d->store);
     if (job == NULL) {
         pf_log(PF_LOG_WARNING, "the disk is too slow: keyframe %u is dropped", k.index);
@@ -279,6 +312,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
     }
     job->kind = PF_OBJECT_KEYFRAME;
     job->index = k.index;
+    memcpy(job->break_reason, p->break_reason, sizeof job->break_reason);
     pf_store_give(d->store, job);
     return true;
 }
@@ -453,14 +487,14 @@ static void store_end(pf_pipeline *p, const char *reason)
                              .boots = p->boots,
                              .reason = reason,
                              .last_status = &status,
-                             .lost_index = survey.lost};
-    if (!pf_store_settle(d->store))
-        return;
+                             .lost_first = survey.lost_first,
+                             .lost_count = survey.lost_count};
+    pf_store_settle(d->store);
     pf_daemon_status(d, &status);
     pf_store_get_survey(d->store, &survey);
     memcpy(end.survey_id, d->survey_id, sizeof end.survey_id);
     end.frames = status.frames;
-    end.lost_count = survey.lost_count;
+    end.lost_ranges = survey.lost_ranges;
     job = pf_store_take(d->store);
     if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
         pf_log(PF_LOG_ERROR, "cannot make the survey's end message");
@@ -470,7 +504,7 @@ static void store_end(pf_pipeline *p, const char *reason)
     }
     job->kind = PF_OBJECT_SURVEY_END;
     pf_store_give(d->store, job);
-    (void)pf_store_settle(d->store);
+    pf_store_settle(d->store);
 }
 
 static void *run(void *argument)

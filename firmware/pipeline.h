@@ -11,17 +11,18 @@ typedef struct pf_pipeline pf_pipeline;
 /* Most bytes of a keyframe message with this configuration and camera: what the store's jobs must hold. */
 size_t pf_pipeline_object_max(const pf_daemon *daemon);
 
-/* Takes all memory; hands the SurveyStart to the store. False: error[n] says what failed. */
+/* Takes all memory; hands the store the SurveyEnd of an interrupted survey (`before`, if it has had boots) and the
+ * SurveyStart. False: error[n] says what failed. */
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
-                      char *error, size_t n);
+                      const pf_survey *before, char *error, size_t n);
 
 /* Starts the thread: captures until the recording ends, the camera fails or the daemon is stopped, then stores the
  * SurveyEnd and sets is_done. */
 bool pf_pipeline_start(pf_pipeline *pipeline, char *error, size_t n);
 bool pf_pipeline_is_done(pf_pipeline *pipeline);
 
-/* Joins the thread (pf_store_quit must have been called, or is_done be true) and frees all. False: the camera failed.
- */
+/* Joins the thread and frees all; the survey must have been stopped or over, and pf_store_flush been called, lest it
+ * wait for a host. False: the camera failed. */
 bool pf_pipeline_close(pf_pipeline *pipeline);
 
 #endif

@@ -11,7 +11,9 @@
 #include "config.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
-#include "pipefish/link.h"
+#include "pipefish/messages.h"
+
+#define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
 
 enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
 
@@ -28,26 +30,34 @@ struct pf_store {
     uint32_t free_count;
     pf_job **queue; /* ring, oldest first */
     uint32_t queue_first, queue_count;
-    bool is_blocked; /* the oldest job waits for room in the spool */
-    bool has_more;   /* the spool may hold an object after `cursor` */
-    uint64_t cursor; /* row of the last object that went into a slot */
+    bool is_blocked;   /* the oldest job waits for room in the spool */
+    bool is_failing;   /* the spool cannot be read, or not removed from, now */
+    uint64_t retry_ns; /* when to try again at the latest */
+    bool has_more;     /* the spool may hold an object after `cursor` */
+    uint64_t cursor;   /* row of the last object that went into a slot */
     pf_slot *slots;
     size_t slot_capacity;
-    bool is_hurried, is_quitting;
+    bool is_hurried, is_flushing, is_quitting;
     pf_store_stats stats;
+    /* The thread's own: */
+    bool was_blocked, was_failing;        /* has said so */
+    char lost_break[PF_BREAK_REASON_MAX]; /* of a keyframe that was lost: the next one that is stored tells it */
 };
 
 /* ---- the thread's work: each is called without the mutex */
 
-static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey)
+static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey, const char *break_reason)
 {
+    size_t n = job->n; /* the bytes behind are free: a job that waits is stored again */
     uint8_t name[32], value[PF_SURVEY_BYTES];
     size_t value_n = 0; /* of the survey's end: the value is deleted */
-    if (pf_sha256(job->bytes, job->n, name) != PF_OK)
+    if (break_reason[0] != '\0' && pf_msg_append_break(break_reason, job->bytes, s->config.capacity, &n) != PF_OK)
+        return PF_ERR_ARGUMENT;
+    if (pf_sha256(job->bytes, n, name) != PF_OK)
         return PF_ERR_IO;
     if (job->kind != PF_OBJECT_SURVEY_END)
         value_n = pf_survey_pack(survey, value);
-    return s->spool.ops->put_and_set(s->spool.self, job->kind, name, job->bytes, job->n, PF_SURVEY_KEY, value, value_n);
+    return s->spool.ops->put_and_set(s->spool.self, job->kind, name, job->bytes, n, PF_SURVEY_KEY, value, value_n);
 }
 
 static bool is_keyframe(const pf_job *job)
@@ -59,6 +69,19 @@ static void lose(pf_store *s, uint32_t index)
 {
     s->stats.keyframes_dropped++;
     pf_survey_lose(&s->survey, index);
+}
+
+static void lose_job(pf_store *s, const pf_job *job)
+{
+    if (is_keyframe(job))
+        lose(s, job->index);
+    else
+        s->stats.has_failed = true;
+}
+
+static const char *what(const pf_job *job)
+{
+    return is_keyframe(job) ? "a keyframe" : "the survey's start or end";
 }
 
 static void free_job(pf_store *s, pf_job *job)
@@ -81,15 +104,33 @@ static void do_job(pf_store *s)
     const pf_job *job = s->queue[s->queue_first];
     pf_survey survey = s->survey;
     uint64_t start = pf_now();
-    bool was_blocked = s->is_blocked;
+    bool may_wait = !s->is_flushing && (s->config.is_patient || !is_keyframe(job));
+    bool is_waiting;
+    char break_reason[PF_BREAK_REASON_MAX] = "";
     pf_status status;
 
     if (is_keyframe(job))
         survey.next_index = job->index + 1;
     pthread_mutex_unlock(&s->mutex);
-    status = store_object(s, job, &survey);
+    if (is_keyframe(job))
+        memcpy(break_reason, job->break_reason[0] ? job->break_reason : s->lost_break, sizeof break_reason);
+    status = store_object(s, job, &survey, break_reason);
+    is_waiting = status == PF_ERR_SPACE && may_wait;
+    if (is_waiting && !s->was_blocked)
+        pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
+    else if (status != PF_OK && !is_waiting)
+        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self), what(job));
+    s->was_blocked = is_waiting;
+    if (is_keyframe(job) && status == PF_OK)
+        s->lost_break[0] = '\0';
+    else if (is_keyframe(job) && !is_waiting)
+        memcpy(s->lost_break, break_reason, sizeof s->lost_break);
     pthread_mutex_lock(&s->mutex);
-    s->is_blocked = false;
+    if (is_waiting) {
+        s->is_blocked = !s->is_flushing;
+        s->retry_ns = pf_now() + RETRY_NS;
+        return;
+    }
     if (status == PF_OK) {
         s->has_more = true;
         s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
@@ -98,20 +139,24 @@ static void do_job(pf_store *s)
             s->stats.store_ns += pf_now() - start;
             s->stats.stored++;
         }
-    } else if (status == PF_ERR_SPACE && (s->config.is_patient || !is_keyframe(job))) {
-        if (!was_blocked)
-            pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
-        s->is_blocked = true;
-        return;
     } else {
-        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self),
-               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
-        if (is_keyframe(job))
-            lose(s, job->index);
-        else
-            s->stats.has_failed = true;
+        lose_job(s, job);
     }
     pop_job(s);
+}
+
+/* Says once, not every second, that the spool fails; without the mutex, after a call that says how. */
+static void note_failure(pf_store *s, bool is_failing)
+{
+    if (is_failing && !s->was_failing)
+        pf_log(PF_LOG_ERROR, "%s: trying again", s->spool.ops->error(s->spool.self));
+    s->was_failing = is_failing;
+}
+
+static void retry_later(pf_store *s)
+{
+    s->is_failing = true;
+    s->retry_ns = pf_now() + RETRY_NS;
 }
 
 /* Loads the next object into an empty slot. Enters and leaves with the mutex. */
@@ -126,36 +171,45 @@ static void fill_slot(pf_store *s, pf_slot *slot)
     status = s->spool.ops->next(s->spool.self, after, &slot->item);
     if (status == PF_OK) {
         status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
-        after = slot->item.row;
         if (status == PF_ERR_CHECKSUM) { /* of no use to anyone, and never acknowledged */
             pf_log(PF_LOG_ERROR, "%s: it is removed", s->spool.ops->error(s->spool.self));
             (void)s->spool.ops->remove(s->spool.self, slot->item.row);
-        } else if (status != PF_OK) {
+        } else if (status == PF_ERR_SPACE) {
             pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
         }
-    } else if (status != PF_ERR_END) {
-        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+        if (status != PF_ERR_IO)
+            after = slot->item.row;
     }
+    note_failure(s, status == PF_ERR_IO);
     pthread_mutex_lock(&s->mutex);
-    if (after != s->cursor)
+    if (after != s->cursor || status == PF_ERR_IO)
         s->has_more = true;
     s->cursor = after;
-    if (status == PF_OK) {
-        slot->state = SLOT_READY;
-        if (write(s->config.wake_fd, &one, sizeof one) < 0)
-            pf_log(PF_LOG_ERROR, "cannot wake the courier");
-    }
+    if (status == PF_ERR_IO)
+        retry_later(s);
+    if (status != PF_OK)
+        return;
+    slot->state = SLOT_READY;
+    pthread_mutex_unlock(&s->mutex);
+    if (write(s->config.wake_fd, &one, sizeof one) < 0)
+        pf_log(PF_LOG_ERROR, "cannot wake the courier");
+    pthread_mutex_lock(&s->mutex);
 }
 
 static void empty_slot(pf_store *s, pf_slot *slot)
 {
     uint64_t row = slot->item.row;
+    bool is_removed;
     pthread_mutex_unlock(&s->mutex);
-    if (s->spool.ops->remove(s->spool.self, row) != PF_OK)
-        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+    is_removed = s->spool.ops->remove(s->spool.self, row) == PF_OK;
+    note_failure(s, !is_removed);
     pthread_mutex_lock(&s->mutex);
-    slot->state = SLOT_EMPTY;
-    s->is_blocked = false;
+    if (is_removed) {
+        slot->state = SLOT_EMPTY;
+        s->is_blocked = false;
+    } else {
+        retry_later(s);
+    }
 }
 
 static void refresh_spool_stats(pf_store *s)
@@ -177,11 +231,11 @@ static bool do_round(pf_store *s)
         is_busy = true;
     }
     for (uint32_t i = 0; i < s->config.slots; i++) {
-        if (s->slots[i].state == SLOT_DONE) {
+        if (s->slots[i].state == SLOT_DONE && !s->is_failing) {
             empty_slot(s, &s->slots[i]);
             is_busy = true;
         }
-        if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_quitting) {
+        if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_failing && !s->is_quitting) {
             fill_slot(s, &s->slots[i]);
             is_busy = true;
         }
@@ -201,25 +255,14 @@ static void *run(void *argument)
         }
         if (s->is_quitting)
             break;
-        if (s->is_blocked) { /* room may come from elsewhere, too: a full disk that someone has cleaned up */
-            struct timespec until;
-            (void)clock_gettime(CLOCK_MONOTONIC, &until);
-            until.tv_sec += 1;
-            if (pthread_cond_timedwait(&s->work, &s->mutex, &until) != 0)
-                s->is_blocked = false;
+        if (s->is_blocked || s->is_failing) { /* room may come from elsewhere, too: someone cleans up a full disk */
+            const struct timespec until = {(time_t)(s->retry_ns / 1000000000u), (long)(s->retry_ns % 1000000000u)};
+            (void)pthread_cond_timedwait(&s->work, &s->mutex, &until);
+            if (pf_now() >= s->retry_ns)
+                s->is_blocked = s->is_failing = false;
         } else {
             pthread_cond_wait(&s->work, &s->mutex);
         }
-    }
-    while (s->queue_count > 0) {
-        const pf_job *job = s->queue[s->queue_first];
-        pf_log(PF_LOG_ERROR, "no room in the spool: %s is lost",
-               is_keyframe(job) ? "a keyframe" : "the survey's start or end");
-        if (is_keyframe(job))
-            lose(s, job->index);
-        else
-            s->stats.has_failed = true;
-        pop_job(s);
     }
     pthread_mutex_unlock(&s->mutex);
     return NULL;
@@ -318,16 +361,16 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
 void pf_store_quit(pf_store *s)
 {
     pthread_mutex_lock(&s->mutex);
-    s->is_quitting = true;
-    s->is_hurried = true;
+    s->is_quitting = s->is_hurried = s->is_flushing = true;
+    s->is_blocked = false;
     pthread_cond_broadcast(&s->work);
     pthread_cond_broadcast(&s->change);
     pthread_mutex_unlock(&s->mutex);
+    (void)pthread_join(s->thread, NULL);
 }
 
 void pf_store_close(pf_store *s)
 {
-    (void)pthread_join(s->thread, NULL);
     pthread_cond_destroy(&s->work);
     pthread_cond_destroy(&s->change);
     pthread_mutex_destroy(&s->mutex);
@@ -347,18 +390,29 @@ pf_job *pf_store_take(pf_store *s)
     pthread_mutex_lock(&s->mutex);
     while (s->free_count == 0 && s->config.is_patient && !s->is_hurried)
         pthread_cond_wait(&s->change, &s->mutex);
-    if (s->free_count > 0)
+    if (s->free_count > 0) {
         job = s->free_job[--s->free_count];
+        *job = (pf_job){.bytes = job->bytes};
+    }
     pthread_mutex_unlock(&s->mutex);
     return job;
 }
 
 void pf_store_give(pf_store *s, pf_job *job)
 {
+    bool is_late;
     pthread_mutex_lock(&s->mutex);
-    s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
-    pthread_cond_signal(&s->work);
+    is_late = s->is_quitting;
+    if (is_late) {
+        lose_job(s, job);
+        free_job(s, job);
+    } else {
+        s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
+        pthread_cond_signal(&s->work);
+    }
     pthread_mutex_unlock(&s->mutex);
+    if (is_late)
+        pf_log(PF_LOG_ERROR, "the store has quit: %s is lost", what(job));
 }
 
 void pf_store_give_back(pf_store *s, pf_job *job)
@@ -383,15 +437,22 @@ void pf_store_hurry(pf_store *s)
     pthread_mutex_unlock(&s->mutex);
 }
 
-bool pf_store_settle(pf_store *s)
+void pf_store_flush(pf_store *s)
 {
-    bool is_settled;
     pthread_mutex_lock(&s->mutex);
-    while (s->queue_count > 0 && !s->is_quitting)
-        pthread_cond_wait(&s->change, &s->mutex);
-    is_settled = s->queue_count == 0;
+    s->is_hurried = s->is_flushing = true;
+    s->is_blocked = false;
+    pthread_cond_broadcast(&s->work);
+    pthread_cond_broadcast(&s->change);
     pthread_mutex_unlock(&s->mutex);
-    return is_settled;
+}
+
+void pf_store_settle(pf_store *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    while (s->queue_count > 0)
+        pthread_cond_wait(&s->change, &s->mutex);
+    pthread_mutex_unlock(&s->mutex);
 }
 
 /* ---- the courier's side */

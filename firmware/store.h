@@ -7,11 +7,14 @@
 
 #include "survey.h"
 
+#define PF_BREAK_REASON_MAX 128u /* bytes, with the zero */
+
 typedef struct pf_job {
     uint8_t *bytes; /* capacity of pf_store_capacity() */
     size_t n;
-    uint32_t kind;  /* pf_object_kind */
-    uint32_t index; /* of a keyframe */
+    uint32_t kind;                          /* pf_object_kind */
+    uint32_t index;                         /* of a keyframe */
+    char break_reason[PF_BREAK_REASON_MAX]; /* of a keyframe; "" = tracks go on from the one before. Not in `bytes` */
 } pf_job;
 
 typedef struct pf_slot {
@@ -43,8 +46,11 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
                    char *error, size_t n);
 size_t pf_store_capacity(const pf_store *store);
 
-/* A job to fill; NULL: none is free (when patient: only after pf_store_hurry). Goes on with give or give_back. */
+/* A job to fill, all but its bytes zero; NULL: none is free (when patient: only after pf_store_hurry). Goes on with
+ * give or give_back. */
 pf_job *pf_store_take(pf_store *store);
+/* The store adds the break reason to a keyframe's message when it stores it: if the keyframe is lost, the next one that
+ * is stored carries it. */
 void pf_store_give(pf_store *store, pf_job *job);
 void pf_store_give_back(pf_store *store, pf_job *job);
 
@@ -54,8 +60,11 @@ void pf_store_lose(pf_store *store, uint32_t index);
 /* From now on take() does not wait: the survey is being stopped. */
 void pf_store_hurry(pf_store *store);
 
-/* Waits until every job is stored or dropped. False: pf_store_quit came first. */
-bool pf_store_settle(pf_store *store);
+/* From now on nothing waits for room in the spool: what does not fit is lost, and counted. */
+void pf_store_flush(pf_store *store);
+
+/* Waits until every job is stored or dropped: for room in the spool as well, unless pf_store_flush was called. */
+void pf_store_settle(pf_store *store);
 
 /* A slot whose object is to be sent, or NULL; and its return: the host has it, or has refused it for ever. */
 pf_slot *pf_store_next_slot(pf_store *store);
@@ -67,7 +76,8 @@ bool pf_store_is_drained(pf_store *store);
 void pf_store_get_stats(pf_store *store, pf_store_stats *stats);
 void pf_store_get_survey(pf_store *store, pf_survey *survey);
 
-/* The thread ends after what it does now; jobs that still wait for room are lost. Then close joins it and frees all. */
+/* Flushes, stores what is queued, removes what was released, and ends the thread. Nothing may come after it: what does
+ * counts as lost. Then close frees all. */
 void pf_store_quit(pf_store *store);
 void pf_store_close(pf_store *store);
 

@@ -5,7 +5,8 @@
 #include <string.h>
 #include <sys/random.h>
 
-#define FORMAT 1u /* of the packed survey: its first byte */
+#define FORMAT 2u  /* of the packed survey: its first byte */
+#define HEADER 61u /* bytes before the ranges */
 
 static void put_u32(uint8_t *out, uint32_t value)
 {
@@ -20,45 +21,59 @@ static uint32_t get_u32(const uint8_t *in)
 
 size_t pf_survey_pack(const pf_survey *s, uint8_t *out)
 {
+    uint32_t n = 0;
     out[0] = FORMAT;
     memcpy(out + 1, s->id, 16);
-    put_u32(out + 17, s->boots);
-    put_u32(out + 21, s->next_index);
-    put_u32(out + 25, s->lost_count);
-    for (uint32_t i = 0; i < s->lost_count; i++)
-        put_u32(out + 29 + 4 * i, s->lost[i]);
-    return 29 + 4 * (size_t)s->lost_count;
+    memcpy(out + 17, s->setup, 32);
+    put_u32(out + 49, s->boots);
+    put_u32(out + 53, s->next_index);
+    for (; n < s->lost_ranges && s->lost_first[n] < s->next_index; n++) {
+        uint32_t before = s->next_index - s->lost_first[n];
+        put_u32(out + HEADER + 8 * n, s->lost_first[n]);
+        put_u32(out + HEADER + 8 * n + 4, s->lost_count[n] < before ? s->lost_count[n] : before);
+    }
+    put_u32(out + 57, n);
+    return HEADER + 8 * (size_t)n;
 }
 
 static bool unpack(pf_survey *s, const uint8_t *in, size_t n)
 {
-    if (n < 29 || in[0] != FORMAT || get_u32(in + 25) > PF_SURVEY_LOST_MAX || n != 29 + 4 * (size_t)get_u32(in + 25))
+    if (n < HEADER || in[0] != FORMAT || get_u32(in + 57) > PF_SURVEY_LOST_MAX ||
+        n != HEADER + 8 * (size_t)get_u32(in + 57))
         return false;
     memcpy(s->id, in + 1, 16);
-    s->boots = get_u32(in + 17);
-    s->next_index = get_u32(in + 21);
-    s->lost_count = get_u32(in + 25);
-    for (uint32_t i = 0; i < s->lost_count; i++)
-        s->lost[i] = get_u32(in + 29 + 4 * i);
+    memcpy(s->setup, in + 17, 32);
+    s->boots = get_u32(in + 49);
+    s->next_index = get_u32(in + 53);
+    s->lost_ranges = get_u32(in + 57);
+    for (uint32_t i = 0; i < s->lost_ranges; i++) {
+        s->lost_first[i] = get_u32(in + HEADER + 8 * i);
+        s->lost_count[i] = get_u32(in + HEADER + 8 * i + 4);
+    }
     return true;
 }
 
-bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_t n)
+bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,
+                    size_t n)
 {
     uint8_t bytes[PF_SURVEY_BYTES];
     size_t size = 0;
     pf_status status = spool->ops->get(spool->self, PF_SURVEY_KEY, bytes, sizeof bytes, &size);
     memset(survey, 0, sizeof *survey);
+    memset(before, 0, sizeof *before);
     if (status == PF_OK && unpack(survey, bytes, size)) {
-        survey->is_resumed = true;
-        survey->boots++;
-        return true;
-    }
-    if (status == PF_OK) {
+        if (memcmp(survey->setup, setup, sizeof survey->setup) == 0) {
+            survey->is_resumed = true;
+            survey->boots++;
+            return true;
+        }
+        *before = *survey;
+        memset(survey, 0, sizeof *survey);
+    } else if (status == PF_OK) {
         (void)snprintf(error, n, "the survey that the spool remembers was written by another version");
         return false;
     }
-    if (status != PF_ERR_END) {
+    if (status != PF_OK && status != PF_ERR_END) {
         (void)snprintf(error, n, "%s", spool->ops->error(spool->self));
         return false;
     }
@@ -66,12 +81,61 @@ bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_
         (void)snprintf(error, n, "no random numbers: %s", strerror(errno));
         return false;
     }
+    memcpy(survey->setup, setup, sizeof survey->setup);
     survey->boots = 1;
     return true;
 }
 
-void pf_survey_lose(pf_survey *survey, uint32_t index)
+/* Makes one range of range i and the next. */
+static void join(pf_survey *s, uint32_t i)
 {
-    if (survey->lost_count < PF_SURVEY_LOST_MAX)
-        survey->lost[survey->lost_count++] = index;
+    size_t rest = s->lost_ranges - i - 2;
+    s->lost_count[i] = s->lost_first[i + 1] + s->lost_count[i + 1] - s->lost_first[i];
+    memmove(s->lost_first + i + 1, s->lost_first + i + 2, rest * sizeof *s->lost_first);
+    memmove(s->lost_count + i + 1, s->lost_count + i + 2, rest * sizeof *s->lost_count);
+    s->lost_ranges--;
+}
+
+/* Of several equal distances the oldest: what lies there has most likely been delivered. */
+static void join_closest(pf_survey *s)
+{
+    uint32_t best = 0, least = UINT32_MAX;
+    for (uint32_t i = 0; i + 1 < s->lost_ranges; i++) {
+        uint32_t distance = s->lost_first[i + 1] - s->lost_first[i] - s->lost_count[i];
+        if (distance < least) {
+            least = distance;
+            best = i;
+        }
+    }
+    join(s, best);
+}
+
+void pf_survey_lose(pf_survey *s, uint32_t index)
+{
+    uint32_t at = s->lost_ranges; /* the first range after index */
+    while (at > 0 && s->lost_first[at - 1] > index)
+        at--;
+    if (at > 0 && index - s->lost_first[at - 1] < s->lost_count[at - 1])
+        return;
+    if (at > 0 && index - s->lost_first[at - 1] == s->lost_count[at - 1]) {
+        s->lost_count[at - 1]++;
+        if (at < s->lost_ranges && s->lost_first[at] == index + 1)
+            join(s, at - 1);
+        return;
+    }
+    if (at < s->lost_ranges && s->lost_first[at] == index + 1) {
+        s->lost_first[at]--;
+        s->lost_count[at]++;
+        return;
+    }
+    if (s->lost_ranges == PF_SURVEY_LOST_MAX) {
+        join_closest(s);
+        pf_survey_lose(s, index); /* may lie in the joined range */
+        return;
+    }
+    memmove(s->lost_first + at + 1, s->lost_first + at, (s->lost_ranges - at) * sizeof *s->lost_first);
+    memmove(s->lost_count + at + 1, s->lost_count + at, (s->lost_ranges - at) * sizeof *s->lost_count);
+    s->lost_first[at] = index;
+    s->lost_count[at] = 1;
+    s->lost_ranges++;
 }

@@ -9,26 +9,31 @@
 #include "pipefish/drivers/spool.h"
 
 #define PF_SURVEY_KEY      "survey"
-#define PF_SURVEY_LOST_MAX 1024u /* numbers of lost keyframes that are remembered; more are only counted */
-#define PF_SURVEY_BYTES    (1u + 16u + 3u * 4u + 4u * PF_SURVEY_LOST_MAX)
+#define PF_SURVEY_LOST_MAX 1024u /* ranges of lost keyframes that are remembered */
+#define PF_SURVEY_BYTES    (1u + 16u + 32u + 3u * 4u + 8u * PF_SURVEY_LOST_MAX)
 
 typedef struct pf_survey {
     uint8_t id[16];
-    uint32_t boots;      /* starts of the daemon so far, this one included */
-    uint32_t next_index; /* of the next keyframe */
-    uint32_t lost_count;
-    uint32_t lost[PF_SURVEY_LOST_MAX];
+    uint8_t setup[32];    /* SHA-256 of what must not change within a survey */
+    uint32_t boots;       /* starts of the daemon so far, this one included */
+    uint32_t next_index;  /* of the next keyframe */
+    uint32_t lost_ranges; /* ascending, with a keyframe between any two */
+    uint32_t lost_first[PF_SURVEY_LOST_MAX], lost_count[PF_SURVEY_LOST_MAX];
     bool is_resumed; /* not the survey's first boot */
 } pf_survey;
 
-/* Goes on with the survey that the spool remembers, or begins one with a random id. False: error[n] says what failed.
- */
-bool pf_survey_open(pf_survey *survey, const pf_spool *spool, char *error, size_t n);
+/* Goes on with the survey that the spool remembers if it has the same setup, or begins one with a random id. *before
+ * gets the survey of another setup that was interrupted, and must be ended; boots = 0: there is none. False: error[n]
+ * says what failed. */
+bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,
+                    size_t n);
 
-/* The survey as the spool keeps it; returns its bytes, PF_SURVEY_BYTES at most. */
+/* The survey as the spool keeps it; returns its bytes, PF_SURVEY_BYTES at most. Lost keyframes from next_index on are
+ * left out: the next boot uses their numbers again. */
 size_t pf_survey_pack(const pf_survey *survey, uint8_t *out);
 
-/* Remembers a keyframe that was made but cannot be delivered. */
+/* Remembers a keyframe that was made but cannot be delivered. Of more than PF_SURVEY_LOST_MAX ranges the closest two
+ * become one, which then covers keyframes that are not lost: the host counts those that it has as received. */
 void pf_survey_lose(pf_survey *survey, uint32_t index);
 
 #endif

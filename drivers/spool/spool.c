@@ -205,7 +205,7 @@ static pf_status insert(spool *s, const object *o, bool *stored)
         return PF_OK;
     if (code != SQLITE_DONE)
         return fail_call(s, "storing");
-    if (s->quota != 0 && (o->n > s->quota || s->stats.bytes > s->quota - o->n)) {
+    if (s->quota != 0 && s->stats.bytes > s->quota - o->n) {
         s->stats.errors++;
         return pf_fail(&s->failure, PF_ERR_SPACE, "%s: quota: %" PRIu64 " bytes wait, %zu more are above %" PRIu64,
                        s->path, s->stats.bytes, o->n, s->quota);
@@ -272,6 +272,8 @@ static pf_status spool_put_and_set(void *self, uint32_t kind, const uint8_t name
     object o = {kind, name, bytes, n};
     if (n == 0 || n > UINT32_MAX)
         return fail_argument(s, "an object must have 1..2^32 - 1 bytes");
+    if (s->quota != 0 && n > s->quota)
+        return fail_argument(s, "an object is larger than the whole quota");
     return store(s, &o, key, value, value_n);
 }
 

@@ -293,7 +293,7 @@ def receive(
     receiver.client.close()
     summary = receiver.summary()
     keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
-    lost = {w.path: len(w.content.end.lost_index) if w.content.end else 0 for w in store.writers.values()}
+    lost = {w.path: w.content.lost for w in store.writers.values()}
     damaged = [str(w.damaged) for w in store.writers.values() if w.damaged]
     try:
         finished = store.finish_complete({key: str(value) for key, value in summary.items()})
@@ -304,7 +304,7 @@ def receive(
         raise Interrupted(f"{why}: {_resume_text(finished, partial, keyframes)}")
     if file not in keyframes:  # it was complete before, under another name
         content = read_content(file)
-        keyframes[file], lost[file] = len(content.indices), len(content.end.lost_index) if content.end else 0
+        keyframes[file], lost[file] = len(content.indices), content.lost
     return {
         "file": str(file),
         "keyframes": keyframes[file],

@@ -304,8 +304,8 @@ class Survey:
 
     @property
     def lost(self) -> list[int]:
-        """Indices of keyframes that the device says were made but can never be delivered."""
-        return sorted(self.end.lost_index) if self.end else []
+        """Indices of keyframes that the device says were made but can never be delivered. Ascending."""
+        return sorted(lost_indices(self.end) - {k.index for k in self.keyframes}) if self.end else []
 
     @property
     def complete(self) -> bool:
@@ -441,6 +441,12 @@ class Survey:
             "end_reason": self.end.reason if self.end else None,
             "link": self.metadata,
         }
+
+
+def lost_indices(end: pb.SurveyEnd) -> set[int]:
+    """The keyframes of a survey that its end lists as lost; some may have arrived (pipefish.proto)."""
+    ranges = zip(end.lost_first, end.lost_count, strict=False)
+    return {i for first, count in ranges for i in range(first, min(first + count, end.keyframes))}
 
 
 def profile_summary(binary: bytes) -> dict[str, Any] | None:

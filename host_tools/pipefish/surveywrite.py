@@ -28,7 +28,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
 from pipefish.errors import FormatError, PipefishError, file_error
 from pipefish.mcapscan import McapScan
-from pipefish.survey import UNKNOWN_ERROR_NS, Observations
+from pipefish.survey import UNKNOWN_ERROR_NS, Observations, lost_indices
 
 FORMAT_VERSION = 1  # of the layout in docs/survey.md
 OBJECT_START, OBJECT_KEYFRAME, OBJECT_END = 1, 2, 3  # pf_object_kind
@@ -149,7 +149,12 @@ class Content:
         """Keyframes that the device made and did not lose, and that are not here; [] before the survey's end."""
         if self.end is None:
             return []
-        return sorted(set(range(self.end.keyframes)) - self.indices - set(self.end.lost_index))
+        return sorted(set(range(self.end.keyframes)) - self.indices - lost_indices(self.end))
+
+    @property
+    def lost(self) -> int:
+        """Number of keyframes that the device lost."""
+        return len(lost_indices(self.end) - self.indices) if self.end else 0
 
     def note(self, topic: str, data: bytes) -> None:
         """Takes in one message of the file. Raises DecodeError."""
@@ -355,7 +360,7 @@ class SurveyWriter:
         Raises PipefishError, OSError; what was stored then stays in the partial file."""
         self._check_place()
         self._refuse_finished()
-        start, end = self.content.start, self.content.end
+        start = self.content.start
         self._writer.flush()
         about = {
             "format": str(FORMAT_VERSION),
@@ -364,7 +369,7 @@ class SurveyWriter:
             "name": start.name if start else "",
             "device_software": start.software if start else "",
             "keyframes": str(len(self.content.indices)),
-            "keyframes_lost": str(len(end.lost_index) if end else 0),
+            "keyframes_lost": str(self.content.lost),
         }
         self._writer.add_metadata("pipefish", {**about, **notes})
         if start is not None and start.profile:

@@ -228,6 +228,9 @@ size_t pf_link_input(pf_link *link, const uint8_t *bytes, size_t n, uint64_t now
         else if (link->in_size < sizeof link->in)
             link->in[link->in_size++] = byte;
     }
+    /* Here too, for a line that takes nothing is given no output; after the bytes, for they may be a sign of life. */
+    if (i == n && link->event_count == 0)
+        pf_session_tick(link);
     link->stats.bytes_in += i;
     return i;
 }

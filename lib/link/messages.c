@@ -173,6 +173,7 @@ static void set_telemetry(pipefish_v1_Telemetry *out, const pf_msg_telemetry *in
     out->gain = in->gain;
     out->has_lamp = in->has_lamp;
     out->lamp = in->lamp;
+    out->emergency_stop = in->emergency_stop;
 }
 
 static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
@@ -252,9 +253,19 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     m.has_observations = true;
     set_observations(&m.observations, columns, k->tracks, k->n_tracks);
     m.common_tracks = k->common_tracks;
-    m.after_break = k->break_reason != NULL;
-    m.break_reason = text(k->break_reason);
     return encode(pipefish_v1_Keyframe_fields, &m, out, capacity, n);
+}
+
+/* A message of Protocol Buffers followed by fields is that message with these fields. */
+pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity, size_t *n)
+{
+    pb_ostream_t stream = pb_ostream_from_buffer(out + *n, capacity - *n);
+    if (!pb_encode_tag(&stream, PB_WT_VARINT, pipefish_v1_Keyframe_after_break_tag) || !pb_encode_varint(&stream, 1) ||
+        !pb_encode_tag(&stream, PB_WT_STRING, pipefish_v1_Keyframe_break_reason_tag) ||
+        !pb_encode_string(&stream, (const uint8_t *)reason, strlen(reason)))
+        return PF_ERR_SPACE;
+    *n += stream.bytes_written;
+    return PF_OK;
 }
 
 typedef struct lines_view {
@@ -325,7 +336,7 @@ static bool write_numbers(pb_ostream_t *stream, const pb_field_t *field, void *c
 pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *e, uint8_t *out, size_t capacity, size_t *n)
 {
     pipefish_v1_SurveyEnd m = pipefish_v1_SurveyEnd_init_zero;
-    numbers_view lost = {e->lost_index, e->lost_count};
+    numbers_view lost_first = {e->lost_first, e->lost_ranges}, lost_count = {e->lost_count, e->lost_ranges};
 
     memcpy(m.survey_id, e->survey_id, sizeof m.survey_id);
     m.has_time = true;
@@ -337,8 +348,9 @@ pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *e, uint8_t *out, siz
     m.has_last_status = e->last_status != NULL;
     if (e->last_status)
         set_status(&m.last_status, e->last_status);
-    m.lost_index.funcs.encode = write_numbers;
-    m.lost_index.arg = &lost;
+    m.lost_first.funcs.encode = m.lost_count.funcs.encode = write_numbers;
+    m.lost_first.arg = &lost_first;
+    m.lost_count.arg = &lost_count;
     return encode(pipefish_v1_SurveyEnd_fields, &m, out, capacity, n);
 }
 

@@ -15,6 +15,7 @@ static void encode(const uint8_t *data, size_t n)
     pf_msg_keyframe k;
     size_t size = 0, jpeg_size, small, unused;
     uint64_t id = 0;
+    bool has_break;
     if (n < sizeof k)
         return;
     memset(&k, 0, sizeof k);
@@ -25,7 +26,7 @@ static void encode(const uint8_t *data, size_t n)
     memcpy(&k.telemetry.encoder_count, data + 44, 8);
     k.telemetry.has_encoder = data[52] & 1;
     k.telemetry.has_attitude = data[52] & 2;
-    k.break_reason = data[52] & 4 ? "gap" : NULL;
+    has_break = data[52] & 4;
     small = data[53];
     data += sizeof k;
     n -= sizeof k;
@@ -44,7 +45,9 @@ static void encode(const uint8_t *data, size_t n)
     k.jpeg_size = jpeg_size;
     if (pf_msg_encode_keyframe(&k, out, PF_MSG_KEYFRAME_MAX(k.n_tracks, jpeg_size), &size) != PF_OK)
         abort();
-    if (small < size && pf_msg_encode_keyframe(&k, out, small, &unused) != PF_ERR_SPACE)
+    if (has_break && pf_msg_append_break("gap", out, PF_MSG_KEYFRAME_MAX(k.n_tracks, jpeg_size), &size) != PF_OK)
+        abort();
+    if (small < size && !has_break && pf_msg_encode_keyframe(&k, out, small, &unused) != PF_ERR_SPACE)
         abort();
 }
 

@@ -83,7 +83,8 @@ def end(keyframes: int, survey: bytes = SURVEY, boot: int = BOOT, lost: tuple[in
         survey_id=survey, keyframes=keyframes, frames=keyframes * 5, boots=1, reason="end of recording"
     )
     message.time.boot_id, message.time.monotonic_ns = boot, 60_000_000_000
-    message.lost_index.extend(lost)
+    message.lost_first.extend(lost)
+    message.lost_count.extend(1 for _ in lost)
     message.last_status.frames = keyframes * 5
     message.last_status.fps = 31.5
     message.last_status.stage.track = 4200.0

@@ -8,6 +8,7 @@ import os
 import random
 import signal
 import socket
+import sqlite3
 import subprocess
 import time
 from collections import Counter
@@ -21,6 +22,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import ACCEPT, STORED, Client, Handlers
+from pipefish.survey import lost_indices
 from pipefish.transport import TcpTransport, TransportClosed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -202,6 +204,12 @@ def wait_for_log(crawler: Crawler, text: str) -> None:
         time.sleep(0.02)
 
 
+def spooled(crawler: Crawler) -> Counter[int]:
+    """How many objects of each kind the spool of a daemon that has ended holds."""
+    with contextlib.closing(sqlite3.connect(crawler.config.parent / "spool.db")) as database:
+        return Counter(kind for (kind,) in database.execute("SELECT kind FROM object"))
+
+
 def receive_all(crawler: Crawler, store: Store) -> int:
     """Serves the daemon until it exits; returns its exit code."""
     with store.client() as client:
@@ -318,7 +326,7 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     assert {start.survey_id} == {k.survey_id for k in keyframes} | {end.survey_id}
     assert [k.index for k in keyframes] == list(range(20))
     assert end.reason == "end of recording"
-    assert (end.keyframes, end.frames, end.boots, list(end.lost_index)) == (20, 40, 1, [])
+    assert (end.keyframes, end.frames, end.boots, list(end.lost_first)) == (20, 40, 1, [])
     assert set(store.arrivals.values()) == {1}
 
     boot = start.time.boot_id
@@ -456,6 +464,49 @@ def test_what_could_not_be_sent_is_delivered_by_the_next_start_before_its_new_su
     assert old_end <= 21 + 3
 
 
+def test_without_time_to_drain_every_keyframe_made_and_the_end_are_still_stored(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=0", "--set", "camera.loops=0", *EVERY_FRAME)
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.terminate()
+    assert crawler.wait() == 0
+    made = int(crawler.text().split("survey ends: terminated; ")[1].split()[0])
+    assert spooled(crawler) == {START: 1, KEYFRAME: made, END: 1}
+
+
+class LateStore(Store):
+    """A host that takes the survey's end in, but acknowledges it only when `may_acknowledge` says so."""
+
+    may_acknowledge = False
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        return None if kind == END and not self.may_acknowledge else super().on_object(name, kind, data)
+
+
+def test_an_acknowledgement_at_the_last_moment_still_empties_the_spool(crawler: Crawler):
+    store = LateStore(crawler.port)
+    crawler.start("--set", "daemon.drain_s=1", "--set", "daemon.log_level=debug")
+    with store.client() as client:
+        serve(crawler, client, lambda: "the link closes" in crawler.text())
+        store.may_acknowledge = True
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    assert len(store.ends) == 1
+    assert spooled(crawler) == {}
+
+
+def test_a_shutdown_waits_for_a_host_that_takes_nothing_only_as_long_as_a_signal_does(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=1", "--set", "daemon.exit_when_done=false")
+    with contextlib.closing(Client(TcpTransport("127.0.0.1", crawler.port), Handlers(), wants_objects=False)) as client:
+        wait_for_log(crawler, "survey ends")
+        client.open()
+        serve(crawler, client, lambda: client.up)
+        client.ask(shutdown=pb.Nothing())
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
+    assert spooled(crawler) == {START: 1, KEYFRAME: 20, END: 1}
+
+
 def test_a_second_sigterm_exits_at_once(crawler: Crawler):
     crawler.start("--set", "camera.loops=0")
     with Store(crawler.port).client():
@@ -510,6 +561,37 @@ def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawle
     assert crawler.wait() == 0
 
 
+def wake_ups_per_second(crawler: Crawler, seconds: float) -> float:
+    """How often the daemon's threads have gone to sleep, a second."""
+
+    def count() -> int:
+        tasks = Path(f"/proc/{crawler.process.pid}/task").glob("*/status")
+        return sum(int(t.read_text().split("voluntary_ctxt_switches:")[1].split()[0]) for t in tasks)
+
+    first, begin = count(), time.monotonic()
+    time.sleep(seconds)
+    return (count() - first) / (time.monotonic() - begin)
+
+
+def test_a_daemon_without_a_host_sleeps(crawler: Crawler):
+    crawler.start()
+    wait_for_log(crawler, "survey ends")
+    assert wake_ups_per_second(crawler, 1) < 200  # it looks around 20 times a second, the rest is spare
+
+
+def test_a_host_that_reads_nothing_counts_as_gone_and_costs_no_wake_ups(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 600)
+    store = Store(crawler.port)
+    full_line = ("--set", "link.window=1048576", "--set", "link.send_slots=16")
+    crawler.start("--set", "link.keepalive_ms=200", *full_line, *EVERY_FRAME)
+    with store.client() as client:
+        client.transport._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # it fills up at once
+        serve(crawler, client, lambda: len(store.objects) > 3)
+        wait_for_log(crawler, "host has gone")  # from here on it reads nothing
+        wait_for_log(crawler, "survey ends")
+        assert wake_ups_per_second(crawler, 1) < 1500
+
+
 def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Path, crawler: Crawler):
     recording = tmp_path / "survey.y4m"
     csv = recording.with_suffix(".csv")
@@ -537,7 +619,13 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
-    assert list(end_message.lost_index) == []
+    assert list(end_message.lost_first) == []
+
+
+def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
+    done = run("--config", crawler.config, "--set", "spool.quota_mb=0.05")
+    assert done.returncode == 1
+    assert "spool.quota_mb = 0.05: an object of this camera may have" in done.stderr
 
 
 def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
@@ -547,7 +635,7 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
     wait_for_log(crawler, "survey ends")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
-    lost, got = set(end_message.lost_index), {k.index for k in store.keyframes}
+    lost, got = lost_indices(end_message), {k.index for k in store.keyframes}
     assert lost
     assert lost & got == set()
     assert lost | got == set(range(end_message.keyframes))
@@ -562,7 +650,7 @@ def check_everything_arrived_once(store: Store, kills: int) -> None:
     [end] = store.ends
     assert {k.survey_id for k in store.keyframes} == {end.survey_id}
     assert [k.index for k in store.keyframes] == list(range(end.keyframes))
-    assert list(end.lost_index) == []
+    assert list(end.lost_first) == []
     assert 1 < end.boots <= kills + 1
     # One start for each boot that came to store it; each boot's first keyframe is marked.
     boots = [s.time.boot_id for s in store.starts]
@@ -590,6 +678,24 @@ def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path,
     crawler.start()
     assert receive_all(crawler, store) == 0
     check_everything_arrived_once(store, kills)
+
+
+@pytest.mark.parametrize("change", ["survey.name=the next pipe", "encoder.metres_per_count=0.0002"])
+def test_after_kill_9_another_setup_begins_another_survey_and_ends_the_old_one(crawler: Crawler, change: str):
+    crawler.start("--set", "camera.loops=0")
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.kill()
+    store = Store(crawler.port)
+    crawler.start("--set", change)
+    assert receive_all(crawler, store) == 0
+    ends = {e.reason: e for e in store.ends}
+    old, new = ends["interrupted; another survey began"], ends["end of recording"]
+    assert [s.survey_id for s in store.starts] == [old.survey_id, new.survey_id]
+    for end in (old, new):
+        assert [k.index for k in store.keyframes if k.survey_id == end.survey_id] == list(range(end.keyframes))
+        assert (end.boots, list(end.lost_first)) == (1, [])
+    assert not next(k for k in store.keyframes if k.survey_id == new.survey_id).after_break
 
 
 def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(

@@ -204,7 +204,7 @@ def test_lens_is_outside_the_model_family_but_close_to_it(tmp_path: Path) -> Non
     simulate("tiny", tmp_path / "t", frames=1, quiet=True)
     profile = json.loads((tmp_path / "t.profile.json").read_text())
     assert profile["source"] == "simulated"
-    # A wave of 0.1 px that grows to the rim has an rms of 0.1 / sqrt(2 x 5) = 0.03 px; a polynomial follows little of it.
+    # A wave of 0.1 px that grows to the rim has an rms of 0.1 / sqrt(10) px; a polynomial follows little of it.
     assert 0.015 < profile["rms_px"] < 0.035
     lens = Scene.load("demo").lens()
     theta, pupil = np.array(lens["theta"]), np.array(lens["pupil_m"])

@@ -15,7 +15,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError, PipefishError
 from pipefish.survey import Observations, Survey
 from pipefish.surveystore import SurveyStore
-from pipefish.surveywrite import SurveyWriter
+from pipefish.surveywrite import OBJECT_END, SurveyWriter
 from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 
@@ -276,6 +276,18 @@ def test_lost_keyframes_do_not_keep_a_survey_open(tmp_path):
     write_survey(path, objects=[start(), keyframe(0), keyframe(2), end(3, lost=(1,))])
     survey = Survey.open(path)
     assert survey.complete and survey.missing == survey.lost == [1]
+
+
+def test_a_long_range_of_lost_keyframes_is_understood_and_what_arrived_of_it_is_not_lost(tmp_path):
+    path = tmp_path / "survey.mcap"
+    message = pb.SurveyEnd.FromString(end(3000)[2])
+    message.lost_first.extend((1, 2500))
+    message.lost_count.extend((2000, 2**32 - 1))  # joined over keyframe 1500, which did arrive; and past the end
+    objects = [start(), keyframe(0), keyframe(1500), *(keyframe(i, tracks=0) for i in range(2001, 2500))]
+    write_survey(path, objects=[*objects, as_object(OBJECT_END, message)])
+    survey = Survey.open(path)
+    assert survey.complete
+    assert survey.lost == survey.missing == [*range(1, 1500), *range(1501, 2001), *range(2500, 3000)]
 
 
 def test_pictures_survive_recompression_by_other_tools(tmp_path):

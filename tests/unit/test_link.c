@@ -483,6 +483,25 @@ static void test_examples_of_the_specification_are_what_is_sent(void)
     free(spec);
 }
 
+/* Proves: silence is noticed by input alone, without a byte, for nobody asks for output while the line takes nothing; and
+ * bytes that come late are still a sign of life. */
+static void test_silence_is_noticed_without_output(void)
+{
+    open_both();
+    now += 3999 * MS;
+    feed(&a, NULL, 0);
+    TEST_ASSERT_TRUE(pf_link_is_up(a.link));
+    now += 1 * MS;
+    (void)move(&b, &a);
+    TEST_ASSERT_TRUE(pf_link_is_up(a.link));
+    now += 3999 * MS;
+    (void)pf_link_input(a.link, NULL, 0, now);
+    TEST_ASSERT_TRUE(pf_link_is_up(a.link));
+    now += 1000 * MS;
+    (void)pf_link_input(a.link, NULL, 0, now);
+    TEST_ASSERT_FALSE(pf_link_is_up(a.link));
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -501,5 +520,6 @@ int main(void)
     RUN_TEST(test_truncated_frames_of_every_type);
     RUN_TEST(test_output_writes_whole_frames_within_its_capacity);
     RUN_TEST(test_examples_of_the_specification_are_what_is_sent);
+    RUN_TEST(test_silence_is_noticed_without_output);
     return UNITY_END();
 }

@@ -146,7 +146,8 @@ static pf_msg_telemetry sample_telemetry(void)
                               .attitude_sigma_rad = 0.0625f,
                               .exposure_us = 8000,
                               .gain = 2.5f,
-                              .lamp = 0.75f};
+                              .lamp = 0.75f,
+                              .emergency_stop = true};
 }
 
 static pf_msg_status sample_status(void)
@@ -216,8 +217,7 @@ static pf_msg_keyframe sample_keyframe(const pf_track *tracks)
                          .telemetry = sample_telemetry(),
                          .tracks = tracks,
                          .n_tracks = TRACKS,
-                         .common_tracks = 44,
-                         .break_reason = "restart"};
+                         .common_tracks = 44};
     memcpy(k.survey_id, survey_id, 16);
     memset(k.frame_sha256, 0xAB, 32);
     return k;
@@ -248,7 +248,7 @@ static pf_msg_survey_start sample_start(void)
     return s;
 }
 
-static const uint32_t lost[] = {3, 300, 4294967295u};
+static const uint32_t lost_first[] = {3, 300, 4294967295u}, lost_count[] = {290, 1, 1};
 
 static pf_msg_survey_end sample_end(const pf_msg_status *status)
 {
@@ -258,8 +258,9 @@ static pf_msg_survey_end sample_end(const pf_msg_status *status)
                            .frames = 1234567890123u,
                            .reason = "terminated",
                            .last_status = status,
-                           .lost_index = lost,
-                           .lost_count = 3};
+                           .lost_first = lost_first,
+                           .lost_count = lost_count,
+                           .lost_ranges = 3};
     memcpy(e.survey_id, survey_id, 16);
     return e;
 }
@@ -278,6 +279,7 @@ static void check_telemetry(view t)
     TEST_ASSERT_EQUAL_FLOAT(2.5f, real32(t, 7));
     TEST_ASSERT_EQUAL_FLOAT(0.75f, real32(t, 8));
     TEST_ASSERT_EQUAL_UINT64(3, number(t, 9));
+    TEST_ASSERT_EQUAL_UINT64(1, number(t, 10));
 }
 
 static void check_status(view s)
@@ -318,6 +320,8 @@ static void test_keyframe_round_trip(void)
     sample_tracks(tracks);
     k = sample_keyframe(tracks);
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_append_break("restart", out, n + 10, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break("restart", out, n + 11, &n));
     m = (view){out, n};
     TEST_ASSERT_EQUAL_MEMORY(survey_id, bytes(m, 1).data, 16);
     TEST_ASSERT_EQUAL_UINT64(12, number(m, 2));
@@ -371,13 +375,12 @@ static void test_unmeasured_telemetry_is_absent(void)
     sample_tracks(tracks);
     k = sample_keyframe(tracks);
     k.telemetry = (pf_msg_telemetry){.time = {1, 2}, .has_attitude = true};
-    k.break_reason = NULL;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
     t = bytes((view){out, n}, 11);
     TEST_ASSERT_TRUE(has(t, 3));
     TEST_ASSERT_TRUE(has(t, 4));
     TEST_ASSERT_FALSE(has(t, 2));
-    for (uint32_t field = 5; field <= 9; field++)
+    for (uint32_t field = 5; field <= 10; field++)
         TEST_ASSERT_FALSE(has(t, field));
     TEST_ASSERT_FALSE(has((view){out, n}, 14));
     TEST_ASSERT_FALSE(has((view){out, n}, 15));
@@ -439,7 +442,11 @@ static void test_survey_end_status_and_preview_round_trip(void)
     check_status(bytes(m, 7));
     packed = bytes(m, 8);
     for (int i = 0; i < 3; i++)
-        TEST_ASSERT_EQUAL_UINT64(lost[i], varint(&packed));
+        TEST_ASSERT_EQUAL_UINT64(lost_first[i], varint(&packed));
+    TEST_ASSERT_EQUAL_size_t(0, packed.n);
+    packed = bytes(m, 9);
+    for (int i = 0; i < 3; i++)
+        TEST_ASSERT_EQUAL_UINT64(lost_count[i], varint(&packed));
     TEST_ASSERT_EQUAL_size_t(0, packed.n);
 
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_preview(&p, out, sizeof out, &n));
@@ -490,7 +497,7 @@ static void test_largest_status_fits_a_control_message(void)
     memset(&s, 0xFF, sizeof s);
     s.state = "surveying";
     s.link_up = s.has_clock = s.telemetry.has_encoder = s.telemetry.has_attitude = s.telemetry.has_exposure = true;
-    s.telemetry.has_gain = s.telemetry.has_lamp = true;
+    s.telemetry.has_gain = s.telemetry.has_lamp = s.telemetry.emergency_stop = true;
     s.telemetry.attitude_sigma_rad = 1.0f;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 }
@@ -568,10 +575,10 @@ static void test_keyframe_bound_holds_for_the_largest_numbers(void)
     reason[256] = '\0';
     k = sample_keyframe(tracks);
     k.n_tracks = PF_TRACKS_MAX;
-    k.break_reason = reason;
     k.index = k.width = k.height = k.jpeg_quality = k.common_tracks = UINT32_MAX;
     k.frame_sequence = k.time.monotonic_ns = UINT64_MAX;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break(reason, out, sizeof out, &n));
     TEST_ASSERT_GREATER_THAN_size_t(sizeof out * 9 / 10, n);
 }
 

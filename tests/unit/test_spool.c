@@ -177,6 +177,11 @@ static void test_quota(void)
     close_spool();
     open_spool("quota.db", quota - 1);
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(6));
+    /* Larger than the whole quota: it never fits, and nobody must wait for that. */
+    close_spool();
+    open_spool("small.db", make_object(6) - 1);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, put(6));
+    TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "quota"));
 }
 
 /* ---- syncs: SQLite's calls land here, the program's symbols come first ---- */

@@ -76,10 +76,11 @@ public:
     {
         nb::list events;
         take_events(events);
-        for (size_t done = 0; done < bytes.size();) {
+        size_t done = 0;
+        do { // once without bytes, too: it notices silence
             done += pf_link_input(link_, data_of(bytes) + done, bytes.size() - done, now_ns);
             take_events(events);
-        }
+        } while (done < bytes.size());
         return events;
     }
 

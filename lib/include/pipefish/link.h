@@ -119,7 +119,9 @@ pf_status pf_link_init(pf_link **link, const pf_link_config *config, void *works
  */
 void pf_link_reset(pf_link *link, uint64_t now_ns);
 
-/* Consumes bytes; returns how many, fewer than n when an event waits to be taken. Any bytes at all are safe. */
+/* Consumes bytes; returns how many, fewer than n when an event waits to be taken. Any bytes at all are safe. Once all
+ * are consumed a peer that was silent for too long counts as gone; bytes NULL and n 0 do only that, and must be called
+ * when pf_link_output is not, because the line takes nothing. */
 size_t pf_link_input(pf_link *link, const uint8_t *bytes, size_t n, uint64_t now_ns);
 
 /* Takes the next event; false when there is none. */

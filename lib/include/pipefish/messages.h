@@ -30,6 +30,7 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     float attitude_sigma_rad; /* 0 = not stated */
     uint32_t exposure_us;
     float gain, lamp;
+    bool emergency_stop;
 } pf_msg_telemetry;
 
 typedef struct pf_msg_keyframe {
@@ -47,10 +48,9 @@ typedef struct pf_msg_keyframe {
     const pf_track *tracks; /* n_tracks, ids ascending; lost ones are left out */
     uint32_t n_tracks;
     uint32_t common_tracks;
-    const char *break_reason; /* NULL = tracks go on from the keyframe before */
 } pf_msg_keyframe;
 
-/* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break_reason at most 256 bytes: 10
+/* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break reason at most 256 bytes: 10
  * (id)
  * + 5 x 5 (x, y, covariance) + 5 (age) + 3 (quality) + 1 (status) a track. */
 #define PF_MSG_KEYFRAME_MAX(n_tracks, jpeg_size) ((size_t)1024 + 44u * (size_t)(n_tracks) + (size_t)(jpeg_size))
@@ -107,9 +107,9 @@ typedef struct pf_msg_survey_end {
     uint32_t keyframes, boots;
     uint64_t frames;
     const char *reason;
-    const pf_msg_status *last_status; /* NULL = none */
-    const uint32_t *lost_index;       /* lost_count of them */
-    uint32_t lost_count;
+    const pf_msg_status *last_status;        /* NULL = none */
+    const uint32_t *lost_first, *lost_count; /* lost_ranges of each */
+    uint32_t lost_ranges;
 } pf_msg_survey_end;
 
 typedef struct pf_msg_preview {
@@ -151,6 +151,9 @@ typedef struct pf_msg_request {
     float lamp;              /* PF_REQUEST_SET_LAMP; as sent: may be any float */
     pf_msg_clock_sync clock; /* PF_REQUEST_CLOCK_SYNC */
 } pf_msg_request;
+
+/* Marks the keyframe message out[0 .. *n) as the first after a break, for this reason; *n grows. PF_ERR_SPACE. */
+pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity, size_t *n);
 
 /* PF_ERR_ARGUMENT: n_tracks > 2 PF_TRACKS_MAX (a whole table, lost tracks included) or ids that do not ascend. */
 pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *keyframe, uint8_t *out, size_t capacity, size_t *n);

@@ -23,7 +23,8 @@ typedef struct pf_spool_stats {
 
 typedef struct pf_spool_ops {
     /* Stores durably: on PF_OK the object outlives a power cut. The same name twice is stored once (PF_OK).
-     * PF_ERR_SPACE (quota or disk full, after evicting what may be), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes). */
+     * PF_ERR_SPACE (quota or disk full: later it may fit), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes, or more than the
+     * quota: never). */
     pf_status (*put)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n);
 
     /* The first item with row > after, oldest first. PF_OK, PF_ERR_END (no more), PF_ERR_IO. */

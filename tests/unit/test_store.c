@@ -1,0 +1,316 @@
+#include "pipefish/drivers/sha256.h"
+#include "pipefish/link.h"
+#include "store.h"
+#include "unity.h"
+
+#include <poll.h>
+#include <pthread.h>
+#include <string.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+/* A spool in memory whose calls fail when told to. */
+enum { OBJECTS_MAX = 32, BYTES_MAX = 512 };
+
+static struct {
+    pthread_mutex_t mutex;
+    struct {
+        pf_spool_item item;
+        uint8_t bytes[BYTES_MAX];
+    } object[OBJECTS_MAX];
+    uint64_t rows;
+    int fail_puts, fail_next, fail_reads, fail_removes; /* so many of the calls to come fail */
+    bool is_full;
+    uint8_t value[PF_SURVEY_BYTES]; /* as stored with the newest object */
+    size_t value_n;
+} fake = {.mutex = PTHREAD_MUTEX_INITIALIZER};
+
+static bool fails(int *count)
+{
+    return *count > 0 && (*count)--;
+}
+
+static pf_status put_and_set(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
+                             const char *key, const void *value, size_t value_n)
+{
+    pf_status status = PF_OK;
+    (void)self;
+    (void)key;
+    (void)pthread_mutex_lock(&fake.mutex);
+    if (fake.is_full) {
+        status = PF_ERR_SPACE;
+    } else if (fails(&fake.fail_puts)) {
+        status = PF_ERR_IO;
+    } else {
+        pf_spool_item *item = &fake.object[fake.rows].item;
+        memcpy(fake.object[fake.rows].bytes, bytes, n);
+        *item = (pf_spool_item){.row = ++fake.rows, .kind = kind, .size = (uint32_t)n};
+        memcpy(item->name, name, 32);
+        memcpy(fake.value, value, value_n);
+        fake.value_n = value_n;
+    }
+    (void)pthread_mutex_unlock(&fake.mutex);
+    return status;
+}
+
+static pf_status next(void *self, uint64_t after, pf_spool_item *item)
+{
+    pf_status status = PF_ERR_END;
+    (void)self;
+    (void)pthread_mutex_lock(&fake.mutex);
+    if (fails(&fake.fail_next)) {
+        status = PF_ERR_IO;
+    } else {
+        for (uint64_t row = after + 1; row <= fake.rows && status == PF_ERR_END; row++) {
+            if (fake.object[row - 1].item.size > 0) {
+                *item = fake.object[row - 1].item;
+                status = PF_OK;
+            }
+        }
+    }
+    (void)pthread_mutex_unlock(&fake.mutex);
+    return status;
+}
+
+static pf_status read_object(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n)
+{
+    pf_status status = PF_OK;
+    (void)self;
+    (void)capacity;
+    (void)pthread_mutex_lock(&fake.mutex);
+    if (fails(&fake.fail_reads)) {
+        status = PF_ERR_IO;
+    } else {
+        *n = fake.object[row - 1].item.size;
+        memcpy(bytes, fake.object[row - 1].bytes, *n);
+    }
+    (void)pthread_mutex_unlock(&fake.mutex);
+    return status;
+}
+
+static pf_status remove_object(void *self, uint64_t row)
+{
+    pf_status status = PF_OK;
+    (void)self;
+    (void)pthread_mutex_lock(&fake.mutex);
+    if (fails(&fake.fail_removes))
+        status = PF_ERR_IO;
+    else
+        fake.object[row - 1].item.size = 0;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    return status;
+}
+
+static void get_stats(void *self, pf_spool_stats *stats)
+{
+    (void)self;
+    memset(stats, 0, sizeof *stats);
+    (void)pthread_mutex_lock(&fake.mutex);
+    for (uint64_t i = 0; i < fake.rows; i++)
+        stats->objects += fake.object[i].item.size > 0;
+    (void)pthread_mutex_unlock(&fake.mutex);
+}
+
+static const char *get_error(void *self)
+{
+    (void)self;
+    return "fake";
+}
+
+static const pf_spool_ops ops = {.next = next,
+                                 .read = read_object,
+                                 .remove = remove_object,
+                                 .put_and_set = put_and_set,
+                                 .stats = get_stats,
+                                 .error = get_error};
+static pf_store *store;
+static int wake_fd;
+
+void setUp(void)
+{
+    pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
+    memset(&fake, 0, sizeof fake);
+    fake.mutex = mutex;
+    wake_fd = eventfd(0, EFD_NONBLOCK);
+}
+
+void tearDown(void)
+{
+    (void)close(wake_fd);
+}
+
+static void open_store(bool is_patient)
+{
+    const pf_spool spool = {NULL, &ops};
+    const pf_survey survey = {.boots = 1};
+    pf_store_config config = {
+        .jobs = 4, .slots = 2, .capacity = BYTES_MAX, .is_patient = is_patient, .wake_fd = wake_fd};
+    char error[256];
+    TEST_ASSERT_TRUE_MESSAGE(pf_store_open(&store, &spool, &survey, &config, error, sizeof error), error);
+}
+
+static void give(uint32_t kind, uint32_t index, const char *break_reason)
+{
+    pf_job *job = pf_store_take(store);
+    TEST_ASSERT_NOT_NULL(job);
+    job->kind = kind;
+    job->index = index;
+    job->n = 2;
+    job->bytes[0] = 0x10; /* the message's field index, a small number */
+    job->bytes[1] = (uint8_t)index;
+    (void)strncpy(job->break_reason, break_reason, sizeof job->break_reason - 1);
+    pf_store_give(store, job);
+}
+
+static pf_store_stats stats(void)
+{
+    pf_store_stats s;
+    pf_store_get_stats(store, &s);
+    return s;
+}
+
+static void close_store(void)
+{
+    pf_store_quit(store);
+    pf_store_close(store);
+}
+
+/* Waits for the next object to send; fails after half a minute. */
+static pf_slot *wait_for_slot(void)
+{
+    pf_slot *slot;
+    for (int i = 0; i < 3000; i++) {
+        if ((slot = pf_store_next_slot(store)) != NULL)
+            return slot;
+        (void)poll(NULL, 0, 10);
+    }
+    TEST_FAIL_MESSAGE("no object to send");
+    return NULL;
+}
+
+/* Whether the object in row `row` (from 1) has this break reason; "" = none. */
+static void check_break(uint64_t row, uint8_t index, const char *reason)
+{
+    const uint8_t *bytes = fake.object[row - 1].bytes;
+    uint32_t n = fake.object[row - 1].item.size;
+    size_t length = strlen(reason);
+    TEST_ASSERT_EQUAL_UINT8(index, bytes[1]);
+    TEST_ASSERT_EQUAL_UINT32(length ? 2 + 2 + 2 + length : 2, n);
+    if (length)
+        TEST_ASSERT_EQUAL_MEMORY(reason, bytes + 6, length);
+}
+
+/* Proves: a break whose keyframe the disk loses is told by the next keyframe that is stored, and by that one only. */
+static void test_a_break_outlives_the_keyframe_that_carried_it(void)
+{
+    open_store(false);
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    pf_store_settle(store);
+    fake.fail_puts = 2;
+    give(PF_OBJECT_KEYFRAME, 1, "gap of 9 frames");
+    give(PF_OBJECT_KEYFRAME, 2, "");
+    give(PF_OBJECT_KEYFRAME, 3, "");
+    pf_store_settle(store);
+    give(PF_OBJECT_KEYFRAME, 4, "");
+    give(PF_OBJECT_KEYFRAME, 5, "restart");
+    pf_store_settle(store);
+    close_store();
+    TEST_ASSERT_EQUAL_UINT64(4, fake.rows);
+    check_break(1, 0, "");
+    check_break(2, 3, "gap of 9 frames");
+    check_break(3, 4, "");
+    check_break(4, 5, "restart");
+}
+
+/* Proves: a job that waits for room is stored as it was, its break told once. */
+static void test_a_break_that_waits_for_room_is_told_once(void)
+{
+    open_store(true);
+    fake.is_full = true;
+    give(PF_OBJECT_KEYFRAME, 7, "gap of 9 frames");
+    (void)poll(NULL, 0, 1200); /* two tries at least */
+    (void)pthread_mutex_lock(&fake.mutex);
+    fake.is_full = false;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    pf_store_settle(store);
+    close_store();
+    TEST_ASSERT_EQUAL_UINT64(1, fake.rows);
+    check_break(1, 7, "gap of 9 frames");
+}
+
+/* Proves: reading, listing and removing that fail once are tried again: every object comes out, oldest first, and goes.
+ */
+static void test_a_failing_disk_is_tried_again(void)
+{
+    open_store(false);
+    fake.fail_reads = 1;
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    give(PF_OBJECT_KEYFRAME, 1, "");
+    pf_slot *first = wait_for_slot(), *second = wait_for_slot();
+    TEST_ASSERT_EQUAL_UINT64(1, first->item.row);
+    TEST_ASSERT_EQUAL_UINT64(2, second->item.row);
+    (void)pthread_mutex_lock(&fake.mutex);
+    fake.fail_removes = fake.fail_next = 1;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    pf_store_release_slot(store, first->item.name, false);
+    pf_store_release_slot(store, second->item.name, false);
+    give(PF_OBJECT_KEYFRAME, 2, "");
+    pf_slot *third = wait_for_slot();
+    TEST_ASSERT_EQUAL_UINT64(3, third->item.row);
+    pf_store_release_slot(store, third->item.name, false);
+    for (int i = 0; i < 3000 && !pf_store_is_drained(store); i++)
+        (void)poll(NULL, 0, 10);
+    TEST_ASSERT_TRUE(pf_store_is_drained(store));
+    close_store();
+}
+
+/* Proves: what is stored with a keyframe never lists a keyframe that the next boot will make again as lost. */
+static void test_losses_of_later_keyframes_are_not_kept(void)
+{
+    pf_survey kept;
+    open_store(false);
+    pf_store_lose(store, 1);
+    pf_store_lose(store, 6); /* lost while number 5 still waited for the disk */
+    give(PF_OBJECT_KEYFRAME, 5, "");
+    pf_store_settle(store);
+    pf_store_get_survey(store, &kept);
+    TEST_ASSERT_EQUAL_UINT32(2, kept.lost_ranges);
+    kept.lost_ranges = 1; /* number 1 */
+    uint8_t expected[PF_SURVEY_BYTES];
+    TEST_ASSERT_EQUAL_size_t(pf_survey_pack(&kept, expected), fake.value_n);
+    TEST_ASSERT_EQUAL_MEMORY(expected, fake.value, fake.value_n);
+    close_store();
+}
+
+/* Proves: flushing ends the wait for room, and what comes after the end counts as lost, not as stored. */
+static void test_flush_and_quit_count_what_is_lost(void)
+{
+    open_store(true);
+    fake.is_full = true;
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    give(PF_OBJECT_SURVEY_END, 0, "");
+    pf_job *late = pf_store_take(store);
+    pf_store_flush(store);
+    pf_store_settle(store);
+    TEST_ASSERT_EQUAL_UINT64(1, stats().keyframes_dropped);
+    TEST_ASSERT_TRUE(stats().has_failed);
+    fake.is_full = false;
+    pf_store_quit(store);
+    late->kind = PF_OBJECT_KEYFRAME;
+    late->index = 1;
+    pf_store_give(store, late);
+    TEST_ASSERT_EQUAL_UINT64(2, stats().keyframes_dropped);
+    TEST_ASSERT_EQUAL_UINT64(0, fake.rows);
+    pf_store_close(store);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_a_break_outlives_the_keyframe_that_carried_it);
+    RUN_TEST(test_a_break_that_waits_for_room_is_told_once);
+    RUN_TEST(test_a_failing_disk_is_tried_again);
+    RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
+    RUN_TEST(test_flush_and_quit_count_what_is_lost);
+    return UNITY_END();
+}
