@@ -483,8 +483,8 @@ static void test_examples_of_the_specification_are_what_is_sent(void)
     free(spec);
 }
 
-/* Proves: silence is noticed by input alone, without a byte, for nobody asks for output while the line takes nothing; and
- * bytes that come late are still a sign of life. */
+/* Proves: silence is noticed by input alone, without a byte, for nobody asks for output while the line takes nothing;
+ * and bytes that come late are still a sign of life. */
 static void test_silence_is_noticed_without_output(void)
 {
     open_both();

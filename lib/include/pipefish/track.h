@@ -1,6 +1,7 @@
 /* The feature tracker: corners spread over the image, pyramidal KLT with forward-backward check, a table of tracks with
- * stable ids, bearings, keyframe choice. The tracker itself is integers only: the same bits on all targets. Bearings are
- * doubles rounded to Q1.30, so a keyframe chosen by parallax may differ where libm does; one chosen by encoder does not.
+ * stable ids, bearings, keyframe choice. The tracker itself is integers only: the same bits on all targets. Bearings
+ * are doubles rounded to Q1.30, so a keyframe chosen by parallax may differ where libm does; one chosen by encoder does
+ * not.
  */
 #ifndef PIPEFISH_TRACK_H
 #define PIPEFISH_TRACK_H
