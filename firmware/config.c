@@ -35,11 +35,10 @@ static const setting settings[] = {
      "its telemetry; empty = beside it (path with .csv, or telemetry.csv in the folder), if it is there"},
     {"camera", "speed", CHOICE, AT(camera.speed), "", "recorded", 0, 0, "recorded|fast",
      "recorded = as it happened, late frames are dropped; fast = as fast as possible, nothing is dropped"},
-    {"camera", "loops", INTEGER, AT(camera.loops), "", "1", 0, 1000000, NULL, "play it so often; 0 = for ever"},
+    {"camera", "loops", INTEGER, AT(camera.loops), "", "1", 0, 1000000, NULL,
+     "play it so often; 0 = for ever; each begins with a marked break"},
     {"camera", "frame_rate", NUMBER, AT(camera.frame_rate), "1/s", "0", 0, 10000, NULL,
      "of a recording without times; 0 = 10"},
-    {"camera", "restamp", SWITCH, AT(camera.restamp), "", "false", 0, 0, NULL,
-     "true = frames get the time of now, as a live camera's; false = the recording's times are kept"},
     {"camera", "profile", TEXT, AT(camera.profile), "", "", 0, 0, NULL,
      "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
 

@@ -30,7 +30,6 @@ typedef struct pf_config {
         pf_config_text path, csv, profile;
         uint32_t loops;
         double frame_rate;
-        bool restamp;
     } camera;
     struct {
         uint32_t max_tracks, levels, window, iterations, cell, min_eigen;

@@ -37,7 +37,6 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
         .state = states[atomic_load(&d->state)],
         .frames = c->frames,
         .frames_dropped = c->frames_dropped,
-        .frames_skipped = 0, /* every frame taken is tracked: a driver drops those that come too fast */
         .tracks_live = c->tracks_live,
         .tracks_new = c->tracks_new,
         .tracks_lost = c->tracks_lost,
@@ -51,7 +50,7 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
                   .store = mean_us(store.store_ns, store.stored),
                   .frame_max = (float)((double)c->frame_max_ns / 1e3)},
         .spool = {store.spool.objects, store.spool.bytes, store.spool.stored, store.spool.acknowledged,
-                  store.spool.evicted, store.spool.errors},
+                  store.spool.errors},
         .link_up = c->link_up,
         .link = c->link,
         .telemetry = c->telemetry,
@@ -73,9 +72,9 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
         (void)fprintf(out, "%02x", s->survey_id[i]);
     (void)fprintf(out, "\",\n  \"state\": \"%s\",\n  \"uptime_ns\": %" PRIu64 ",\n", s->state, s->uptime_ns);
     (void)fprintf(out,
-                  "  \"frames\": %" PRIu64 ",\n  \"frames_dropped\": %" PRIu64 ",\n  \"frames_skipped\": %" PRIu64
+                  "  \"frames\": %" PRIu64 ",\n  \"frames_dropped\": %" PRIu64
                   ",\n  \"tracks_live\": %u,\n  \"tracks_new\": %u,\n  \"tracks_lost\": %u,\n",
-                  s->frames, s->frames_dropped, s->frames_skipped, s->tracks_live, s->tracks_new, s->tracks_lost);
+                  s->frames, s->frames_dropped, s->tracks_live, s->tracks_new, s->tracks_lost);
     (void)fprintf(out, "  \"keyframes\": %" PRIu64 ",\n  \"keyframes_dropped\": %" PRIu64 ",\n  \"fps\": %.3f,\n",
                   s->keyframes, s->keyframes_dropped, s->fps);
     (void)fprintf(out,
@@ -85,10 +84,9 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   (double)s->stage.keyframe, (double)s->stage.store, (double)s->stage.frame_max);
     (void)fprintf(out,
                   "  \"spool\": {\"objects\": %" PRIu64 ", \"bytes\": %" PRIu64 ", \"stored\": %" PRIu64
-                  ", \"acknowledged\": %" PRIu64 ", \"evicted\": %" PRIu64 ", \"errors\": %" PRIu64
-                  ", \"refused\": %" PRIu64 "},\n",
-                  s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.evicted,
-                  s->spool.errors, store->refused);
+                  ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
+                  s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
+                  store->refused);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
                   ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64

@@ -137,8 +137,8 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
                                .csv = c->camera.csv[0] ? c->camera.csv : NULL,
                                .speed = c->camera.speed == PF_SPEED_FAST ? PF_REPLAY_FAST : PF_REPLAY_RECORDED,
                                .loops = c->camera.loops,
-                               .frame_rate = c->camera.frame_rate,
-                               .restamp = c->camera.restamp};
+                               .loop_gap = (uint64_t)c->tracker.reset_gap + 1, /* tracks must not go on */
+                               .frame_rate = c->camera.frame_rate};
     if (pf_replay_open(&d->camera, &replay, error, n) != PF_OK)
         return false;
     info = d->camera.ops->info(d->camera.self);

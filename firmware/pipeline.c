@@ -281,6 +281,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
     pf_msg_keyframe k = {.index = p->next_index,
                          .time = {d->boot_id, frame->time_ns},
                          .frame_sequence = frame->sequence,
+                         .recorded_ns = frame->recorded_ns,
                          .width = frame->image.width,
                          .height = frame->image.height,
                          .jpeg_quality = d->config.keyframe.jpeg_quality,

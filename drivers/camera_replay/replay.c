@@ -29,7 +29,6 @@ typedef struct replay {
     pf_folder folder;
     pf_csv csv;
     pf_replay_speed speed;
-    bool restamp;
     uint32_t loops;
     uint64_t frames;        /* of one loop */
     uint64_t period_ns;     /* between frames: nominal, or the mean of the recorded times */
@@ -38,7 +37,6 @@ typedef struct replay {
     uint64_t index, loop; /* of the frame to come */
     uint64_t start_ns;    /* monotonic clock at start() */
     uint64_t start_time;  /* recorded time of the frame that was due at start() */
-    uint64_t last_stamp;  /* restamp at full speed: stamps must rise */
     buffer buffers[BUFFERS];
     pf_failure failure;
 } replay;
@@ -145,17 +143,6 @@ static pf_status check_hash(replay *r, uint64_t index, const pf_image *image)
     return PF_OK;
 }
 
-static uint64_t stamp(replay *r, uint64_t index, uint64_t loop)
-{
-    if (!r->restamp)
-        return time_of(r, index, loop);
-    if (r->speed == PF_REPLAY_RECORDED)
-        return due_ns(r, index, loop);
-    uint64_t now = now_ns();
-    r->last_stamp = now > r->last_stamp ? now : r->last_stamp + 1;
-    return r->last_stamp;
-}
-
 static pf_status replay_next(void *self, uint32_t timeout_ms, pf_frame *frame)
 {
     replay *r = self;
@@ -193,7 +180,8 @@ static pf_status replay_next(void *self, uint32_t timeout_ms, pf_frame *frame)
         memcpy(frame->sha256, row->sha256, sizeof frame->sha256);
     }
     frame->sequence += loop * r->loop_sequence;
-    frame->time_ns = stamp(r, index, loop);
+    frame->time_ns = due_ns(r, index, loop);
+    frame->recorded_ns = time_of(r, index, loop);
     frame->handle = free_buffer;
     free_buffer->held = true;
     return PF_OK;
@@ -300,7 +288,7 @@ static pf_status open_csv(replay *r, const char *named)
 }
 
 /* Frame rate, period, and what a loop adds. */
-static void plan(replay *r, double frame_rate)
+static void plan(replay *r, double frame_rate, uint64_t loop_gap)
 {
     uint64_t n = r->frames;
     if (r->info.frame_rate <= 0 && r->has_csv && n > 1)
@@ -312,6 +300,7 @@ static void plan(replay *r, double frame_rate)
     if (r->period_ns == 0)
         r->period_ns = 1;
     r->loop_sequence = r->has_csv ? r->csv.rows[n - 1].sequence - r->csv.rows[0].sequence + 1 : n;
+    r->loop_sequence += loop_gap;
     r->loop_ns = r->has_csv ? r->csv.rows[n - 1].time_ns - r->csv.rows[0].time_ns + r->period_ns
                             : (uint64_t)llround((double)n * SECOND_NS / r->info.frame_rate);
     if (r->loops != 0)
@@ -329,9 +318,8 @@ static pf_status open_parts(replay *r, const pf_replay_config *config)
     if (status != PF_OK)
         return status;
     r->speed = config->speed;
-    r->restamp = config->restamp;
     r->loops = config->loops;
-    plan(r, config->frame_rate);
+    plan(r, config->frame_rate, config->loop_gap);
     (void)snprintf(r->info.source, sizeof r->info.source, "replay %s", r->path);
     for (uint32_t i = 0; i < BUFFERS; i++) {
         r->buffers[i].pixels = malloc((size_t)r->info.width * r->info.height);

@@ -184,11 +184,11 @@ def run_status(args: argparse.Namespace) -> Result:
         ("up for", seconds_text(status.uptime_ns / 1e9)),
         (
             "frames",
-            f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped, {status.frames_skipped} skipped",
+            f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped",
         ),
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
         ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
-        ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)}), {status.spool.evicted} evicted"),
+        ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"),
         (
             "link",
             f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, "

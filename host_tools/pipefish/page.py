@@ -305,7 +305,6 @@ class Page:
         if status is not None:
             breaks += [
                 ("frames dropped by the camera", str(status.frames_dropped)),
-                ("frames skipped (too slow)", str(status.frames_skipped)),
                 ("keyframes that could not be stored", str(status.keyframes_dropped)),
             ]
         tables = [("Survey", survey), ("Link", link), ("Gaps and breaks", breaks)]

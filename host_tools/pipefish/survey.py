@@ -385,11 +385,6 @@ class Survey:
             yield boot, (max(times) - min(times)) / 1e9
 
     @property
-    def recorded_time(self) -> bool:
-        """Whether times are those of a replayed recording: intervals are right, the time of day is not."""
-        return self.start is not None and "camera.restamp = false" in self.start.config
-
-    @property
     def last_status(self) -> pb.Status | None:
         """The newest counters of the device, from the end of the survey or the last status message."""
         if self.end is not None and self.end.HasField("last_status"):
@@ -434,7 +429,7 @@ class Survey:
             "breaks": self.breaks,
             "duration_s": sum(seconds for _, seconds in spans),
             "length_m": length,
-            "first_time_unix_ns": self.keyframes[0].time_ns if self.keyframes and not self.recorded_time else None,
+            "first_time_unix_ns": self.keyframes[0].time_ns if self.keyframes else None,
             "tracks": lengths,
             "object_bytes": sum(r.size for r in self.receipts),
             "receive_s": (max(received) - min(received)) / 1e9 if received else None,

@@ -184,7 +184,6 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     out->state = text(in->state);
     out->frames = in->frames;
     out->frames_dropped = in->frames_dropped;
-    out->frames_skipped = in->frames_skipped;
     out->tracks_live = in->tracks_live;
     out->tracks_new = in->tracks_new;
     out->tracks_lost = in->tracks_lost;
@@ -194,8 +193,8 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     out->stage =
         (pipefish_v1_Status_StageTimes){in->stage.capture,  in->stage.pyramid, in->stage.track,    in->stage.detect,
                                         in->stage.keyframe, in->stage.store,   in->stage.frame_max};
-    out->spool = (pipefish_v1_Status_Spool){in->spool.objects,      in->spool.bytes,   in->spool.stored,
-                                            in->spool.acknowledged, in->spool.evicted, in->spool.errors};
+    out->spool = (pipefish_v1_Status_Spool){in->spool.objects, in->spool.bytes, in->spool.stored,
+                                            in->spool.acknowledged, in->spool.errors};
     out->link = (pipefish_v1_Status_Link){.up = in->link_up,
                                           .bytes_out = in->link.bytes_out,
                                           .bytes_in = in->link.bytes_in,
@@ -242,6 +241,7 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     m.has_time = true;
     m.time = device_time(&k->time);
     m.frame_sequence = k->frame_sequence;
+    m.recorded_ns = k->recorded_ns;
     memcpy(m.frame_sha256, k->frame_sha256, sizeof m.frame_sha256);
     m.width = k->width;
     m.height = k->height;

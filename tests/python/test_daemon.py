@@ -30,6 +30,7 @@ START, KEYFRAME, END = 1, 2, 3
 SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
 WIDTH, HEIGHT = 192, 160
 COUNTS_PER_FRAME = 10
+RESET_GAP = 5  # tracker.reset_gap's default
 EVERY_FRAME = (
     *("--set", "keyframe.step_mm=1", "--set", "keyframe.min_interval=1"),
     *("--set", "keyframe.jpeg_quality=100"),
@@ -258,7 +259,7 @@ def test_check_config_accepts_a_good_file(crawler: Crawler):
         ("levels = 4\nlevels = 4", "tracker.levels is set a second time; the first is in line 2"),
         ("levels", "neither [section] nor key = value"),
         ("[camera]\ndriver = v4l3", "camera.driver = v4l3: this build has: replay"),
-        ("[camera]\nrestamp = yes", "must be true or false"),
+        ("[link]\nrtscts = yes", "must be true or false"),
     ],
 )
 def test_a_bad_setting_is_named_with_file_and_line(tmp_path: Path, line: str, what: str):
@@ -333,7 +334,10 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     ages: dict[int, int] = {}
     for k in keyframes:
         assert k.frame_sequence == 2 * k.index
-        assert (k.time.boot_id, k.time.monotonic_ns) == (boot, 10**9 + k.frame_sequence * 40_000_000)
+        assert (k.time.boot_id, k.recorded_ns) == (boot, 10**9 + k.frame_sequence * 40_000_000)
+        # On the clock of the start and the end, at the recorded distances.
+        assert k.time.monotonic_ns - keyframes[0].time.monotonic_ns == k.recorded_ns - keyframes[0].recorded_ns
+        assert start.time.monotonic_ns < keyframes[0].time.monotonic_ns < end.time.monotonic_ns
         assert k.frame_sha256.hex() == hashes[k.frame_sequence]
         assert k.telemetry.encoder_count == k.frame_sequence * COUNTS_PER_FRAME
         assert k.telemetry.roll_rad == pytest.approx(0.01)
@@ -645,8 +649,8 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
 # ---- kill -9
 
 
-def check_everything_arrived_once(store: Store, kills: int) -> None:
-    """Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
+def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -> None:
+    """`frames`: of one loop of the recording. Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
     [end] = store.ends
     assert {k.survey_id for k in store.keyframes} == {end.survey_id}
     assert [k.index for k in store.keyframes] == list(range(end.keyframes))
@@ -655,14 +659,15 @@ def check_everything_arrived_once(store: Store, kills: int) -> None:
     # One start for each boot that came to store it; each boot's first keyframe is marked.
     boots = [s.time.boot_id for s in store.starts]
     assert len(set(boots)) == len(boots) <= end.boots
-    before = None
+    before, loop = None, 0
     for k in store.keyframes:
         assert k.time.boot_id in boots
         is_first = k.time.boot_id != before
-        assert k.after_break == (is_first and k.index > 0), k.index
+        is_wrap = not is_first and k.frame_sequence // (frames + RESET_GAP + 1) != loop
+        assert k.after_break == (is_first and k.index > 0 or is_wrap), k.index
         if k.after_break:
-            assert k.break_reason == "restart"
-        before = k.time.boot_id
+            assert k.break_reason == ("restart" if is_first else f"gap of {RESET_GAP + 1} frames")
+        before, loop = k.time.boot_id, k.frame_sequence // (frames + RESET_GAP + 1)
 
 
 def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path, crawler: Crawler):

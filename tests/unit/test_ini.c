@@ -162,7 +162,7 @@ static void test_config_refuses_bad_values(void)
     check_refused("[tracker]\nfb_px = 1e999", "not a number");
     check_refused("[camera]\nspeed = slow", "camera.speed = slow: this build has: recorded|fast");
     check_refused("[camera]\nspeed = recorded|fast", "this build has");
-    check_refused("[camera]\nrestamp = 1", "must be true or false");
+    check_refused("[link]\nrtscts = 1", "must be true or false");
     check_refused("[survey]\nname = \xC3(", "not UTF-8");
     check_refused("[link]\nport = 1\n[link]\nport = 1", "f:4: link.port is set a second time; the first is in line 2");
     check_refused("[link]\nprot = 1", "unknown key prot in [link]; it has: transport device");

@@ -93,13 +93,13 @@ static void check_pixels(const pf_frame *frame, uint64_t i)
 }
 
 /* Takes the next frame, checks its pixels and stamps, and gives it back. */
-static void expect_frame(uint64_t i, uint64_t sequence, uint64_t time_ns)
+static void expect_frame(uint64_t i, uint64_t sequence, uint64_t recorded_ns)
 {
     pf_frame frame;
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, camera.ops->next(camera.self, 10000, &frame), camera.ops->error(camera.self));
     check_pixels(&frame, i);
     TEST_ASSERT_EQUAL_UINT64(sequence, frame.sequence);
-    TEST_ASSERT_EQUAL_UINT64(time_ns, frame.time_ns);
+    TEST_ASSERT_EQUAL_UINT64(recorded_ns, frame.recorded_ns);
     camera.ops->release(camera.self, &frame);
 }
 
@@ -448,11 +448,11 @@ static void test_recorded_speed_skips_what_is_late(void)
     for (int i = 0; i < 5; i++) {
         uint64_t asked = now_ns();
         TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->next(camera.self, 10000, &frame));
-        TEST_ASSERT_TRUE(now_ns() - before >= frame.time_ns);
+        TEST_ASSERT_TRUE(now_ns() - before >= frame.recorded_ns);
         uint64_t late_from = asked - after > period ? asked - after - period : 0;
-        TEST_ASSERT_TRUE(frame.time_ns >= late_from || frame.sequence == 199);
+        TEST_ASSERT_TRUE(frame.recorded_ns >= late_from || frame.sequence == 199);
         TEST_ASSERT_TRUE(i == 0 ? frame.sequence > 10 : frame.sequence > previous);
-        TEST_ASSERT_EQUAL_UINT64(frame.sequence * period, frame.time_ns);
+        TEST_ASSERT_EQUAL_UINT64(frame.sequence * period, frame.recorded_ns);
         previous = frame.sequence;
         camera.ops->release(camera.self, &frame);
     }
@@ -475,32 +475,42 @@ static void test_recorded_speed_keeps_the_newest(void)
     TEST_ASSERT_EQUAL_INT(PF_ERR_AGAIN, camera.ops->next(camera.self, 5, &frame));
 }
 
-/* Proves: restamped frames carry times of now that rise: at recorded speed with the recorded distances. */
-static void test_restamp(void)
+/* Proves: times are of the monotonic clock, on which the daemon stamps everything else: the first frame is due at the
+ * start, the others at their recorded distances, at any speed and over a wrap; the recording's own time is kept. */
+static void test_times_are_mapped_to_the_start(void)
 {
     for (int speed = PF_REPLAY_RECORDED; speed <= PF_REPLAY_FAST; speed++) {
-        pf_replay_config config = {.path = write_y4m("r.y4m", "YUV4MPEG2 W6 H4 F1000:1 Cmono", 5),
-                                   .speed = (pf_replay_speed)speed,
-                                   .loops = 2,
-                                   .restamp = true};
-        uint64_t start = now_ns(), first = 0, first_sequence = 0, last = 0;
-        open_ok(&config);
         pf_frame frame;
+        temporary_text("r.csv", "sequence,time_ns\n0,3600000000000\n1,3600001000000\n2,3600009000000\n");
+        pf_replay_config config = {.path = write_y4m("r.y4m", "YUV4MPEG2 W6 H4 F1000:1 Cmono", 3),
+                                   .speed = (pf_replay_speed)speed,
+                                   .loops = 2};
+        uint64_t before = now_ns();
+        open_ok(&config);
+        uint64_t after = now_ns(), frames = 0;
         while (camera.ops->next(camera.self, 10000, &frame) == PF_OK) {
-            TEST_ASSERT_TRUE(frame.time_ns >= start && frame.time_ns <= now_ns() && frame.time_ns > last);
-            if (first == 0) {
-                first = frame.time_ns;
-                first_sequence = frame.sequence;
-            }
-            if (speed == PF_REPLAY_RECORDED)
-                TEST_ASSERT_EQUAL_UINT64((frame.sequence - first_sequence) * 1000000, frame.time_ns - first);
-            last = frame.time_ns;
+            uint64_t start = frame.time_ns - (frame.recorded_ns - 3600000000000u);
+            TEST_ASSERT_TRUE(frame.recorded_ns >= 3600000000000u && start >= before && start <= after);
+            frames++;
             camera.ops->release(camera.self, &frame);
         }
-        TEST_ASSERT_TRUE(last > 0);
+        TEST_ASSERT_TRUE(speed == PF_REPLAY_RECORDED ? frames > 0 : frames == 6);
         camera.ops->close(camera.self);
         camera.self = NULL;
     }
+}
+
+/* Proves: at a wrap, where the scene jumps back, the sequence leaves the gap that makes it a break. */
+static void test_a_wrap_leaves_a_gap(void)
+{
+    pf_replay_config config = {.path = write_y4m("w.y4m", "YUV4MPEG2 W6 H4 F1000:1 Cmono", 2),
+                               .speed = PF_REPLAY_FAST,
+                               .loops = 3,
+                               .loop_gap = 6};
+    open_ok(&config);
+    for (uint64_t i = 0; i < 6; i++)
+        expect_frame(i % 2, i % 2 + i / 2 * 8, i * 1000000);
+    expect_end();
 }
 
 /* Proves: a board without lines says so at every call. */
@@ -535,7 +545,8 @@ int main(void)
     RUN_TEST(test_two_frames_are_held);
     RUN_TEST(test_recorded_speed_skips_what_is_late);
     RUN_TEST(test_recorded_speed_keeps_the_newest);
-    RUN_TEST(test_restamp);
+    RUN_TEST(test_times_are_mapped_to_the_start);
+    RUN_TEST(test_a_wrap_leaves_a_gap);
     RUN_TEST(test_gpio_none);
     return UNITY_END();
 }

@@ -38,6 +38,7 @@ typedef struct pf_msg_keyframe {
     uint32_t index;
     pf_msg_time time;
     uint64_t frame_sequence;
+    uint64_t recorded_ns; /* 0 = not a recording */
     uint8_t frame_sha256[32];
     uint32_t width, height; /* pixels */
     const uint8_t *jpeg;
@@ -74,7 +75,7 @@ typedef struct pf_msg_stages { /* microseconds */
 } pf_msg_stages;
 
 typedef struct pf_msg_spool {
-    uint64_t objects, bytes, stored, acknowledged, evicted, errors;
+    uint64_t objects, bytes, stored, acknowledged, errors;
 } pf_msg_spool;
 
 typedef struct pf_msg_clock_sync {
@@ -87,7 +88,7 @@ typedef struct pf_msg_status {
     pf_msg_time time;
     uint8_t survey_id[16];
     const char *state;
-    uint64_t frames, frames_dropped, frames_skipped;
+    uint64_t frames, frames_dropped;
     uint32_t tracks_live, tracks_new, tracks_lost;
     uint64_t keyframes, keyframes_dropped;
     double fps;

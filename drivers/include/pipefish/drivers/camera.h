@@ -18,9 +18,10 @@ typedef struct pf_telemetry {
 } pf_telemetry;
 
 typedef struct pf_frame {
-    pf_image image;    /* the driver's memory: valid until release */
-    uint64_t sequence; /* the sensor's own count: a gap means dropped frames */
-    uint64_t time_ns;  /* monotonic clock, middle of the exposure. A recording's own time when replayed */
+    pf_image image;       /* the driver's memory: valid until release */
+    uint64_t sequence;    /* the sensor's own count: a gap means dropped frames */
+    uint64_t time_ns;     /* monotonic clock, middle of the exposure */
+    uint64_t recorded_ns; /* the recording's own time of a replayed frame; 0 = none */
     pf_telemetry telemetry;
     bool has_sha256; /* a recording states the hash of the pixels; the driver has checked it */
     uint8_t sha256[32];
@@ -64,8 +65,8 @@ typedef struct pf_camera_source_ops {
     void (*close)(void *self); /* frees everything, self included */
 } pf_camera_source_ops;
 
-/* Recorded frames: a Y4M file with a telemetry CSV beside it, or a folder of PNG, JPEG or PGM images
- * (docs/recording.md). */
+/* Recorded frames: times are the recording's distances from start() on, when the first frame is due. A Y4M file with a
+ * telemetry CSV beside it, or a folder of PNG, JPEG or PGM images (docs/recording.md). */
 typedef enum pf_replay_speed {
     PF_REPLAY_RECORDED = 0, /* frames come when they came then, however slow the rest is: one that is over a period late
                                is skipped once the next is due, and leaves a gap in the sequence */
@@ -76,9 +77,10 @@ typedef struct pf_replay_config {
     const char *path; /* .y4m, or a folder */
     const char *csv;  /* telemetry; NULL = path with .csv for .y4m (may be absent), telemetry.csv in a folder */
     pf_replay_speed speed;
-    uint32_t loops;    /* play it so often; 0 = for ever. Sequence and time go on rising, the encoder starts again */
+    uint32_t loops; /* play it so often; 0 = for ever. Sequence and time go on rising, the encoder starts again */
+    uint64_t
+        loop_gap; /* numbers that the sequence leaves out before the recording begins again: the scene jumps back */
     double frame_rate; /* of a recording without times; 0 = 10 */
-    bool restamp;      /* true: times are those of now (as a live camera's); false: the recording's */
 } pf_replay_config;
 
 /* Opens and checks a recording (every header, the whole CSV, the first frame). On failure *source is untouched and

@@ -17,8 +17,8 @@ typedef struct pf_spool_item {
 } pf_spool_item;
 
 typedef struct pf_spool_stats {
-    uint64_t objects, bytes;                        /* waiting now */
-    uint64_t stored, acknowledged, evicted, errors; /* since opening */
+    uint64_t objects, bytes;               /* waiting now */
+    uint64_t stored, acknowledged, errors; /* since opening */
 } pf_spool_stats;
 
 typedef struct pf_spool_ops {
