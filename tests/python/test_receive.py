@@ -211,12 +211,18 @@ def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
 def test_a_line_that_we_may_not_open_fails_at_once(tmp_path, monkeypatch):
     import serial
 
+    def wait_for(device: str, why: str) -> None:
+        with pytest.raises(TransportClosed, match=why):
+            receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+
+    wait_for("/dev/null", "/dev/null: not a serial line")
+    wait_for(str(tmp_path), "Is a directory")
+
     def denied(*_, **__):
         raise serial.SerialException(errno.EACCES, "could not open port")
 
     monkeypatch.setattr(serial, "Serial", denied)
-    with pytest.raises(TransportClosed, match="ttyUSB0: Permission denied"):
-        receive(open_transport("/dev/ttyUSB0"), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+    wait_for("/dev/ttyUSB0", "ttyUSB0: Permission denied")
 
 
 def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
