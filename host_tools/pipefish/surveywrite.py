@@ -355,6 +355,7 @@ class SurveyWriter:
         Raises PipefishError, OSError; what was stored then stays in the partial file."""
         self._check_place()
         self._refuse_finished()
+        self._failed = True  # unless all of the following works, nothing may be added behind it
         start, end = self.content.start, self.content.end
         self._writer.flush()
         about = {
