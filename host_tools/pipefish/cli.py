@@ -285,7 +285,7 @@ def not_negative(text: str) -> float:
     """An argument that is a number of at least zero."""
     value = float(text)
     if not value >= 0:
-        raise argparse.ArgumentTypeError(f"{value} is below zero")
+        raise argparse.ArgumentTypeError(f"{value:g} is not a number of at least zero")
     return value
 
 

@@ -104,7 +104,7 @@ class Client:
         try:
             self.transport.open()
         except TransportClosed as error:
-            self._open_error = str(error)
+            self._open_error = error.reason
             raise
         if self._was_open:
             self.reconnections += 1

@@ -275,7 +275,7 @@ def receive(
             try:
                 receiver.client.open()
             except TransportClosed as error:  # it may be about to start, or about to be plugged in
-                if error.is_forbidden:
+                if error.is_final:
                     raise
                 if not quiet:
                     print(f"{error}; waiting for it", file=sys.stderr, flush=True)

@@ -60,9 +60,14 @@ class SurveyStore:
         self._names: set[bytes] = set()
         self._empty: dict[Path, SurveyWriter] = {}  # partial files without an object, by final name
         self._finished_before: dict[bytes, Path] = {}  # siblings that are complete
+        if path.is_dir():
+            raise PipefishError(f"{path} is a folder; name a file in it")
         if path.exists() and not overwrite:
             raise PipefishError(f"{path} exists already; choose another name or pass --overwrite")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise PipefishError(f"{path}: {path.parent} is not a folder") from None
         self._old: IO[bytes] | None = None  # a partial file to be replaced, locked until then
         try:
             if partial_of(path).exists():

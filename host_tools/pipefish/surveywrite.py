@@ -360,6 +360,7 @@ class SurveyWriter:
         Raises PipefishError, OSError; what was stored then stays in the partial file."""
         self._check_place()
         self._refuse_finished()
+        self._failed = True  # unless all of the following works, nothing may be added behind it
         start = self.content.start
         self._writer.flush()
         about = {

@@ -21,17 +21,33 @@ CONNECT_TIMEOUT_S = 5.0
 class TransportClosed(PipefishError):
     """The line is gone: cable out, adapter removed, peer closed the connection. Reopening may help.
 
-    is_forbidden: the system denies us the device, which waiting does not change."""
+    reason    without the name of the line
+    is_final  waiting does not help: we may not open it, or it is no line"""
 
     def __init__(self, text: str, cause: Exception | None = None) -> None:
         super().__init__(text)
-        self.is_forbidden = getattr(cause, "errno", None) in (errno.EACCES, errno.EPERM)
+        self.reason = text if cause is None else _reason(cause)
+        self.is_final = _number(cause) in (errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTTY)
 
 
 def _reason(error: Exception) -> str:
     """The system's text for an error number, without what libraries put around it."""
-    number = getattr(error, "errno", None)
-    return os.strerror(number) if isinstance(number, int) and number > 0 else str(error)
+    if isinstance(error, socket.gaierror):
+        return error.strerror
+    number = _number(error)
+    if number == errno.ENOTTY:
+        return "not a serial line"
+    return os.strerror(number) if number else str(error)
+
+
+def _number(error: BaseException | None) -> int:
+    """The system's error number, also where a library has wrapped the error; 0 if there is none."""
+    while error is not None:
+        number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
+        if isinstance(number, int) and number > 0:
+            return number
+        error = error.__context__
+    return 0
 
 
 class Transport(ABC):

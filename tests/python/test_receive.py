@@ -211,12 +211,18 @@ def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
 def test_a_line_that_we_may_not_open_fails_at_once(tmp_path, monkeypatch):
     import serial
 
+    def wait_for(device: str, why: str) -> None:
+        with pytest.raises(TransportClosed, match=why):
+            receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+
+    wait_for("/dev/null", "/dev/null: not a serial line")
+    wait_for(str(tmp_path), "Is a directory")
+
     def denied(*_, **__):
         raise serial.SerialException(errno.EACCES, "could not open port")
 
     monkeypatch.setattr(serial, "Serial", denied)
-    with pytest.raises(TransportClosed, match="ttyUSB0: Permission denied"):
-        receive(open_transport("/dev/ttyUSB0"), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+    wait_for("/dev/ttyUSB0", "ttyUSB0: Permission denied")
 
 
 def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
@@ -254,6 +260,18 @@ def test_a_device_that_is_idle_and_empty_is_not_waited_for(tmp_path):
         pytest.raises(PipefishError, match=r"nothing more to send.*its end missing"),
     ):
         receive_from(device, tmp_path / "a.mcap")
+
+
+def test_a_survey_that_a_sibling_holds_is_not_received_twice(tmp_path):
+    """The device has forgotten all acknowledgements of a survey that went into a-2.mcap."""
+    with Device(survey_objects(4), SURVEY) as device:
+        receive_from(device, tmp_path / "a-2.mcap")
+    before = (tmp_path / "a-2.mcap").read_bytes()
+    with Device(survey_objects(4), SURVEY, nonce=8) as device:
+        summary = receive_from(device, tmp_path / "a.mcap")
+        assert not device.spool
+    assert summary["file"] == str(tmp_path / "a-2.mcap") and summary["keyframes"] == 4
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a-2.mcap": before}
 
 
 def test_a_survey_that_was_received_before_is_said(tmp_path):
