@@ -262,6 +262,18 @@ def test_a_device_that_is_idle_and_empty_is_not_waited_for(tmp_path):
         receive_from(device, tmp_path / "a.mcap")
 
 
+def test_a_survey_that_a_sibling_holds_is_not_received_twice(tmp_path):
+    """The device has forgotten all acknowledgements of a survey that went into a-2.mcap."""
+    with Device(survey_objects(4), SURVEY) as device:
+        receive_from(device, tmp_path / "a-2.mcap")
+    before = (tmp_path / "a-2.mcap").read_bytes()
+    with Device(survey_objects(4), SURVEY, nonce=8) as device:
+        summary = receive_from(device, tmp_path / "a.mcap")
+        assert not device.spool
+    assert summary["file"] == str(tmp_path / "a-2.mcap") and summary["keyframes"] == 4
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a-2.mcap": before}
+
+
 def test_a_survey_that_was_received_before_is_said(tmp_path):
     with Device([], SURVEY, state="idle") as device, pytest.raises(PipefishError, match="has been received before"):
         receive_from(device, tmp_path / "a.mcap")
