@@ -373,6 +373,7 @@ class SurveyWriter:
             "keyframes_lost": str(self.content.lost),
         }
         self._writer.add_metadata("pipefish", {**about, **notes})
+        self._failed = True  # unless all of the following works, nothing may be added behind it
         if start is not None and start.profile:
             now = time.time_ns()
             self._writer.add_attachment(now, now, "profile.bin", "application/octet-stream", start.profile)
