@@ -6,6 +6,7 @@ import io
 import json
 import os
 import random
+import select
 import signal
 import socket
 import sqlite3
@@ -410,6 +411,26 @@ def other(folder: Path) -> Path:
     path = folder / "other.y4m"
     path.write_bytes(b"YUV4MPEG2 W64 H64 F25:1 Ip A1:1 Cmono\nFRAME\n" + bytes(4096))
     return path
+
+
+def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_once(tmp_path: Path, crawler: Crawler):
+    device = tmp_path / "ttyPipe"
+    crawler.start("--set", "link.transport=serial", "--set", f"link.device={device}")
+    wait_for_log(crawler, "survey ends")  # it goes on into the spool meanwhile
+    missing = f"{device}: No such file or directory"
+    wait_for_log(crawler, missing)
+    master, slave = os.openpty()
+    device.symlink_to(os.ttyname(slave))
+    end = time.monotonic() + 20
+    while not select.select([master], [], [], 0.1)[0]:  # its hello
+        assert time.monotonic() < end, crawler.text()
+    device.unlink()
+    os.close(master)
+    os.close(slave)
+    wait_for_log(crawler, f"{device}: hung up")
+    time.sleep(1)  # four tries
+    assert crawler.text().count(missing) == 2  # before it came, and after it went
+    assert crawler.text().count("hung up") == 1
 
 
 def test_two_runs_of_one_recording_track_the_same(tmp_path: Path):
