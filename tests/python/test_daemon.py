@@ -671,7 +671,9 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
 
 
 def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -> None:
-    """`frames`: of one loop of the recording. Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
+    """`frames`: of one loop of the recording.
+
+    Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
     [end] = store.ends
     assert {k.survey_id for k in store.keyframes} == {end.survey_id}
     assert [k.index for k in store.keyframes] == list(range(end.keyframes))
@@ -685,7 +687,7 @@ def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -
         assert k.time.boot_id in boots
         is_first = k.time.boot_id != before
         is_wrap = not is_first and k.frame_sequence // (frames + RESET_GAP + 1) != loop
-        assert k.after_break == (is_first and k.index > 0 or is_wrap), k.index
+        assert k.after_break == ((is_first and k.index > 0) or is_wrap), k.index
         if k.after_break:
             assert k.break_reason == ("restart" if is_first else f"gap of {RESET_GAP + 1} frames")
         before, loop = k.time.boot_id, k.frame_sequence // (frames + RESET_GAP + 1)
