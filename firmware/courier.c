@@ -25,8 +25,9 @@ struct pf_courier {
     _Atomic bool is_quitting;
     pf_link *link;
     void *workspace;
-    bool has_stream, has_failed; /* the transport's: connected; its failure has been logged */
-    uint8_t out[16384];          /* frames that the transport has not taken yet: out[out_at .. out_n) */
+    bool has_stream;    /* the transport is connected */
+    char failure[256];  /* of the transport, as it was last logged; "" since it is connected */
+    uint8_t out[16384]; /* frames that the transport has not taken yet: out[out_at .. out_n) */
     size_t out_at, out_n;
     uint64_t status_due, publish_due;
     uint8_t message[CONTROL_MAX]; /* status and replies */
@@ -175,12 +176,30 @@ static void take_events(pf_courier *c, uint64_t now)
 
 /* ---- bytes */
 
-static void lose_stream(pf_courier *c, uint64_t now)
+/* Logs what is wrong with the transport, once for each change of its words: it is asked again and again. */
+static void tell_failure(pf_courier *c)
+{
+    const pf_transport *t = &c->daemon->transport;
+    char failure[sizeof c->failure];
+    (void)snprintf(failure, sizeof failure, "%s", t->ops->error(t->self));
+    if (strcmp(failure, c->failure) == 0)
+        return;
+    memcpy(c->failure, failure, sizeof c->failure);
+    pf_log(PF_LOG_WARNING, "%s: %s", t->ops->name(t->self), failure);
+}
+
+static void drop_session(pf_courier *c, uint64_t now)
 {
     c->has_stream = false;
     c->out_at = c->out_n = 0;
     pf_link_reset(c->link, now);
     take_events(c, now);
+}
+
+static void lose_stream(pf_courier *c, uint64_t now)
+{
+    tell_failure(c);
+    drop_session(c, now);
 }
 
 static void service(pf_courier *c, uint64_t now)
@@ -189,14 +208,13 @@ static void service(pf_courier *c, uint64_t now)
     bool is_fresh = false;
     pf_status status = t->ops->service(t->self, &is_fresh);
     if (is_fresh) {
-        lose_stream(c, now);
-        c->has_failed = false;
+        drop_session(c, now);
+        c->failure[0] = '\0';
         pf_log(PF_LOG_DEBUG, "%s: connected", t->ops->name(t->self));
     }
     c->has_stream = status == PF_OK;
-    if (status == PF_ERR_IO && !c->has_failed)
-        pf_log(PF_LOG_ERROR, "%s: %s", t->ops->name(t->self), t->ops->error(t->self));
-    c->has_failed = status == PF_ERR_IO;
+    if (!c->has_stream)
+        tell_failure(c);
 }
 
 static void read_stream(pf_courier *c, uint64_t now)

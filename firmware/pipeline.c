@@ -10,8 +10,9 @@
 #include "pipefish/drivers/sha256.h"
 #include "utf8.h"
 
-#define NEXT_TIMEOUT_MS 100u /* how long a stop may go unnoticed while the camera is silent */
-#define START_MAX       (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
+#define PREVIEW_OVERHEAD 128u /* most bytes of a preview message without its JPEG: six numbers and their tags */
+#define NEXT_TIMEOUT_MS  100u /* how long a stop may go unnoticed while the camera is silent */
+#define START_MAX        (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
 
 struct pf_pipeline {
     pf_daemon *daemon;
@@ -27,6 +28,7 @@ struct pf_pipeline {
     pf_jpeg *jpeg;
     uint8_t preview[PF_PREVIEW_MAX];
     uint64_t preview_due;
+    uint32_t preview_quality, preview_shrink; /* of the last preview */
     uint32_t next_index;
     uint32_t boots;
     char break_reason[PF_BREAK_REASON_MAX]; /* "" = tracks go on */
@@ -227,6 +229,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     }
     p->daemon = daemon;
     p->courier = courier;
+    p->preview_quality = daemon->config.status.preview_quality;
+    p->preview_shrink = PF_JPEG_PREVIEW_SHRINK;
     p->next_index = survey->next_index;
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
@@ -324,10 +328,8 @@ static void make_preview(pf_pipeline *p, const pf_frame *frame)
     uint64_t now = pf_now();
     bool is_wanted;
     size_t n;
-    pf_msg_preview preview = {.time = {d->boot_id, frame->time_ns},
-                              .frame_sequence = frame->sequence,
-                              .width = (frame->image.width + 3) / PF_JPEG_PREVIEW_SHRINK,
-                              .height = (frame->image.height + 3) / PF_JPEG_PREVIEW_SHRINK};
+    pf_msg_preview preview = {.time = {d->boot_id, frame->time_ns}, .frame_sequence = frame->sequence};
+    pf_jpeg_preview made;
     if (d->config.status.preview_interval_ms == 0 || now < p->preview_due)
         return;
     pthread_mutex_lock(&d->counters.mutex);
@@ -336,14 +338,21 @@ static void make_preview(pf_pipeline *p, const pf_frame *frame)
     if (!is_wanted)
         return;
     p->preview_due = now + (uint64_t)d->config.status.preview_interval_ms * 1000000u;
-    if (pf_jpeg_encode_preview(p->jpeg, &frame->image, &preview.jpeg, &preview.jpeg_size) != PF_OK) {
+    if (pf_jpeg_encode_preview(p->jpeg, &frame->image, sizeof p->preview - PREVIEW_OVERHEAD, &made) != PF_OK) {
         pf_log(PF_LOG_WARNING, "preview: %s", pf_jpeg_error(p->jpeg));
         return;
     }
+    if (made.quality != p->preview_quality || made.shrink != p->preview_shrink)
+        pf_log(PF_LOG_WARNING, "previews are too large: from now on 1/%u of the size, quality %u", made.shrink,
+               made.quality);
+    p->preview_quality = made.quality;
+    p->preview_shrink = made.shrink;
+    preview.width = made.width;
+    preview.height = made.height;
+    preview.jpeg = made.bytes;
+    preview.jpeg_size = made.n;
     if (pf_msg_encode_preview(&preview, p->preview, sizeof p->preview, &n) == PF_OK)
         pf_courier_preview(p->courier, p->preview, n);
-    else
-        pf_log(PF_LOG_WARNING, "a preview of %zu bytes is too large: lower status.preview_quality", preview.jpeg_size);
 }
 
 static void release_previous(pf_pipeline *p)

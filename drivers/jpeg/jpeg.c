@@ -7,13 +7,15 @@
 #include <string.h>
 #include <turbojpeg.h>
 
+#define PREVIEW_QUALITY_LEAST 20u /* below it a smaller picture shows more */
+
 typedef struct span {
     uint32_t begin, end; /* columns of one row inside the circle: begin <= x < end */
 } span;
 
 struct pf_jpeg {
     pf_jpeg_config config;
-    uint32_t preview_width, preview_height;
+    uint32_t preview_quality, preview_shrink; /* as far as was needed so far */
     tjhandle turbo;
     span *spans;      /* height of them; NULL without a circle */
     uint8_t *masked;  /* width x height, black outside the spans for good; NULL without a circle */
@@ -64,16 +66,18 @@ static pf_status check(const pf_jpeg_config *config, pf_failure *failure)
 static pf_status open_parts(pf_jpeg *jpeg)
 {
     const pf_jpeg_config *config = &jpeg->config;
-    jpeg->preview_width = (config->width + PF_JPEG_PREVIEW_SHRINK - 1) / PF_JPEG_PREVIEW_SHRINK;
-    jpeg->preview_height = (config->height + PF_JPEG_PREVIEW_SHRINK - 1) / PF_JPEG_PREVIEW_SHRINK;
+    uint32_t width = (config->width + PF_JPEG_PREVIEW_SHRINK - 1) / PF_JPEG_PREVIEW_SHRINK;
+    uint32_t height = (config->height + PF_JPEG_PREVIEW_SHRINK - 1) / PF_JPEG_PREVIEW_SHRINK;
+    jpeg->preview_quality = config->preview_quality;
+    jpeg->preview_shrink = PF_JPEG_PREVIEW_SHRINK;
     jpeg->out_size = tjBufSize((int)config->width, (int)config->height, TJSAMP_GRAY);
-    jpeg->preview_out_size = tjBufSize((int)jpeg->preview_width, (int)jpeg->preview_height, TJSAMP_GRAY);
+    jpeg->preview_out_size = tjBufSize((int)width, (int)height, TJSAMP_GRAY);
     jpeg->turbo = tjInitCompress();
     if (jpeg->turbo == NULL)
         return pf_fail(&jpeg->failure, PF_ERR_IO, "libjpeg-turbo: %s", tjGetErrorStr2(NULL));
     jpeg->out = malloc(jpeg->out_size);
     jpeg->preview_out = malloc(jpeg->preview_out_size);
-    jpeg->preview = malloc((size_t)jpeg->preview_width * jpeg->preview_height);
+    jpeg->preview = malloc((size_t)width * height);
     bool complete = jpeg->out != NULL && jpeg->preview_out != NULL && jpeg->preview != NULL;
     if (complete && config->circle_radius > 0) {
         jpeg->spans = malloc(config->height * sizeof *jpeg->spans);
@@ -169,14 +173,14 @@ pf_status pf_jpeg_encode(pf_jpeg *jpeg, const pf_image *image, const uint8_t **b
 }
 
 /* Box filter: each pixel the rounded mean of the source pixels it covers. */
-static void shrink(const pf_image *from, uint32_t width, uint32_t height, uint8_t *to)
+static void shrink(const pf_image *from, uint32_t by, uint32_t width, uint32_t height, uint8_t *to)
 {
     for (uint32_t y = 0; y < height; y++) {
-        uint32_t y0 = y * PF_JPEG_PREVIEW_SHRINK, y1 = y0 + PF_JPEG_PREVIEW_SHRINK;
+        uint32_t y0 = y * by, y1 = y0 + by;
         if (y1 > from->height)
             y1 = from->height;
         for (uint32_t x = 0; x < width; x++) {
-            uint32_t x0 = x * PF_JPEG_PREVIEW_SHRINK, x1 = x0 + PF_JPEG_PREVIEW_SHRINK, sum = 0;
+            uint32_t x0 = x * by, x1 = x0 + by, sum = 0;
             if (x1 > from->width)
                 x1 = from->width;
             for (uint32_t v = y0; v < y1; v++)
@@ -188,13 +192,29 @@ static void shrink(const pf_image *from, uint32_t width, uint32_t height, uint8_
     }
 }
 
-pf_status pf_jpeg_encode_preview(pf_jpeg *jpeg, const pf_image *image, const uint8_t **bytes, size_t *n)
+pf_status pf_jpeg_encode_preview(pf_jpeg *jpeg, const pf_image *image, size_t most, pf_jpeg_preview *p)
 {
     pf_image masked = *image;
     pf_status status = mask(jpeg, &masked);
     if (status != PF_OK)
         return status;
-    pf_image preview = {jpeg->preview, jpeg->preview_width, jpeg->preview_height, jpeg->preview_width};
-    shrink(&masked, preview.width, preview.height, jpeg->preview);
-    return compress(jpeg, &preview, jpeg->config.preview_quality, jpeg->preview_out, jpeg->preview_out_size, bytes, n);
+    for (;;) {
+        uint32_t by = jpeg->preview_shrink;
+        p->shrink = by;
+        p->quality = jpeg->preview_quality;
+        p->width = (masked.width + by - 1) / by;
+        p->height = (masked.height + by - 1) / by;
+        pf_image preview = {jpeg->preview, p->width, p->height, p->width};
+        shrink(&masked, by, p->width, p->height, jpeg->preview);
+        status = compress(jpeg, &preview, p->quality, jpeg->preview_out, jpeg->preview_out_size, &p->bytes, &p->n);
+        if (status != PF_OK || p->n <= most)
+            return status;
+        if (p->width == 1 && p->height == 1)
+            return pf_fail(&jpeg->failure, PF_ERR_SPACE, "a preview of one pixel has more than %zu bytes", most);
+        if (jpeg->preview_quality > PREVIEW_QUALITY_LEAST)
+            jpeg->preview_quality =
+                jpeg->preview_quality / 2 > PREVIEW_QUALITY_LEAST ? jpeg->preview_quality / 2 : PREVIEW_QUALITY_LEAST;
+        else
+            jpeg->preview_shrink *= 2;
+    }
 }

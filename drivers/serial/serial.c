@@ -118,9 +118,11 @@ static pf_status configure(serial *s, int fd)
     return PF_OK;
 }
 
-static pf_status open_device(serial *s)
+/* *is_absent: nothing is plugged in under this path. */
+static pf_status open_device(serial *s, bool *is_absent)
 {
     int fd = open(s->device, O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
+    *is_absent = fd < 0 && (errno == ENOENT || errno == ENODEV || errno == ENXIO);
     if (fd < 0)
         return pf_fail(&s->failure, PF_ERR_IO, "%s: %s", s->device, strerror(errno));
     pf_status status = configure(s, fd);
@@ -151,8 +153,9 @@ static int serial_fd(void *self)
 static pf_status serial_service(void *self, bool *fresh)
 {
     serial *s = self;
+    bool is_absent;
     *fresh = false;
-    if (s->fd < 0 && open_device(s) != PF_OK)
+    if (s->fd < 0 && open_device(s, &is_absent) != PF_OK)
         return PF_ERR_AGAIN; /* whatever the reason: a device that is plugged in goes through all of them */
     *fresh = s->fresh;
     s->fresh = false;
@@ -284,8 +287,9 @@ pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config
     s->rtscts = config->rtscts;
     s->fd = -1;
     (void)snprintf(s->name, sizeof s->name, "serial %s %u", s->device, s->baud);
-    pf_status status = open_device(s);
-    if (status != PF_OK) {
+    bool is_absent;
+    pf_status status = open_device(s, &is_absent);
+    if (status != PF_OK && !is_absent) {
         pf_failure_copy(&s->failure, status, error, n);
         serial_close(s);
         return status;

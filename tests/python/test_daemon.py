@@ -6,6 +6,7 @@ import io
 import json
 import os
 import random
+import select
 import signal
 import socket
 import sqlite3
@@ -412,6 +413,26 @@ def other(folder: Path) -> Path:
     return path
 
 
+def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_once(tmp_path: Path, crawler: Crawler):
+    device = tmp_path / "ttyPipe"
+    crawler.start("--set", "link.transport=serial", "--set", f"link.device={device}")
+    wait_for_log(crawler, "survey ends")  # it goes on into the spool meanwhile
+    missing = f"{device}: No such file or directory"
+    wait_for_log(crawler, missing)
+    master, slave = os.openpty()
+    device.symlink_to(os.ttyname(slave))
+    end = time.monotonic() + 20
+    while not select.select([master], [], [], 0.1)[0]:  # its hello
+        assert time.monotonic() < end, crawler.text()
+    device.unlink()
+    os.close(master)
+    os.close(slave)
+    wait_for_log(crawler, f"{device}: hung up")
+    time.sleep(1)  # four tries
+    assert crawler.text().count(missing) == 2  # before it came, and after it went
+    assert crawler.text().count("hung up") == 1
+
+
 def test_two_runs_of_one_recording_track_the_same(tmp_path: Path):
     write_recording(tmp_path / "survey.y4m", 30)
     runs = []
@@ -650,7 +671,9 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
 
 
 def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -> None:
-    """`frames`: of one loop of the recording. Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
+    """`frames`: of one loop of the recording.
+
+    Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
     [end] = store.ends
     assert {k.survey_id for k in store.keyframes} == {end.survey_id}
     assert [k.index for k in store.keyframes] == list(range(end.keyframes))
@@ -664,7 +687,7 @@ def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -
         assert k.time.boot_id in boots
         is_first = k.time.boot_id != before
         is_wrap = not is_first and k.frame_sequence // (frames + RESET_GAP + 1) != loop
-        assert k.after_break == (is_first and k.index > 0 or is_wrap), k.index
+        assert k.after_break == ((is_first and k.index > 0) or is_wrap), k.index
         if k.after_break:
             assert k.break_reason == ("restart" if is_first else f"gap of {RESET_GAP + 1} frames")
         before, loop = k.time.boot_id, k.frame_sequence // (frames + RESET_GAP + 1)

@@ -91,6 +91,7 @@ static void test_circle_masks_the_outside(void)
 /* Proves: a preview pixel is the mean of the 4 x 4 it covers, also at the ragged right and lower border. */
 static void test_preview_is_the_mean(void)
 {
+    pf_jpeg_preview preview;
     pf_jpeg *jpeg = NULL;
     pf_jpeg_config config = {.width = W, .height = H, .quality = 80, .preview_quality = 100};
     const uint8_t *bytes;
@@ -98,7 +99,9 @@ static void test_preview_is_the_mean(void)
     uint32_t w = (W + 3) / 4, h = (H + 3) / 4;
     paint();
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_open(&jpeg, &config, error, sizeof error));
-    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, &bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, 1 << 20, &preview));
+    bytes = preview.bytes;
+    n = preview.n;
     decode(bytes, n, w, h);
     for (uint32_t y = 0; y < h; y++)
         for (uint32_t x = 0; x < w; x++) {
@@ -111,9 +114,34 @@ static void test_preview_is_the_mean(void)
     pf_jpeg_close(jpeg);
 }
 
+/* Proves: a preview that is too large is made again with less until it fits, and the next one begins there. */
+static void test_preview_is_made_to_fit(void)
+{
+    pf_jpeg_preview first, preview;
+    pf_jpeg *jpeg = NULL;
+    pf_jpeg_config config = {.width = W, .height = H, .quality = 80, .preview_quality = 100};
+    paint();
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_open(&jpeg, &config, error, sizeof error));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, 1 << 20, &first));
+    size_t most = first.n, whole = first.n;
+    while (most > whole / 4 && most > 400) {
+        most -= 20;
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, most, &preview));
+        TEST_ASSERT_TRUE(preview.n <= most);
+        decode(preview.bytes, preview.n, (W + preview.shrink - 1) / preview.shrink,
+               (H + preview.shrink - 1) / preview.shrink);
+    }
+    TEST_ASSERT_TRUE(preview.quality < 100);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, 1 << 20, &first));
+    TEST_ASSERT_EQUAL_UINT32(preview.quality, first.quality);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_jpeg_encode_preview(jpeg, &image, 10, &preview));
+    pf_jpeg_close(jpeg);
+}
+
 /* Proves: noise at quality 100, the worst case, fits the memory taken at opening. */
 static void test_worst_case_fits(void)
 {
+    pf_jpeg_preview preview;
     pf_jpeg *jpeg = NULL;
     pf_jpeg_config config = {.width = W, .height = H, .quality = 100, .preview_quality = 100};
     const uint8_t *bytes;
@@ -125,7 +153,9 @@ static void test_worst_case_fits(void)
     }
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_open(&jpeg, &config, error, sizeof error));
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode(jpeg, &image, &bytes, &n));
-    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, &bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_encode_preview(jpeg, &image, 1 << 20, &preview));
+    bytes = preview.bytes;
+    n = preview.n;
     pf_jpeg_close(jpeg);
 }
 
@@ -179,6 +209,7 @@ int main(void)
     RUN_TEST(test_frame_survives);
     RUN_TEST(test_circle_masks_the_outside);
     RUN_TEST(test_preview_is_the_mean);
+    RUN_TEST(test_preview_is_made_to_fit);
     RUN_TEST(test_worst_case_fits);
     RUN_TEST(test_wrong_arguments_are_refused);
     RUN_TEST(test_sha256);

@@ -187,7 +187,6 @@ static void refused(const char *device, uint32_t baud, pf_status expected, const
 /* Proves: what is no serial line, no rate, or in use, is refused in words; and is free again after closing. */
 static void test_wrong_devices_are_refused(void)
 {
-    refused(temporary_path("missing"), 115200, PF_ERR_IO, "missing: No such file");
     refused("/dev/null", 115200, PF_ERR_UNSUPPORTED, "/dev/null: not a terminal");
     refused(temporary_text("file", "x"), 115200, PF_ERR_UNSUPPORTED, "not a terminal");
     refused("", 115200, PF_ERR_ARGUMENT, "no device");

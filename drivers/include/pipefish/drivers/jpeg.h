@@ -26,8 +26,15 @@ void pf_jpeg_close(pf_jpeg *jpeg); /* NULL is allowed */
  * PF_OK; PF_ERR_ARGUMENT (another size); PF_ERR_IO (libjpeg-turbo failed: pf_jpeg_error says how). */
 pf_status pf_jpeg_encode(pf_jpeg *jpeg, const pf_image *image, const uint8_t **bytes, size_t *n);
 
-/* The same, shrunk to (width + 3) / 4 by (height + 3) / 4. */
-pf_status pf_jpeg_encode_preview(pf_jpeg *jpeg, const pf_image *image, const uint8_t **bytes, size_t *n);
+typedef struct pf_jpeg_preview {
+    const uint8_t *bytes; /* the encoder's memory */
+    size_t n;
+    uint32_t width, height, quality, shrink; /* as it was made */
+} pf_jpeg_preview;
+
+/* The same, shrunk to (width + 3) / 4 by (height + 3) / 4, in `most` bytes: what does not fit is made again at half the
+ * quality, then at half the size, and so are all previews after it. Also PF_ERR_SPACE: no picture is that small. */
+pf_status pf_jpeg_encode_preview(pf_jpeg *jpeg, const pf_image *image, size_t most, pf_jpeg_preview *preview);
 
 /* The last failure in words; "" if there was none. */
 const char *pf_jpeg_error(const pf_jpeg *jpeg);

@@ -43,9 +43,9 @@ typedef struct pf_serial_config {
     bool rtscts;
 } pf_serial_config;
 
-/* On failure *transport is untouched and error[n] says what. Once open, the device may vanish and come back: service()
- * opens it again under the same path. PF_OK; PF_ERR_IO (no such device, in use); PF_ERR_ARGUMENT; PF_ERR_UNSUPPORTED
- * (not a terminal, or not at this rate). */
+/* On failure *transport is untouched and error[n] says what. The device may be absent, vanish and come back: service()
+ * opens it under the same path once it is there. PF_OK; PF_ERR_IO (no permission, in use); PF_ERR_ARGUMENT;
+ * PF_ERR_UNSUPPORTED (not a terminal, or not at this rate). */
 pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config, char *error, size_t n);
 
 /* Listens; one client at a time, the next waits. Without TLS (a later issue) only loopback addresses are accepted. */
