@@ -346,6 +346,7 @@ static void write_plain(const char *name, uint8_t value)
 static void test_folder_in_order(void)
 {
     pf_frame frame;
+    uint64_t first = 0;
     make_folder();
     write_plain("img10.pgm", 10);
     write_plain("img2.PGM", 2);
@@ -370,7 +371,10 @@ static void test_folder_in_order(void)
             else
                 TEST_ASSERT_EQUAL_MEMORY(expected, frame.image.data, W * H);
             TEST_ASSERT_EQUAL_UINT64(with_csv ? (i < 2 ? i + 1 : i + 2) : i, frame.sequence);
-            TEST_ASSERT_EQUAL_UINT64(with_csv ? (i < 3 ? i + 5 : 9) : i * 100000000, frame.time_ns); /* 10 a second */
+            uint64_t recorded = with_csv ? (i < 3 ? i + 5 : 9) : i * 100000000; /* 10 a second without times */
+            first = i == 0 ? frame.time_ns - recorded : first;
+            TEST_ASSERT_EQUAL_UINT64(recorded, frame.recorded_ns);
+            TEST_ASSERT_EQUAL_UINT64(first + recorded, frame.time_ns);
             camera.ops->release(camera.self, &frame);
         }
         TEST_ASSERT_EQUAL_INT(PF_ERR_END, camera.ops->next(camera.self, 0, &frame));
