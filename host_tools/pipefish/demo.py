@@ -255,6 +255,7 @@ def demo(
         "track_length_p90": info["tracks"]["length_frames_p90"],
         "track_length_keyframes_median": info["tracks"]["length_keyframes_median"],
         "within_1px": evaluation["within_1px"] if evaluation else None,
+        "survival": evaluation["survival"] if evaluation else None,
         "evaluation": evaluation,
         **link_goodput(programs.bench_link, quiet),
         "length_m": info["length_m"],
@@ -298,6 +299,7 @@ def figures(summary: dict[str, Any]) -> str:
             ("track length, median", camera_frames("track_length_median")),
             ("track length, 90th percentile", camera_frames("track_length_p90")),
             ("tracked points within 1 px of the truth", percent("within_1px")),
+            ("followed to the next keyframe, of those possible", percent("survival")),
             ("link goodput, clean", percent("link_goodput_clean")),
             ("link goodput, 1 % of frames lost", percent("link_goodput_1pct")),
         ]

@@ -124,11 +124,15 @@ class Page:
         ages = [f"{b['age_low']}-{b['age_high']}" for b in by_age]
         error = self.evaluation["median_px"]
         median = f"; the median error is {error:.3f} px" if error is not None else ""
+        share = self.evaluation.get("survival")
+        survival = (
+            f" {100 * share:.1f} % of the tracks that could be followed to the next keyframe were." if share else ""
+        )
         return {
             "id": "accuracy",
             "title": "Accuracy against the simulator's truth",
             "text": f"{100 * self.evaluation['within_1px']:.2f} % of all observations lie within one pixel of where "
-            f"the point really is{median}. Each track is anchored at the keyframe that saw it first.",
+            f"the point really is{median}. Each track is anchored at the keyframe that saw it first.{survival}",
             "data": [
                 {
                     "type": "bar",

@@ -16,7 +16,7 @@ from pipefish.survey import Survey
 BUILD = os.environ.get("PIPEFISH_BUILD") or str(Path(__file__).resolve().parents[2] / "build" / "release")
 DOORS = (
     *("frames", "fps", "keyframes_sent", "keyframes_received", "bytes", "crc_errors"),
-    *("track_length_median", "track_length_p90", "within_1px"),
+    *("track_length_median", "track_length_p90", "within_1px", "survival"),
 )
 
 

@@ -16,6 +16,7 @@ from synthetic import as_object, end, keyframe, start, survey_objects, write_sur
 EVALUATION = {
     "observations": 10,
     "within_1px": 0.98,
+    "survival": 0.991,
     "median_px": 0.2,
     "p95_px": 0.7,
     "by_age": [{"age_low": 1, "age_high": 5, "count": 10, "within_1px": 0.98, "median_px": None}],
