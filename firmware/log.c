@@ -3,6 +3,7 @@
 #include <stdarg.h>
 #include <stdatomic.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
 
@@ -23,7 +24,14 @@ void pf_log(uint32_t level, const char *format, ...)
     va_list arguments;
     if (level > most)
         return;
-    n = (size_t)snprintf(line, sizeof line, "<%d>pipefishd: ", priority[level]);
+    /* systemd sets this and reads the priority from the prefix; people need not see it. */
+    if (getenv("JOURNAL_STREAM"))
+        n = (size_t)snprintf(line, sizeof line, "<%d>pipefishd: ", priority[level]);
+    else
+        n = (size_t)snprintf(line, sizeof line, "pipefishd: %s",
+                             level == PF_LOG_ERROR     ? "error: "
+                             : level == PF_LOG_WARNING ? "warning: "
+                                                       : "");
     va_start(arguments, format);
     (void)vsnprintf(line + n, sizeof line - n - 1, format, arguments);
     va_end(arguments);
