@@ -54,7 +54,7 @@ class Receiver(Handlers):
         self._info_id: int | None = None
         self._first_object: float | None = None
         self._last_object: float | None = None
-        self._clock_told = False
+        self._clock_told_ns: int | None = None  # error of the clock that the device was told
         self._quiet = quiet
         self._asked_rest: tuple[int | None, int, float] = (None, 0, 0.0)  # request, objects received then, when
 
@@ -63,7 +63,7 @@ class Receiver(Handlers):
     def on_up(self, event: Any) -> None:
         self.sessions += 1
         self._up_since = time.monotonic()
-        self._clock_told = False
+        self._clock_told_ns = None
         self._info_id = self._ask(get_info=pb.Nothing())
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int:
@@ -113,8 +113,9 @@ class Receiver(Handlers):
         clock = self.client.clock
         if clock is not None and self.client.boot:
             self._clocks[self.client.boot] = clock
-            if not self._clock_told:
-                self._clock_told = True
+            # The first round trips queue behind keyframes; a better one is worth telling.
+            if self._clock_told_ns is None or clock.error_ns < self._clock_told_ns / 2:
+                self._clock_told_ns = clock.error_ns
                 self._ask(
                     clock_sync=pb.ClockSync(
                         boot_id=self.client.boot, offset_ns=clock.offset_ns, error_ns=clock.error_ns
