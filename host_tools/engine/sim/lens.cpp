@@ -63,6 +63,27 @@ double rear_group(double alpha)
     return 0.6 * std::sin(alpha) + 0.8 * std::tan(0.5 * alpha);
 }
 
+// The root in [lo, hi] of an increasing function f(t, &slope): Newton from t, a step that leaves the bracket bisects
+// it.
+template <typename F> double increasing_root(double lo, double hi, double t, const F &f)
+{
+    for (int k = 0; k < 80; k++) {
+        double slope = 0.0;
+        const double error = f(t, &slope);
+        (error > 0.0 ? hi : lo) = t;
+        double next = t - error / slope;
+        if (!(next >= lo && next <= hi)) {
+            next = 0.5 * (lo + hi);
+        }
+        const bool done = std::abs(next - t) < 1e-15;
+        t = next;
+        if (done) {
+            break;
+        }
+    }
+    return t;
+}
+
 } // namespace
 
 LensTable trace_fisheye(double theta_max, double circle_radius, double pupil_scale)
@@ -169,21 +190,7 @@ bool Lens::theta_of_radius(double r, double &theta) const
         return false;
     }
     double lo = 0.0, hi = theta_max(), t = hi * r / circle_radius();
-    for (int k = 0; k < 60; k++) {
-        double slope = 0.0;
-        const double error = radius_(t, &slope) - r;
-        (error > 0.0 ? hi : lo) = t;
-        double next = t - error / slope;
-        if (!(next >= lo && next <= hi)) {
-            next = 0.5 * (lo + hi);
-        }
-        const bool done = std::abs(next - t) < 1e-15;
-        t = next;
-        if (done) {
-            break;
-        }
-    }
-    theta = t;
+    theta = increasing_root(lo, hi, t, [&](double at, double *slope) { return radius_(at, slope) - r; });
     return true;
 }
 
@@ -204,22 +211,12 @@ bool Lens::theta_of_point(double rho, double z, double &theta) const
     if (miss(hi, nullptr) > 0.0) {
         return false;
     }
-    for (int k = 0; k < 80; k++) {
-        double slope = 0.0;
-        const double error = miss(t, &slope);
-        (error > 0.0 ? lo : hi) = t;
-        double next = t - error / slope;
-        if (!(next >= lo && next <= hi)) {
-            next = 0.5 * (lo + hi);
-        }
-        const bool done = std::abs(next - t) < 1e-15;
-        t = next;
-        if (done) {
-            break;
-        }
-    }
-    theta = t;
-    return rho * std::sin(t) + (z - pupil_(t)) * std::cos(t) > 0.0;
+    theta = increasing_root(lo, hi, t, [&](double at, double *slope) {
+        const double value = miss(at, slope);
+        *slope = -*slope;
+        return -value;
+    });
+    return rho * std::sin(theta) + (z - pupil_(theta)) * std::cos(theta) > 0.0;
 }
 
 } // namespace pipefish::sim
