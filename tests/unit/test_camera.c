@@ -180,7 +180,7 @@ static void test_derivative_by_parameters_equals_finite_differences(void)
         offsetof(pf_camera, k3),  offsetof(pf_camera, k4),  offsetof(pf_camera, k5)};
     for (int l = 0; l < LENSES; l++)
         for (size_t i = 0; i < GRID_THETAS; i++)
-            for (int param = 0; param < PF_CAMERA_PARAMS; param++) {
+            for (int param = 0; param <= PF_PARAM_K5; param++) {
                 pf_camera camera = lens(l);
                 double xyz[3], uv[2], low[2], high[2], jacobian[2 * PF_CAMERA_PARAMS];
                 direction(grid_theta(i), 2.2, 0.3, xyz);
@@ -385,7 +385,7 @@ static void test_batches_mark_invalid_items(void)
             TEST_ASSERT_TRUE(isnan(uv[i][0]) && isnan(uv[i][1]));
         }
     }
-    pf_camera_unproject_n(&camera, 4, &uv[0][0], &ray[0][0], ok);
+    pf_camera_unproject_n(&camera, 4, &uv[0][0], &ray[0][0], NULL, ok);
     for (int i = 0; i < 4; i++) {
         TEST_ASSERT_EQUAL_UINT8(i == 0 || i == 3, ok[i]);
         TEST_ASSERT_TRUE(ok[i] ? fabs(hypot(hypot(ray[i][0], ray[i][1]), ray[i][2]) - 1) < 1e-15

@@ -21,6 +21,38 @@
 #define POINT_MIN 1e-100
 #define POINT_MAX 1e100
 
+double *pf_camera_param_at(pf_camera *camera, uint32_t param)
+{
+    static const struct {
+        uint32_t first;
+        size_t offset;
+    } runs[] = {
+        {PF_PARAM_F_U, offsetof(pf_camera, f_u)},
+        {PF_PARAM_F_V, offsetof(pf_camera, f_v)},
+        {PF_PARAM_SKEW, offsetof(pf_camera, skew)},
+        {PF_PARAM_C_U, offsetof(pf_camera, c_u)},
+        {PF_PARAM_C_V, offsetof(pf_camera, c_v)},
+        {PF_PARAM_K2, offsetof(pf_camera, k2)},
+        {PF_PARAM_K3, offsetof(pf_camera, k3)},
+        {PF_PARAM_K4, offsetof(pf_camera, k4)},
+        {PF_PARAM_K5, offsetof(pf_camera, k5)},
+        {PF_PARAM_ASYM_RADIAL_THETA, offsetof(pf_camera, asym_radial_theta)},
+        {PF_PARAM_ASYM_RADIAL_PHI, offsetof(pf_camera, asym_radial_phi)},
+        {PF_PARAM_ASYM_TANGENTIAL_THETA, offsetof(pf_camera, asym_tangential_theta)},
+        {PF_PARAM_ASYM_TANGENTIAL_PHI, offsetof(pf_camera, asym_tangential_phi)},
+        {PF_PARAM_TILT, offsetof(pf_camera, tilt)},
+        {PF_PARAM_MIRROR, offsetof(pf_camera, mirror)},
+        {PF_PARAM_PUPIL_E1, offsetof(pf_camera, pupil_e1)},
+        {PF_PARAM_CPOLY, offsetof(pf_camera, cpoly)},
+    };
+    if (param >= PF_CAMERA_PARAMS)
+        return NULL;
+    size_t i = sizeof runs / sizeof runs[0] - 1;
+    while (runs[i].first > param)
+        i--;
+    return (double *)(void *)((unsigned char *)camera + runs[i].offset) + (param - runs[i].first);
+}
+
 /* ------------------------------------------------------------------------------------------------- checking */
 
 typedef struct range {
@@ -217,6 +249,14 @@ static double radial(const pf_camera *camera, double theta, double *derivative)
     return 1 + s * (camera->k2 + s * (camera->k3 + s * (camera->k4 + s * camera->k5)));
 }
 
+double pf_camera_radius(const pf_camera *camera, double theta, double *slope)
+{
+    double derivative, over_theta = radial(camera, theta, &derivative);
+    if (slope)
+        *slope = derivative;
+    return theta * over_theta;
+}
+
 /* Solves r(theta) = rd, 0 <= rd <= r(theta_max), by Newton inside a bracket: a step that leaves the bracket, or does
  * not halve the step before the last, becomes a bisection, so about 2 x 53 steps are the most; real lenses take 5. */
 static double radial_solve(const pf_camera *camera, double rd)
@@ -357,11 +397,15 @@ void pf_camera_project_n(const pf_camera *camera, size_t n, const double *xyz, d
     }
 }
 
-void pf_camera_unproject_n(const pf_camera *camera, size_t n, const double *uv, double *ray, uint8_t *ok)
+void pf_camera_unproject_n(const pf_camera *camera, size_t n, const double *uv, double *ray, double *origin,
+                           uint8_t *ok)
 {
     for (size_t i = 0; i < n; i++) {
-        ok[i] = pf_camera_unproject(camera, uv + 2 * i, ray + 3 * i, NULL, NULL) == PF_OK;
+        double from[3] = {(double)NAN, (double)NAN, (double)NAN};
+        ok[i] = pf_camera_unproject(camera, uv + 2 * i, ray + 3 * i, from, NULL) == PF_OK;
         if (!ok[i])
             ray[3 * i] = ray[3 * i + 1] = ray[3 * i + 2] = (double)NAN;
+        for (size_t j = 0; origin && j < 3; j++)
+            origin[3 * i + j] = from[j];
     }
 }
