@@ -7,10 +7,9 @@
 
 #define BLOCK 64
 
-/* On x86-64 a second copy of each loop for AVX2, chosen when the program starts. Basic operations without contraction
- * give the same bits in both. */
-#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && defined(__OPTIMIZE__) &&                         \
-    !defined(__SANITIZE_ADDRESS__)
+/* PF_WIDE (CMake: x86-64 Linux): a second copy of each loop for AVX2, chosen when the program starts. Basic operations
+ * without contraction give the same bits in both. */
+#ifdef PF_WIDE
 #define WIDE __attribute__((target_clones("default", "avx2")))
 #else
 #define WIDE
@@ -34,7 +33,7 @@ WIDE static void angles(const double *restrict xyz, size_t n, double theta_max, 
         double inverse = 1 / (on_axis ? 1 : rho);
         double angle = angle_of(rho, z[i]);
         bool ahead = !(on_axis & (z[i] < 0)) & (angle <= theta_max + THETA_SLACK);
-        valid[i] = point_is_sound(x[i], y[i], z[i]) & ahead ? 1 : 0;
+        valid[i] = (point_is_sound(x[i], y[i], z[i]) & ahead) ? 1 : 0;
         theta[i] = angle < theta_max ? angle : theta_max;
         c[i] = on_axis ? 1 : x[i] * inverse;
         s[i] = y[i] * (on_axis ? 0 : inverse);
@@ -167,7 +166,7 @@ WIDE static void inverse_block(const pf_camera *camera, const inverse_start *sta
         t -= step;
         step = (t * generic_radial(camera, t, &slope) - rd[i]) / slope;
         t -= step;
-        settled[i] = (fabs(step) <= 1e-9 * t) & (slope > 1e-3) & (rd[i] < start->rd_max) ? 1 : 0;
+        settled[i] = ((fabs(step) <= 1e-9 * t) & (slope > 1e-3) & (rd[i] < start->rd_max)) ? 1 : 0;
         theta[i] = t < camera->theta_max ? t : camera->theta_max;
         sine_cosine(theta[i], &sine[i], &cosine[i]);
     }
