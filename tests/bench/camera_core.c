@@ -3,7 +3,8 @@
 
 #include <math.h>
 
-/* The lens of the example profile: 185 degrees, p9; with Paper II's asymmetric terms (about 1 px) where `asymmetric`. */
+/* The lens of the example profile: 185 degrees, p9; with Paper II's asymmetric terms (about 1 px) where `asymmetric`.
+ */
 const pf_camera *bench_camera(int asymmetric);
 const pf_camera *bench_camera(int asymmetric)
 {
