@@ -16,9 +16,10 @@ struct RowHits {
 struct Scene::Buffers {
     // Of the lit pixels: where each sees the wall, in texels, and the light that reaches it from a white wall.
     std::vector<float> texel_row, texel_column, light;
-    std::vector<float> image; // linear grey levels, height x width, blurred along the rows
+    float share = 1.0f;              // of the exposure that is being drawn
+    std::vector<float> image, spare; // linear grey levels, height x width
 
-    Buffers(size_t lit, size_t pixels) : texel_row(lit), texel_column(lit), light(lit), image(pixels) {}
+    Buffers(size_t lit, size_t pixels) : texel_row(lit), texel_column(lit), light(lit), image(pixels), spare(pixels) {}
 };
 
 } // namespace pipefish::sim
