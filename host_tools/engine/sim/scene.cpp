@@ -182,23 +182,31 @@ bool Scene::cast_from(const CameraState &camera, const double px[2], double worl
 
 bool Scene::project(int frame, const double world[3], double px[2]) const
 {
-    double found[2] = {0.0, 0.5 * (spec_.lens.height - 1)};
+    const double last = spec_.lens.height - 1;
     // The row says when, and when says which row. A row's time is a small part of what the image needs to move by one.
-    for (int k = 0; k < 100; k++) {
-        const double row = found[1];
-        if (!project_from(camera(frame, row), world, found)) {
+    // A point that comes into the field or leaves it is not there for every row: then another start finds it.
+    for (const double start : {0.5, 0.0, 1.0, 0.25, 0.75}) {
+        double found[2] = {0.0, start * last};
+        for (int k = 0; k < 100; k++) {
+            const double row = found[1];
+            if (!project_from(camera(frame, row), world, found)) {
+                break;
+            }
+            if (spec_.sensor.line_time_s > 0.0 && !(std::abs(found[1] - row) < 1e-11)) {
+                continue;
+            }
+            if (!on_sensor(found)) {
+                return false;
+            }
+            px[0] = found[0];
+            px[1] = found[1];
+            return true;
+        }
+        if (spec_.sensor.line_time_s == 0.0) {
             return false;
         }
-        if (spec_.sensor.line_time_s == 0.0 || std::abs(found[1] - row) < 1e-11) {
-            break;
-        }
     }
-    if (!on_sensor(found)) {
-        return false;
-    }
-    px[0] = found[0];
-    px[1] = found[1];
-    return true;
+    return false;
 }
 
 bool Scene::project_from(const CameraState &camera, const double world[3], double px[2]) const
