@@ -17,7 +17,8 @@ namespace
 int texels_around(const Lens &lens)
 {
     const double theta = std::min(lens.theta_max(), 0.5 * std::numbers::pi), step = 1e-3;
-    const double pixels = 2.0 * std::numbers::pi * (lens.radius(theta) - lens.radius(theta - step)) / step;
+    const double slant = std::sin(theta) * std::sin(theta); // the wall's distance, and that it is seen at an angle
+    const double pixels = 2.0 * std::numbers::pi * slant * (lens.radius(theta) - lens.radius(theta - step)) / step;
     int around = 64;
     while (around < 1.2 * pixels && around < 16384) {
         around *= 2;
