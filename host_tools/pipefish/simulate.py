@@ -451,6 +451,7 @@ def _thumbnail(scene: Scene, frame: int, width: int) -> Any:
 
     grey = scene.render(frame)
     image = Image.fromarray(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8))
+    width = min(width, image.width)
     return image.resize((width, round(image.height * width / image.width)), Image.Resampling.BOX)
 
 

@@ -326,11 +326,14 @@ def test_every_scenario_is_valid_and_says_what_it_is() -> None:
         assert Scene.load(name).frames > 0
 
 
-def test_every_scenario_is_in_the_documents() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text()
+def test_every_scenario_is_in_the_documents_with_a_small_picture() -> None:
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    page = (docs / "scenarios.md").read_text()
     for name, about in scenarios().items():
         assert f"## {name}\n" in page, name
         assert about in " ".join(page.split()), name
+        assert f"(scenarios/{name}.jpg)" in page, name
+        assert 1000 < (docs / "scenarios" / f"{name}.jpg").stat().st_size < 40000, name
 
 
 def test_pictures_are_small_and_whole(tmp_path: Path) -> None:
