@@ -299,12 +299,16 @@ def truth_of(scene: Scene) -> dict[str, Any]:
 def fitted_camera(scene: Scene) -> Any:
     """The p9 camera closest to the scene's lens at the wall of its pipe: least squares of image radius over angle.
 
-    This version's camera model is central and the lens is not, so the fit holds at one distance: wall points at the
-    pipe's radius, seen from the camera centre. `rms_px` is the residual there. A pipefish.Camera.
+    The fit is central and the lens is not, so it holds at one distance: wall points at the pipe's radius, seen from the
+    camera centre. `rms_px` is the residual there, without the asymmetry. For a lens that is a profile: that profile. A
+    pipefish.Camera.
     """
     from pipefish.camera import Camera
 
     spec = scene.spec["lens"]
+    if spec["profile"]["f_u"] > 0:
+        size = {key: spec[key] for key in ("width", "height", "c_u", "c_v", "theta_max")}
+        return Camera(**size, **spec["profile"], name="simulated, exactly this profile", source="simulated", rms_px=0.0)
     ray = np.linspace(0, spec["theta_max"], 1001)[1:]
     radius, pupil = np.array([scene._scene.lens(t) for t in ray]).T
     wall = scene.spec["diameter"] / 2

@@ -138,6 +138,9 @@ def test_a_profile_as_lens_is_that_profile_to_another_implementation(tmp_path: P
         'diameter = 0.2\npieces = [{ length = 1 }]\nmotion = { frames = 5 }\nlens = { profile = "camera.json" }\n'
     )
     scene = Scene.load(tmp_path / "scene.toml")
+    simulate(tmp_path / "scene.toml", tmp_path / "a", frames=1, quiet=True)
+    again = Camera.load(tmp_path / "a.profile.json")
+    assert [getattr(again, k) for k in ("f_u", "skew", "c_v", "k5")] == [71.3, 0.02, 121.4, -0.0001]
     rng = np.random.default_rng(1)
     theta, phi = rng.uniform(0.001, 1.59, 3000), rng.uniform(0, 2 * np.pi, 3000)
     local = on_cone(theta, phi, 0 * theta)
