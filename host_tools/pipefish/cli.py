@@ -364,6 +364,10 @@ def build_parser() -> argparse.ArgumentParser:
     def scene_is_named(args: argparse.Namespace, refuse: Callable[[str], None] = p.error) -> None:
         if args.scene is None and not (args.list or args.contact_sheet):
             refuse("which SCENE? `pipefish simulate --list` tells what there is")
+        if not args.output and (args.frames or args.seed is not None):
+            refuse("--frames and --seed are for a recording: -o STEM")
+        if args.frame is not None and not args.picture:
+            refuse("--frame is for --picture")
 
     p.set_defaults(check=scene_is_named)
 

@@ -353,4 +353,6 @@ def test_the_command_lists_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "there is no frame 99" in capsys.readouterr().err
     assert main(["simulate", "-o", str(tmp_path / "a")]) == 2
     assert main(["simulate", "tiny"]) == 2
+    assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--seed", "3"]) == 2
+    assert main(["simulate", "tiny", "-o", str(tmp_path / "a"), "--frame", "3"]) == 2
     assert not list(tmp_path.iterdir())
