@@ -116,6 +116,7 @@ class Scene:
         except ValueError as error:
             where, _, what = str(error).partition(": ")
             raise FormatError(source, where, what) from None
+        self._middle_row = (self.spec["lens"]["height"] - 1) / 2
 
     @staticmethod
     def load(name_or_path: str | os.PathLike[str]) -> Scene:
@@ -172,11 +173,11 @@ class Scene:
 
     def pose(self, frame: int, row: float | None = None) -> np.ndarray:
         """cam_from_world [R | t] in the middle of the exposure of `row` [the middle one], (3, 4)."""
-        return self._scene.pose(frame, (self.spec["lens"]["height"] - 1) / 2 if row is None else row)
+        return self._scene.pose(frame, self._middle_row if row is None else row)
 
-    def row_time(self, frame: int, row: float) -> float:
-        """When the middle of that row's exposure is, seconds since that of frame 0."""
-        return self._scene.row_time(frame, row)
+    def time(self, frame: int, row: float | None = None) -> float:
+        """When the middle of the exposure of `row` [the middle one] is, seconds since that of frame 0."""
+        return self._scene.row_time(frame, self._middle_row if row is None else row)
 
     def centre(self, frame: int) -> np.ndarray:
         """The camera's centre in the world, (3,) metres."""
@@ -275,8 +276,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
     poses = []
     for frame in range(scene.frames):
         q = quaternion(scene.pose(frame)[:, :3])
-        time = frame / scene.spec["motion"]["frame_rate"]
-        told = [scene.driven(frame), scene.pushed(frame), time, *scene.attitude(frame)]
+        told = [scene.driven(frame), scene.pushed(frame), scene.time(frame), *scene.attitude(frame)]
         poses.append([round(float(v), 12) for v in (scene.arc_length(frame), *q, *scene.centre(frame), *told)])
     return {
         "format": TRUTH_FORMAT,

@@ -250,7 +250,7 @@ def test_rows_of_a_rolling_shutter_see_the_camera_at_their_time() -> None:
     rolling = Scene(small(motion=motion, sensor={"line_time_s": 1 / 20 / 239}))
     fast = Scene(small(motion=motion | {"frames": 81, "frame_rate": 40}))
     for frame in (1, 20, 39):
-        assert rolling.row_time(frame, 239) == pytest.approx((frame + 0.5) / 20, abs=1e-12)
+        assert rolling.time(frame, 239) == pytest.approx((frame + 0.5) / 20, abs=1e-12)
         assert np.abs(rolling.pose(frame, 239) - rolling.pose(frame + 1, 0)).max() < 1e-12
         assert np.abs(rolling.pose(frame, 239) - fast.pose(2 * frame + 1)).max() < 1e-12
         assert np.abs(rolling.pose(frame) - fast.pose(2 * frame)).max() < 1e-12
