@@ -200,9 +200,18 @@ def run_status(args: argparse.Namespace) -> Result:
 
 
 def run_simulate(args: argparse.Namespace) -> Result:
-    from pipefish.simulate import simulate
+    from pipefish import simulate as room
 
-    document = simulate(args.scene, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
+    if args.list:
+        names = room.scenarios()
+        return names, table(list(names.items()))
+    if args.contact_sheet:
+        room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
+        return {"files": [args.contact_sheet]}, table([("written", args.contact_sheet)])
+    if args.picture:
+        room.picture(args.scene, Path(args.picture), args.frame)
+        return {"files": [args.picture]}, table([("written", args.picture)])
+    document = room.simulate(args.scene, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
     rows = [
         ("frames", f"{document['frames']} of {document['width']} x {document['height']} pixels"),
         ("driven", f"{document['driven_m']:.2f} m"),
@@ -302,7 +311,7 @@ def add_command(
     )
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout, nothing else there")
     parser.add_argument("--debug", action="store_true", help="show a traceback on errors")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, check=lambda _: None)
     return parser
 
 
@@ -342,10 +351,25 @@ def build_parser() -> argparse.ArgumentParser:
         "Simulate a camera in a pipe: recorded frames, telemetry, and the truth about both.",
         "pipefish simulate demo -o /tmp/pipe",
     )
-    p.add_argument("scene", metavar="SCENE", help="demo, straight, tiny, or a JSON file (docs/simulator.md)")
-    p.add_argument("-o", "--output", required=True, metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
+    p.add_argument("scene", metavar="SCENE", nargs="?", help="a name of --list, or a TOML or JSON file")
+    what = p.add_mutually_exclusive_group(required=True)
+    what.add_argument("-o", "--output", metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
+    what.add_argument("--list", action="store_true", help="tell which scenes there are")
+    what.add_argument("--picture", metavar="FILE", help="draw one frame into FILE (.png, .jpg, .webp)")
+    what.add_argument("--contact-sheet", metavar="FILE", help="draw one frame of each scene of --list into FILE")
     p.add_argument("--frames", type=positive, help="stop after so many frames")
-    p.add_argument("--seed", type=int, help="of texture, noise and motion [the scene's]")
+    p.add_argument("--seed", type=int, help="of all that is random [the scene's]")
+    p.add_argument("--frame", type=int, metavar="N", help="which, for --picture [at three quarters of the drive]")
+
+    def scene_is_named(args: argparse.Namespace, refuse: Callable[[str], None] = p.error) -> None:
+        if args.scene is None and not (args.list or args.contact_sheet):
+            refuse("which SCENE? `pipefish simulate --list` tells what there is")
+        if not args.output and (args.frames or args.seed is not None):
+            refuse("--frames and --seed are for a recording: -o STEM")
+        if args.frame is not None and not args.picture:
+            refuse("--frame is for --picture")
+
+    p.set_defaults(check=scene_is_named)
 
     p = add_command(
         commands,
@@ -426,6 +450,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = build_parser()
     try:
         args = parser.parse_args(argv)
+        args.check(args)
     except SystemExit as exit_:  # argparse has printed the reason
         return int(exit_.code or 0)
     try:

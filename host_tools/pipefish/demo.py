@@ -125,7 +125,7 @@ def config_text(recording: Recording, profile: Path, run: Path) -> str:
             "speed": "fast",
             "profile": profile.resolve(),
         },
-        "encoder": {"metres_per_count": repr(truth["scene"]["motion"]["metres_per_count"])},
+        "encoder": {"metres_per_count": repr(truth["scene"]["telemetry"]["metres_per_count"])},
         "link": {"transport": "serial", "device": (run / "crawler").absolute(), "baud": BAUD},
         "spool": {"path": (run / "spool.db").absolute()},
     }

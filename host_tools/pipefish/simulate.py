@@ -8,8 +8,9 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-import math
 import os
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -20,33 +21,16 @@ from pipefish.errors import ArgumentError, FormatError, PipefishError
 from pipefish.progress import track
 
 TRUTH_FORMAT = "pipefish-truth"
-TRUTH_VERSION = 1
+TRUTH_VERSION = 2
+POSE_COLUMNS = ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven", "pushed", "time_s", "roll", "pitch"]
 
-PRESETS: dict[str, dict[str, Any]] = {
-    # 6 m DN300: straight, a bend of 30 degrees with a radius of three diameters to the right, an oval stretch.
-    "demo": {
-        "diameter": 0.3,
-        "pieces": [
-            {"length": 2.2},
-            {"angle": math.radians(30), "radius": 0.9, "clock": math.pi / 2},
-            {"length": 4.0},
-        ],
-        "ovals": [{"start": 3.6, "end": 5.4, "ramp": 0.4, "ovality": 0.04, "clock": math.pi / 2}],
-        "motion": {"frames": 601},
-    },
-    "straight": {"diameter": 0.3, "pieces": [{"length": 2.0}], "motion": {"frames": 60}},
-    "tiny": {
-        "diameter": 0.2,
-        "pieces": [{"length": 1.5}],
-        "lens": {"width": 320, "height": 240, "circle_radius": 118, "c_u": 159.5, "c_v": 119.5},
-        "motion": {"frames": 20, "metres_per_count": 0.0005},
-    },
-}
+SCENARIOS = Path(__file__).with_name("scenarios")
+SEEDED = ("texture", "sensor", "motion", "telemetry")  # the parts that have a seed
 
 
-def presets() -> list[str]:
-    """Names of the built-in scenes."""
-    return sorted(PRESETS)
+def scenarios() -> dict[str, str]:
+    """The built-in scenes: name -> what it is, in one line. docs/scenarios.md shows them."""
+    return {path.stem: read_scene(path)[1] for path in sorted(SCENARIOS.glob("*.toml"))}
 
 
 def read_json(path: Path) -> Any:
@@ -57,6 +41,60 @@ def read_json(path: Path) -> Any:
         raise FormatError(path, f"{error.lineno}:{error.colno}", error.msg) from None
     except UnicodeDecodeError as error:
         raise FormatError(path, f"byte {error.start}", "not UTF-8 text") from None
+
+
+def read_toml(path: Path) -> Any:
+    """A TOML file. Raises FormatError with line and column, OSError."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        place = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|(end of document))\)", str(error))
+        if place is None:
+            raise FormatError(path, None, str(error)) from None
+        raise FormatError(path, place[4] or f"{place[2]}:{place[3]}", place[1]) from None
+    except UnicodeDecodeError as error:
+        raise FormatError(path, f"byte {error.start}", "not UTF-8 text") from None
+
+
+def read_scene(path: Path) -> tuple[dict[str, Any], str]:
+    """A scene's description and its line "about" from a TOML or JSON file. Raises FormatError, OSError."""
+    scene = read_toml(path) if path.suffix.lower() == ".toml" else read_json(path)
+    if not isinstance(scene, dict):
+        raise FormatError(path, None, "a scene must be an object")
+    about = scene.pop("about", "")
+    if not isinstance(about, str):
+        raise FormatError(path, "about", "must be text")
+    lens = scene.get("lens")
+    if isinstance(lens, dict) and isinstance(lens.get("profile"), str):
+        scene["lens"] = with_profile(lens, path.parent / lens["profile"], path)
+    return scene, about
+
+
+def with_profile(lens: dict[str, Any], profile: Path, source: Path | None = None) -> dict[str, Any]:
+    """The key `lens` of a scene whose lens is exactly that profile (docs/profile.md), evaluated by the simulator.
+
+    The profile sets width, height, principal point and field; `lens` may hold the rest. `source`: the scene's file, for
+    errors. Raises FormatError, OSError.
+    """
+    data = read_json(profile)
+    if not isinstance(data, dict) or data.get("format") != "pipefish-profile":
+        raise FormatError(profile, "format", "not 'pipefish-profile'")
+    if data.get("radial") != "generic":
+        raise FormatError(profile, "radial", f"the simulator evaluates 'generic' only, not '{data.get('radial')}'")
+    for key in ("tilt", "mirror"):
+        if np.any(np.asarray(data.get(key, 0), dtype=float)):
+            raise FormatError(profile, key, "the simulator does not evaluate it: must be 0")
+    decided = ("width", "height", "c_u", "c_v", "theta_max")
+    known = ("f_u", "f_v", "skew", "k2", "k3", "k4", "k5", "pupil_e1", "cpoly")
+    asymmetry = [f"asym_{kind}_{of}" for kind in ("radial", "tangential") for of in ("theta", "phi")]
+    missing = [key for key in (*decided, *known, *asymmetry) if key not in data]
+    if missing:
+        raise FormatError(profile, missing[0], "missing")
+    for key in decided:
+        if key in lens:
+            raise FormatError(source, f"lens.{key}", "the profile decides it")
+    made = {key: data[key] for key in decided}
+    return {**lens, **made, "profile": {key: data[key] for key in (*known, *asymmetry)}}
 
 
 class Scene:
@@ -78,16 +116,17 @@ class Scene:
         except ValueError as error:
             where, _, what = str(error).partition(": ")
             raise FormatError(source, where, what) from None
+        self._middle_row = (self.spec["lens"]["height"] - 1) / 2
 
     @staticmethod
     def load(name_or_path: str | os.PathLike[str]) -> Scene:
-        """A built-in scene by name, or a JSON file. Raises FormatError, OSError, PipefishError."""
-        if str(name_or_path) in PRESETS:
-            return Scene(PRESETS[str(name_or_path)])
-        path = Path(name_or_path)
+        """A built-in scene by name, or a TOML or JSON file. Raises FormatError, OSError, PipefishError."""
+        path = SCENARIOS / f"{name_or_path}.toml"
+        if Path(name_or_path).name != str(name_or_path) or not path.exists():
+            path = Path(name_or_path)
         if not path.exists():
-            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {', '.join(presets())}")
-        return Scene(read_json(path), path)
+            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {', '.join(scenarios())}")
+        return Scene(read_scene(path)[0], path)
 
     @staticmethod
     def from_truth(path: str | os.PathLike[str]) -> Scene:
@@ -102,7 +141,7 @@ class Scene:
         try:
             centre = np.array(truth["poses"][last][5:8], dtype=float)
         except (KeyError, IndexError, TypeError, ValueError):
-            raise FormatError(path, "poses", "must hold s, qw, qx, qy, qz, cx, cy, cz, driven of every frame") from None
+            raise FormatError(path, "poses", "must hold pose_columns of every frame") from None
         if not np.allclose(centre, scene.centre(last), atol=1e-9):
             raise FormatError(path, f"poses[{last}]", "this version's simulator drives otherwise: simulate anew")
         return scene
@@ -128,12 +167,17 @@ class Scene:
         return self._scene.circle_radius
 
     def render(self, frame: int, threads: int | None = None) -> np.ndarray:
-        """What the camera sees: (H, W) uint8. The same bits for any number of threads [all cores]."""
+        """What the camera sees: (H, W) uint8, or uint16 (0..1023) of 10 bits. The same bits for any number of threads
+        [all cores]."""
         return self._scene.render(frame, threads or os.cpu_count() or 1)
 
-    def pose(self, frame: int) -> np.ndarray:
-        """cam_from_world [R | t], (3, 4)."""
-        return self._scene.pose(frame)
+    def pose(self, frame: int, row: float | None = None) -> np.ndarray:
+        """cam_from_world [R | t] in the middle of the exposure of `row` [the middle one], (3, 4)."""
+        return self._scene.pose(frame, self._middle_row if row is None else row)
+
+    def time(self, frame: int, row: float | None = None) -> float:
+        """When the middle of the exposure of `row` [the middle one] is, seconds since that of frame 0."""
+        return self._scene.row_time(frame, self._middle_row if row is None else row)
 
     def centre(self, frame: int) -> np.ndarray:
         """The camera's centre in the world, (3,) metres."""
@@ -145,8 +189,20 @@ class Scene:
         return self._scene.arc_length(frame)
 
     def driven(self, frame: int) -> float:
-        """How far the crawler has driven since frame 0, metres: what the encoder counts."""
+        """How far the camera has driven since frame 0, metres, less for backwards: what a wheel counts."""
         return self._scene.driven(frame)
+
+    def pushed(self, frame: int) -> float:
+        """How much cable has been pushed since frame 0, metres: what a counter at the reel counts."""
+        return self._scene.pushed(frame)
+
+    def attitude(self, frame: int) -> tuple[float, float]:
+        """True roll and pitch in radians."""
+        return self._scene.attitude(frame)
+
+    def dropped(self, frame: int) -> bool:
+        """Whether the frame is lost before it is recorded: a gap in the sequence."""
+        return self._scene.dropped(frame)
 
     def telemetry(self, frame: int) -> tuple[int, int, float, float]:
         """What the sensors say: time in ns, encoder counts, roll and pitch in radians."""
@@ -159,6 +215,15 @@ class Scene:
     def project(self, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3) world points -> (N, 2) pixels, (N,) ok (false beyond the field; what is in between is not asked)."""
         return self._scene.project(frame, _points(points, 3))
+
+    def flow(self, frame: int, pixels: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where frame `other` sees what `frame` sees at the pixels: (N, 2) -> (N, 2), (N,) ok: in its field and in
+        front of everything else."""
+        points, _ = self.cast(frame, pixels)
+        moved, seen = self.project(other, points)
+        hit, _ = self.cast(other, moved)
+        gap = np.linalg.norm(hit - points, axis=1)
+        return moved, seen & (gap < 1e-6)
 
     def locate(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle; NaN far outside the pipe."""
@@ -211,8 +276,8 @@ def truth_of(scene: Scene) -> dict[str, Any]:
     poses = []
     for frame in range(scene.frames):
         q = quaternion(scene.pose(frame)[:, :3])
-        row = [scene.arc_length(frame), *q, *scene.centre(frame), scene.driven(frame)]
-        poses.append([round(float(v), 12) for v in row])
+        told = [scene.driven(frame), scene.pushed(frame), scene.time(frame), *scene.attitude(frame)]
+        poses.append([round(float(v), 12) for v in (scene.arc_length(frame), *q, *scene.centre(frame), *told)])
     return {
         "format": TRUTH_FORMAT,
         "version": TRUTH_VERSION,
@@ -220,20 +285,30 @@ def truth_of(scene: Scene) -> dict[str, Any]:
         "scene": scene.spec,
         "pipe_length_m": scene.length,
         "lens": scene.lens(),
-        "pose_columns": ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven"],
+        "rows": {
+            "line_time_s": scene.spec["sensor"]["line_time_s"],
+            "rule": "row v is exposed line_time_s (v - (height - 1) / 2) after the frame's time, which is the middle "
+            "of its middle row's exposure; Scene.pose(frame, v) is the camera then",
+        },
+        "pose_columns": POSE_COLUMNS,
         "poses": poses,
+        "dropped": [frame for frame in range(scene.frames) if scene.dropped(frame)],
     }
 
 
 def fitted_camera(scene: Scene) -> Any:
     """The p9 camera closest to the scene's lens at the wall of its pipe: least squares of image radius over angle.
 
-    This version's camera model is central and the lens is not, so the fit holds at one distance: wall points at the
-    pipe's radius, seen from the camera centre. `rms_px` is the residual there. A pipefish.Camera.
+    The fit is central and the lens is not, so it holds at one distance: wall points at the pipe's radius, seen from the
+    camera centre. `rms_px` is the residual there, without the asymmetry. For a lens that is a profile: that profile. A
+    pipefish.Camera.
     """
     from pipefish.camera import Camera
 
     spec = scene.spec["lens"]
+    if spec["profile"]["f_u"] > 0:
+        size = {key: spec[key] for key in ("width", "height", "c_u", "c_v", "theta_max")}
+        return Camera(**size, **spec["profile"], name="simulated, exactly this profile", source="simulated", rms_px=0.0)
     ray = np.linspace(0, spec["theta_max"], 1001)[1:]
     radius, pupil = np.array([scene._scene.lens(t) for t in ray]).T
     wall = scene.spec["diameter"] / 2
@@ -282,15 +357,15 @@ def simulate(
 ) -> dict[str, Any]:
     """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all.
 
-    scene: a preset's name, a JSON file, or the description itself. frames: stop after so many. seed: of texture, noise
-    and motion. Returns what was written. Raises FormatError, PipefishError, OSError.
+    scene: a scenario's name, a TOML or JSON file, or the description itself. frames: stop after so many. seed: of all
+    that is random. Returns what was written. Raises FormatError, PipefishError, OSError.
     """
     made = Scene(scene) if isinstance(scene, dict) else Scene.load(scene)
     if frames is not None or seed is not None:
         spec = copy.deepcopy(made.spec)
         if frames is not None:
             spec["motion"]["frames"] = frames
-        for part in ("texture", "sensor", "motion") if seed is not None else ():
+        for part in SEEDED if seed is not None else ():
             spec[part]["seed"] = seed
         made = Scene(spec)
     stem = Path(stem)
@@ -309,7 +384,7 @@ def simulate(
             file.unlink(missing_ok=True)
     last = made.frames - 1
     return {
-        "frames": made.frames,
+        "frames": sum(not made.dropped(frame) for frame in range(made.frames)),
         "width": made.spec["lens"]["width"],
         "height": made.spec["lens"]["height"],
         "driven_m": made.arc_length(last) - made.arc_length(0),
@@ -317,21 +392,79 @@ def simulate(
     }
 
 
+def _recorded(scene: Scene) -> list[int]:
+    return [frame for frame in range(scene.frames) if not scene.dropped(frame)]
+
+
 def _write_video(scene: Scene, path: Path, threads: int | None, quiet: bool) -> None:
     lens, rate = scene.spec["lens"], scene.spec["motion"]["frame_rate"]
     numerator, denominator = (int(rate), 1) if rate == int(rate) else (round(rate * 1000), 1000)
+    colour = "mono10" if scene.spec["sensor"]["bits"] == 10 else "mono"
+    frames = _recorded(scene)
     with open(path, "wb") as out:
-        header = f"YUV4MPEG2 W{lens['width']} H{lens['height']} F{numerator}:{denominator} Ip A1:1 Cmono\n"
+        header = f"YUV4MPEG2 W{lens['width']} H{lens['height']} F{numerator}:{denominator} Ip A1:1 C{colour}\n"
         out.write(header.encode())
-        for frame in track(range(scene.frames), "simulating", scene.frames, quiet):
+        for frame in track(frames, "simulating", len(frames), quiet):
             out.write(b"FRAME\n")
-            out.write(scene.render(frame, threads).tobytes())
+            image = scene.render(frame, threads)
+            out.write(image.astype(image.dtype.newbyteorder("<"), copy=False).tobytes())
 
 
 def _write_csv(scene: Scene, path: Path) -> None:
-    sigma = scene.spec["motion"]["attitude_sigma"]
+    sigma = scene.spec["telemetry"]["attitude_sigma"]
     with open(path, "w", encoding="utf-8", newline="\n") as out:
         out.write("sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad\n")
-        for frame in range(scene.frames):
+        for frame in _recorded(scene):
             time_ns, count, roll, pitch = scene.telemetry(frame)
-            out.write(f"{frame},{time_ns},{count},{roll:.6f},{pitch:.6f},{sigma:g}\n")
+            attitude = f"{roll:.6f},{pitch:.6f},{sigma:g}" if sigma > 0 else f"{roll:.6f},{pitch:.6f},"
+            out.write(f"{frame},{time_ns},{count},{attitude}\n")
+
+
+def picture(scene: str | os.PathLike[str], path: Path, frame: int | None = None, width: int = 480) -> None:
+    """Writes one frame of a scene [at three quarters of the drive] as a small picture; what kind, the name's end says.
+    Raises FormatError, PipefishError, OSError."""
+    made = Scene.load(scene)
+    frame = made.frames * 3 // 4 if frame is None else frame
+    if not 0 <= frame < made.frames:
+        raise PipefishError(f"there is no frame {frame}: the scene has {made.frames}")
+    _save(_thumbnail(made, frame, width), Path(path))
+
+
+def contact_sheet(path: Path, names: list[str] | None = None, width: int = 400, quiet: bool = False) -> None:
+    """Writes one picture with a frame of each of the scenarios [all]. Raises PipefishError, OSError."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    names = names or list(scenarios())
+    columns, line = 4, 22
+    made = []
+    for name in track(names, "drawing", len(names), quiet):
+        scene = Scene.load(name)
+        made.append(_thumbnail(scene, scene.frames * 3 // 4, width))
+    height = max(image.height for image in made) + line
+    sheet = Image.new("L", (columns * width, -(-len(made) // columns) * height))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    for i, (name, image) in enumerate(zip(names, made, strict=True)):
+        x, y = i % columns * width, i // columns * height
+        sheet.paste(image, (x + (width - image.width) // 2, y + line))
+        draw.text((x + 6, y + 2), name, fill=255, font=font)
+    _save(sheet, Path(path))
+
+
+def _thumbnail(scene: Scene, frame: int, width: int) -> Any:
+    from PIL import Image
+
+    grey = scene.render(frame)
+    image = Image.fromarray(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8))
+    width = min(width, image.width)
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.BOX)
+
+
+def _save(image: Any, path: Path) -> None:
+    partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+    try:
+        image.save(partial, quality=75)
+        os.replace(partial, path)
+    except (ValueError, KeyError):
+        raise PipefishError(f"{path}: pictures end in .png, .jpg or .webp") from None
+    finally:
+        partial.unlink(missing_ok=True)

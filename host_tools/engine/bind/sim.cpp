@@ -1,5 +1,7 @@
-// The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in the fields() below, with its
-// range, and serves reading, checking and writing back.
+// The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in a fields() here or in
+// bind/sim_*.hpp, with its range, and serves reading, checking and writing back.
+#include "bind/sim_camera.hpp"
+#include "bind/sim_motion.hpp"
 #include "sim/scene.hpp"
 
 #include <nanobind/eigen/dense.h>
@@ -20,11 +22,8 @@ using namespace pipefish::sim;
 
 void bind_sim(nb::module_ &m);
 
-namespace
+namespace pipefish::sim
 {
-
-constexpr double kTurn = 2 * M_PI;
-constexpr double kMaxSeed = 9007199254740992.0; // 2^53: JSON numbers are exact to there
 
 template <typename F> void fields(F &f, Piece &p)
 {
@@ -57,27 +56,6 @@ template <typename F> void fields(F &f, TextureSpec &t)
     f("joint_spacing", t.joint_spacing, 0, 100);
 }
 
-template <typename F> void fields(F &f, LensNode &n)
-{
-    f("theta", n.theta, 0, 3);
-    f("radius_px", n.radius_px, 0, 20000);
-    f("pupil_m", n.pupil_m, -0.1, 0.1);
-}
-
-template <typename F> void fields(F &f, LensSpec &l)
-{
-    f("width", l.width, 64, 8192);
-    f("height", l.height, 64, 8192);
-    f("c_u", l.c_u, -8192, 16384);
-    f("c_v", l.c_v, -8192, 16384);
-    f("theta_max", l.theta_max, 0.1, 3);
-    f("circle_radius", l.circle_radius, 10, 10000);
-    f("pupil_scale", l.pupil_scale, 0, 10);
-    f("zonal_px", l.zonal_px, 0, 2);
-    f("vignetting", l.vignetting, 0, 1);
-    f("table", l.table);
-}
-
 template <typename F> void fields(F &f, LampSpec &l)
 {
     f("lamps", l.lamps, 1, 64);
@@ -85,32 +63,6 @@ template <typename F> void fields(F &f, LampSpec &l)
     f("side", l.side, 0, 10);
     f("forward", l.forward, 0, 10);
     f("exposure", l.exposure, 0, 1e5);
-}
-
-template <typename F> void fields(F &f, SensorSpec &s)
-{
-    f("seed", s.seed, 0, kMaxSeed);
-    f("blur_px", s.blur_px, 0, 5);
-    f("read_noise", s.read_noise, 0, 50);
-    f("shot_noise", s.shot_noise, 0, 5);
-}
-
-template <typename F> void fields(F &f, MotionSpec &m)
-{
-    f("seed", m.seed, 0, kMaxSeed);
-    f("frames", m.frames, 1, 1e6);
-    f("frame_rate", m.frame_rate, 0.1, 1000);
-    f("start", m.start, -100, 1000);
-    f("speed", m.speed, 0, 10);
-    f("ramp", m.ramp, 0, 1000);
-    f("below_axis", m.below_axis, -1, 1);
-    f("lookahead", m.lookahead, 0.01, 10);
-    f("wobble_m", m.wobble_m, 0, 0.1);
-    f("wobble_rad", m.wobble_rad, 0, 0.5);
-    f("metres_per_count", m.metres_per_count, 1e-6, 1);
-    f("encoder_bias", m.encoder_bias, -0.5, 0.5);
-    f("encoder_slip", m.encoder_slip, 0, 0.1);
-    f("attitude_sigma", m.attitude_sigma, 0, 0.5);
 }
 
 template <typename F> void fields(F &f, SceneSpec &s)
@@ -124,111 +76,13 @@ template <typename F> void fields(F &f, SceneSpec &s)
     f("lamp", s.lamp);
     f("sensor", s.sensor);
     f("motion", s.motion);
+    f("telemetry", s.telemetry);
 }
 
-// Reads one dict into a struct; a key that nobody asked for is an error that lists those allowed.
-class Reader
+} // namespace pipefish::sim
+
+namespace
 {
-public:
-    Reader(nb::handle source, std::string path) : path_(std::move(path))
-    {
-        if (!nb::isinstance<nb::dict>(source))
-            fail(path_, "must be an object");
-        source_ = nb::borrow<nb::dict>(source);
-    }
-
-    template <typename T> void operator()(const char *name, T &value, double least, double most)
-    {
-        const nb::handle item = take(name);
-        if (!item.is_valid())
-            return;
-        double number = 0;
-        if (nb::isinstance<nb::bool_>(item) || !nb::try_cast<double>(item, number))
-            fail(path_ + name, "must be a number");
-        if (std::is_integral_v<T> && number != std::floor(number))
-            fail(path_ + name, "must be a whole number");
-        if (!(number >= least && number <= most))
-            fail(path_ + name, "must be within " + text(least) + " and " + text(most) + ", not " + text(number));
-        value = static_cast<T>(number);
-    }
-
-    template <typename T> void operator()(const char *name, std::vector<T> &list)
-    {
-        const nb::handle item = take(name);
-        if (!item.is_valid())
-            return;
-        if (!nb::isinstance<nb::list>(item))
-            fail(path_ + name, "must be a list");
-        list.clear();
-        for (nb::handle entry : nb::borrow<nb::list>(item)) {
-            Reader reader(entry, path_ + name + "[" + std::to_string(list.size()) + "].");
-            fields(reader, list.emplace_back());
-            reader.finish();
-        }
-    }
-
-    template <typename T> void operator()(const char *name, T &part)
-    {
-        const nb::handle item = take(name);
-        if (!item.is_valid())
-            return;
-        Reader reader(item, path_ + name + ".");
-        fields(reader, part);
-        reader.finish();
-    }
-
-    void finish() const
-    {
-        for (auto [key, value] : source_) {
-            const std::string name = nb::cast<std::string>(nb::str(key));
-            if (known_.find(" " + name + ",") == std::string::npos)
-                fail(path_ + name, "unknown; known are" + known_.substr(0, known_.size() - 1));
-        }
-    }
-
-    [[noreturn]] static void fail(const std::string &where, const std::string &what)
-    {
-        throw nb::value_error((where + ": " + what).c_str());
-    }
-
-private:
-    nb::dict source_;
-    std::string path_, known_;
-
-    nb::handle take(const char *name)
-    {
-        known_ += std::string(" ") + name + ",";
-        return source_.contains(name) ? nb::handle(PyDict_GetItemString(source_.ptr(), name)) : nb::handle();
-    }
-
-    static std::string text(double v) { return nb::cast<std::string>(nb::str(nb::float_(v))); }
-};
-
-class Writer
-{
-public:
-    nb::dict out;
-
-    template <typename T> void operator()(const char *name, T &value, double, double) { out[name] = value; }
-
-    template <typename T> void operator()(const char *name, std::vector<T> &list)
-    {
-        nb::list items;
-        for (T &entry : list) {
-            Writer writer;
-            fields(writer, entry);
-            items.append(writer.out);
-        }
-        out[name] = items;
-    }
-
-    template <typename T> void operator()(const char *name, T &part)
-    {
-        Writer writer;
-        fields(writer, part);
-        out[name] = writer.out;
-    }
-};
 
 // What single ranges cannot say.
 void check_together(const SceneSpec &s)
@@ -256,15 +110,11 @@ void check_together(const SceneSpec &s)
     }
     if (s.lamp.ring_radius > 0.25 * s.diameter)
         Reader::fail("lamp.ring_radius", "must be at most a quarter of the pipe's diameter");
-    const double ride = std::abs(s.motion.below_axis) + 2 * s.motion.wobble_m;
-    if (ride > 0.4 * s.diameter)
-        Reader::fail("motion.below_axis", "the camera would leave the pipe");
-    const double end = s.motion.start + s.motion.speed * (s.motion.frames - 1) / s.motion.frame_rate;
     double length = 0;
     for (const Piece &p : s.pieces)
         length += p.angle != 0 ? p.angle * p.radius : p.length;
-    if (s.motion.start < -0.4 || end > length + 0.4)
-        Reader::fail("motion", "the camera would drive out of the pipe's " + std::to_string(length) + " m");
+    check_camera(s.lens, s.sensor);
+    check_motion(s.motion, s.diameter, length);
 }
 
 SceneSpec read_scene(const nb::dict &source)
@@ -350,24 +200,30 @@ void bind_sim(nb::module_ &m)
                 checked_frame(s, frame);
                 const size_t height = static_cast<size_t>(s.spec().lens.height);
                 const size_t width = static_cast<size_t>(s.spec().lens.width);
-                std::vector<uint8_t> image(height * width);
-                {
-                    nb::gil_scoped_release release;
-                    s.render(frame, threads, image.data());
-                }
-                return to_numpy<uint8_t>(std::move(image), {height, width});
+                const auto draw = [&](auto pixel) {
+                    std::vector<decltype(pixel)> image(height * width);
+                    {
+                        nb::gil_scoped_release release;
+                        s.render(frame, threads, image.data());
+                    }
+                    return nb::cast(to_numpy<decltype(pixel)>(std::move(image), {height, width}));
+                };
+                return s.spec().sensor.bits > 8 ? draw(uint16_t{}) : draw(uint8_t{});
             },
-            nb::arg("frame"), nb::arg("threads"), "(height, width) uint8.")
+            nb::arg("frame"), nb::arg("threads"), "(height, width) uint8, or uint16 of 10 bits.")
         .def(
             "pose",
-            [](const Scene &s, int frame) {
-                const FrameState &f = state(s, frame);
-                const Eigen::Matrix3d rotation = f.world_from_cam.transpose();
+            [](const Scene &s, int frame, double row) {
+                const CameraState camera = s.camera(checked_frame(s, frame), row);
+                const Eigen::Matrix3d rotation = camera.world_from_cam.transpose();
                 Eigen::Matrix<double, 3, 4, Eigen::RowMajor> out;
-                out << rotation, -rotation * f.centre;
+                out << rotation, -rotation * camera.centre;
                 return out;
             },
-            nb::arg("frame"), "cam_from_world, (3, 4).")
+            nb::arg("frame"), nb::arg("row"), "cam_from_world in the middle of that row's exposure, (3, 4).")
+        .def(
+            "row_time", [](const Scene &s, int frame, double row) { return s.row_time(checked_frame(s, frame), row); },
+            nb::arg("frame"), nb::arg("row"), "Of the middle of that row's exposure, seconds since that of frame 0.")
         .def(
             "arc_length", [](const Scene &s, int frame) { return state(s, frame).s; }, nb::arg("frame"),
             "Of the camera's place along the pipe, metres.")
@@ -375,10 +231,23 @@ void bind_sim(nb::module_ &m)
             "driven", [](const Scene &s, int frame) { return state(s, frame).arc; }, nb::arg("frame"),
             "What the crawler has driven since frame 0, metres.")
         .def(
+            "attitude",
+            [](const Scene &s, int frame) { return std::make_pair(state(s, frame).roll, state(s, frame).pitch); },
+            nb::arg("frame"), "True roll and pitch, radians.")
+        .def(
+            "pushed", [](const Scene &s, int frame) { return state(s, frame).pushed; }, nb::arg("frame"),
+            "Cable pushed since frame 0, metres.")
+        .def(
+            "dropped",
+            [](const Scene &s, int frame) {
+                return s.readings()[static_cast<size_t>(checked_frame(s, frame))].dropped;
+            },
+            nb::arg("frame"), "Whether the frame never arrives.")
+        .def(
             "telemetry",
             [](const Scene &s, int frame) {
-                const FrameState &f = state(s, frame);
-                return std::make_tuple(f.time_ns, f.encoder_count, f.measured_roll, f.measured_pitch);
+                const Reading &r = s.readings()[static_cast<size_t>(checked_frame(s, frame))];
+                return std::make_tuple(r.time_ns, r.encoder_count, r.roll, r.pitch);
             },
             nb::arg("frame"), "(time_ns, encoder_count, roll, pitch) as the sensors say.")
         .def(

@@ -6,12 +6,20 @@
 namespace pipefish::sim
 {
 
+// Positions and inward normals of a row's wall points, in the camera's frame, metres.
+struct RowHits {
+    std::vector<float> x, y, z, nx, ny, nz;
+
+    explicit RowHits(size_t n) : x(n), y(n), z(n), nx(n), ny(n), nz(n) {}
+};
+
 struct Scene::Buffers {
     // Of the lit pixels: where each sees the wall, in texels, and the light that reaches it from a white wall.
     std::vector<float> texel_row, texel_column, light;
-    std::vector<float> image; // linear grey levels, height x width, blurred along the rows
+    float share = 1.0f;              // of the exposure that is being drawn
+    std::vector<float> image, spare; // linear grey levels, height x width
 
-    Buffers(size_t lit, size_t pixels) : texel_row(lit), texel_column(lit), light(lit), image(pixels) {}
+    Buffers(size_t lit, size_t pixels) : texel_row(lit), texel_column(lit), light(lit), image(pixels), spare(pixels) {}
 };
 
 } // namespace pipefish::sim

@@ -44,6 +44,13 @@ enum Stream : uint64_t {
     STREAM_ROLL = 3,
     STREAM_PITCH = 4,
     STREAM_PIXEL = 5,
+    STREAM_WALK = 20,
+    STREAM_STICK = 21,
+    STREAM_ENCODER = 22,
+    STREAM_CLOCK = 23,
+    STREAM_DROP = 24,
+    STREAM_SLIP_EVENT = 25,
+    STREAM_PATTERN = 26,
     STREAM_SURFACE = 1000, // and up: one a layer of the surface
 };
 

@@ -1,10 +1,9 @@
-// Drawing a frame, in three passes over its rows: cast rays and light the wall; read the surface through each pixel's
-// footprint (needs the neighbours' rays) and blur along the rows; blur across them, add noise and encode.
+// Drawing a frame, in passes over its rows: cast rays and light the wall; read the surface through each pixel's
+// footprint (needs the neighbours' rays); both again for every moment of the exposure; then the sensor (sensor.cpp).
 #include "sim/scene.hpp"
 
 #include "sim/buffers.hpp"
 #include "sim/parallel.hpp"
-#include "sim/random.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -18,20 +17,13 @@ namespace
 
 constexpr int BAND = 8; // rows a work item
 
-// Positions and normals of a row's wall points in the camera's frame, and the light on them.
-struct RowLight {
-    std::vector<float> x, y, z, nx, ny, nz, sum;
-
-    explicit RowLight(size_t n) : x(n), y(n), z(n), nx(n), ny(n), nz(n), sum(n, 0.0f) {}
-};
-
 // Adds a small lamp at (lx, ly, 0): its intensity towards the wall point, Lambert's cosine, over the squared distance.
-void add_lamp(RowLight &row, float lx, float ly, float side, float forward)
+void add_lamp(const RowHits &row, std::vector<float> &light, float lx, float ly, float side, float forward)
 {
-    const size_t n = row.sum.size();
+    const size_t n = light.size();
     const float *const x = row.x.data(), *const y = row.y.data(), *const z = row.z.data();
     const float *const nx = row.nx.data(), *const ny = row.ny.data(), *const nz = row.nz.data();
-    float *const sum = row.sum.data();
+    float *const sum = light.data();
     for (size_t i = 0; i < n; i++) {
         const float dx = lx - x[i], dy = ly - y[i], dz = -z[i];
         const float d2 = dx * dx + dy * dy + dz * dz, ahead = std::max(z[i], 0.0f);
@@ -40,27 +32,9 @@ void add_lamp(RowLight &row, float lx, float ly, float side, float forward)
     }
 }
 
-uint32_t hash32(uint32_t x) // "lowbias32" of C. Wellons's search for 32-bit bijections with low bias
-{
-    x ^= x >> 16;
-    x *= 0x7feb352du;
-    x ^= x >> 15;
-    x *= 0x846ca68bu;
-    return x ^ (x >> 16);
-}
-
-// Standard normal number to a good approximation: the sum of 8 bytes (excess kurtosis -0.15, ends at 4.9 sigma).
-float pixel_noise(uint32_t pixel, uint32_t key_a, uint32_t key_b)
-{
-    const uint32_t a = hash32(pixel ^ key_a), b = hash32(a + key_b);
-    const uint32_t pairs = (a & 0x00ff00ffu) + ((a >> 8) & 0x00ff00ffu) + (b & 0x00ff00ffu) + ((b >> 8) & 0x00ff00ffu);
-    const int sum = static_cast<int>((pairs & 0xffffu) + (pairs >> 16));
-    return static_cast<float>(sum - 1020) * (1.0f / 209.02153f); // mean 8 * 127.5, variance 8 (256^2 - 1) / 12
-}
-
 } // namespace
 
-void Scene::render(int frame, int threads, uint8_t *out)
+void Scene::render(int frame, int threads, void *out)
 {
     const std::lock_guard<std::mutex> guard(rendering_);
     if (!buffers_) {
@@ -76,48 +50,83 @@ void Scene::render(int frame, int threads, uint8_t *out)
         });
     };
     surface_->prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
-    const Tube::View view(tube_, f.world_from_cam, f.centre);
-    each_row([&](int y) { cast_row(view, y, *buffers_); });
-    each_row([&](int y) { shade_row(y, *buffers_); });
+    std::fill(buffers_->image.begin(), buffers_->image.end(), 0.0f);
+    const int passes = exposures(frame);
+    buffers_->share = 1.0f / static_cast<float>(passes);
+    for (int k = 0; k < passes; k++) {
+        const double late = spec_.sensor.exposure_s * ((k + 0.5) / passes - 0.5); // seconds after mid-exposure
+        const CameraState camera = passes > 1 ? trajectory_.at(f.time + late) : static_cast<const CameraState &>(f);
+        const Tube::View view(tube_, camera.world_from_cam, camera.centre);
+        const auto draw = [&](int y, const Tube::View &from) {
+            const RowHits hits = cast_row(from, y, *buffers_);
+            light_row(y, hits, *buffers_);
+        };
+        each_row([&](int y) {
+            if (spec_.sensor.line_time_s > 0.0) {
+                const CameraState then = trajectory_.at(row_time(frame, y) + late);
+                draw(y, Tube::View(tube_, then.world_from_cam, then.centre));
+            } else {
+                draw(y, view);
+            }
+        });
+        each_row([&](int y) { shade_row(y, *buffers_); });
+    }
+    each_row([&](int y) { blur_along_row(y, *buffers_); });
+    each_row([&](int y) { blur_across_row(y, *buffers_); });
+    std::swap(buffers_->image, buffers_->spare);
+    for (int k = 0; k < spreads_; k++) {
+        each_row([&](int y) { spread_across_row(y, *buffers_); });
+        std::swap(buffers_->image, buffers_->spare);
+    }
     each_row([&](int y) { develop_row(frame, y, *buffers_, out); });
+    if (spec_.sensor.jpeg_quality > 0) {
+        compress(static_cast<uint8_t *>(out));
+    }
 }
 
-void Scene::cast_row(const Tube::View &view, int row, Buffers &buffers) const
+// As many as keep the image of the wall from moving more than half a pixel between two of them, wherever it is looked
+// at.
+int Scene::exposures(int frame) const
 {
-    const size_t first = row_offset_[static_cast<size_t>(row)];
-    const size_t n = static_cast<size_t>(row_to_[static_cast<size_t>(row)] - row_from_[static_cast<size_t>(row)]);
-    const double texels_a_metre = 1.0 / surface_->texel(), base = surface_->base();
-    const double texels_a_radian = surface_->around() / (2.0 * std::numbers::pi);
-    const LampSpec &lamp = spec_.lamp;
-    RowLight lit(n);
-    for (size_t i = 0; i < n; i++) {
-        const PixelRay &r = rays_[first + i];
-        Hit hit{};
-        if (!view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
-            buffers.texel_row[first + i] = -1.0f; // with a zero normal: black
-            buffers.texel_column[first + i] = 0.0f;
-            lit.z[i] = 1.0f;
-            continue;
-        }
-        buffers.texel_row[first + i] = static_cast<float>((hit.s - base) * texels_a_metre);
-        buffers.texel_column[first + i] = static_cast<float>(hit.clock * texels_a_radian);
-        lit.x[i] = static_cast<float>(hit.t * r.dx);
-        lit.y[i] = static_cast<float>(hit.t * r.dy);
-        lit.z[i] = static_cast<float>(r.pupil + hit.t * r.dz);
-        lit.nx[i] = static_cast<float>(hit.normal.x());
-        lit.ny[i] = static_cast<float>(hit.normal.y());
-        lit.nz[i] = static_cast<float>(hit.normal.z());
+    constexpr int AROUND = 16, MOST = 64;
+    constexpr double STEP = 0.5; // pixels
+    const double exposure = spec_.sensor.exposure_s;
+    if (!(exposure > 0.0)) {
+        return 1;
     }
+    double most = 0.0;
+    for (int i = 0; i < AROUND; i++) {
+        for (const double share : {0.4, 0.7, 0.85, 0.97}) {
+            const double phi = 2.0 * std::numbers::pi * i / AROUND;
+            const Lens::Image at = lens_.image(share * lens_.theta_max(), phi);
+            const double px[2] = {spec_.lens.c_u + at.x, spec_.lens.c_v + at.y};
+            const double time = row_time(frame, px[1]);
+            double world[3], moved[2];
+            if (cast_from(trajectory_.at(time - 0.5 * exposure), px, world) &&
+                project_from(trajectory_.at(time + 0.5 * exposure), world, moved)) {
+                most = std::max(most, std::hypot(moved[0] - px[0], moved[1] - px[1]));
+            }
+        }
+    }
+    return std::clamp(static_cast<int>(std::ceil(most / STEP)), 1, MOST);
+}
+
+// Light on a row's wall points, from a white wall.
+void Scene::light_row(int row, const RowHits &hits, Buffers &buffers) const
+{
+    const size_t first = row_offset_[static_cast<size_t>(row)], n = hits.x.size();
+    const LampSpec &lamp = spec_.lamp;
+    std::vector<float> sum(n, 0.0f);
     for (int k = 0; k < lamp.lamps; k++) {
         const double angle = 2.0 * std::numbers::pi * k / lamp.lamps;
-        add_lamp(lit, static_cast<float>(lamp.ring_radius * std::sin(angle)),
+        add_lamp(hits, sum, static_cast<float>(lamp.ring_radius * std::sin(angle)),
                  static_cast<float>(-lamp.ring_radius * std::cos(angle)), static_cast<float>(lamp.side),
                  static_cast<float>(lamp.forward));
     }
     const double radius = 0.5 * spec_.diameter;
     const float exposure = static_cast<float>(lamp.exposure * radius * radius / lamp.lamps);
     for (size_t i = 0; i < n; i++) {
-        buffers.light[first + i] = exposure * lit.sum[i] * vignette_[first + i];
+        buffers.light[first + i] = exposure * sum[i] * vignette_[first + i];
     }
 }
 
@@ -154,46 +163,9 @@ void Scene::shade_row(int row, Buffers &buffers) const
             buffers.light[own] *
             surface_->sample(buffers.texel_row[own], buffers.texel_column[own], std::sqrt(along), std::sqrt(across));
     }
-    const int reach = static_cast<int>(blur_.size()) - 1;
     float *const out = buffers.image.data() + at * static_cast<size_t>(width);
     for (int x = 0; x < width; x++) {
-        out[x] = blur_[0] * line[static_cast<size_t>(x)];
-    }
-    for (int k = 1; k <= reach; k++) { // beyond the sensor: dark
-        const float weight = blur_[static_cast<size_t>(k)];
-        for (int x = 0; x + k < width; x++) {
-            out[x] += weight * line[static_cast<size_t>(x + k)];
-            out[x + k] += weight * line[static_cast<size_t>(x)];
-        }
-    }
-}
-
-void Scene::develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const
-{
-    const SensorSpec &sensor = spec_.sensor;
-    const int width = spec_.lens.width, height = spec_.lens.height, reach = static_cast<int>(blur_.size()) - 1;
-    std::vector<float> line(static_cast<size_t>(width), 0.0f);
-    for (int k = -reach; k <= reach; k++) {
-        if (row + k < 0 || row + k >= height) {
-            continue;
-        }
-        const float weight = blur_[static_cast<size_t>(std::abs(k))];
-        const float *const in = buffers.image.data() + static_cast<size_t>(row + k) * static_cast<size_t>(width);
-        for (int x = 0; x < width; x++) {
-            line[static_cast<size_t>(x)] += weight * in[x];
-        }
-    }
-    const uint64_t key = hash64(sensor.seed, STREAM_PIXEL, static_cast<uint64_t>(frame));
-    const uint32_t key_a = static_cast<uint32_t>(key), key_b = static_cast<uint32_t>(key >> 32);
-    const float read = static_cast<float>(sensor.read_noise * sensor.read_noise),
-                shot = static_cast<float>(sensor.shot_noise);
-    const uint32_t first = static_cast<uint32_t>(row) * static_cast<uint32_t>(width);
-    uint8_t *const pixels = out + first;
-    for (int x = 0; x < width; x++) {
-        const float signal = line[static_cast<size_t>(x)];
-        const float noise = pixel_noise(first + static_cast<uint32_t>(x), key_a, key_b);
-        const float grey = signal + std::sqrt(read + shot * signal) * noise + 0.5f;
-        pixels[x] = static_cast<uint8_t>(std::min(std::max(grey, 0.0f), 255.0f));
+        out[x] += buffers.share * line[static_cast<size_t>(x)];
     }
 }
 

@@ -1,6 +1,7 @@
 #include "sim/scene.hpp"
 
 #include "sim/buffers.hpp"
+#include "sim/random.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -16,33 +17,13 @@ namespace
 int texels_around(const Lens &lens)
 {
     const double theta = std::min(lens.theta_max(), 0.5 * std::numbers::pi), step = 1e-3;
-    const double pixels = 2.0 * std::numbers::pi * (lens.radius(theta) - lens.radius(theta - step)) / step;
+    const double slant = std::sin(theta) * std::sin(theta); // the wall's distance, and that it is seen at an angle
+    const double pixels = 2.0 * std::numbers::pi * slant * (lens.radius(theta) - lens.radius(theta - step)) / step;
     int around = 64;
     while (around < 1.2 * pixels && around < 16384) {
         around *= 2;
     }
     return around;
-}
-
-LensTable lens_table(const LensSpec &spec)
-{
-    if (spec.table.empty()) {
-        LensTable table = trace_fisheye(spec.theta_max, spec.circle_radius, spec.pupil_scale);
-        // Zones left by the polishing of the front lens: three and a half waves between axis and rim, growing outwards,
-        // which no polynomial of degree 9 follows.
-        for (size_t i = 0; i < table.theta.size(); i++) {
-            const double share = table.theta[i] / spec.theta_max;
-            table.radius[i] += spec.zonal_px * share * share * std::sin(7.0 * std::numbers::pi * share);
-        }
-        return table;
-    }
-    LensTable table;
-    for (const LensNode &node : spec.table) {
-        table.theta.push_back(node.theta);
-        table.radius.push_back(node.radius_px);
-        table.pupil.push_back(node.pupil_m);
-    }
-    return table;
 }
 
 } // namespace
@@ -53,12 +34,16 @@ Scene::Reach Scene::lit_reach(const SceneSpec &spec)
     const double brightest =
         spec.lamp.exposure * (spec.lamp.side + spec.lamp.forward) * static_cast<double>(Surface::MEAN);
     const double radii = std::clamp(std::cbrt(brightest / 0.1), 4.0, 30.0);
-    return {spec.diameter, 0.5 * spec.diameter * radii};
+    const double ahead = 0.5 * spec.diameter * radii;
+    const bool turns = std::any_of(spec.motion.head.begin(), spec.motion.head.end(),
+                                   [](const HeadKey &k) { return std::abs(k.pan) + std::abs(k.tilt) > 0.3; });
+    return {turns ? ahead : spec.diameter, ahead};
 }
 
 Scene::Scene(const SceneSpec &spec)
-    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(lens_table(spec.lens)),
-      frames_(drive(tube_, spec.motion)), reach_(lit_reach(spec))
+    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(spec.lens),
+      trajectory_(tube_, spec.motion), frames_(trajectory_.frames()), readings_(measure(frames_, spec.telemetry)),
+      reach_(lit_reach(spec))
 {
     spec_.lens.theta_max = lens_.theta_max();
     spec_.lens.circle_radius = lens_.circle_radius();
@@ -72,6 +57,8 @@ void Scene::prepare()
                      reach_.behind + reach_.ahead);
     make_pixel_table();
     make_blur_kernel();
+    make_spread();
+    make_patterns();
     buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width) *
                                                            static_cast<size_t>(spec_.lens.height));
 }
@@ -84,15 +71,18 @@ void Scene::make_pixel_table()
         int from = camera.width, to = 0;
         for (int x = 0; x < camera.width; x++) {
             const double px[2] = {static_cast<double>(x), static_cast<double>(y)};
-            PixelRay r{};
-            if (!ray(px, r)) {
+            PixelRay r{0.0, 0.0, 1.0, 0.0};
+            const bool sees = ray(px, r); // or not, within the ring that a mirror's image is: dark
+            if (!sees &&
+                !(from < x && std::hypot(px[0] - camera.c_u, px[1] - camera.c_v) < 0.5 * lens_.circle_radius())) {
                 continue;
             }
             from = std::min(from, x);
             to = x + 1;
             rays_.push_back(r);
             const double edge = std::acos(std::clamp(r.dz, -1.0, 1.0)) / lens_.theta_max();
-            vignette_.push_back(static_cast<float>(1.0 - camera.vignetting * edge * edge * edge * edge));
+            const double light = 1.0 - camera.vignetting * edge * edge * edge * edge;
+            vignette_.push_back(sees ? static_cast<float>(light) : 0.0f);
         }
         row_from_.push_back(std::min(from, to));
         row_to_.push_back(to);
@@ -112,6 +102,38 @@ void Scene::make_blur_kernel()
     }
 }
 
+// The lens's blur, share^2 rim_blur_px at the share of the field's edge, in variance share^4 rim_blur_px^2: a pass of
+// [b, 1 - 2 b, b] adds 2 b, and b stays at most 1/4 where the kernel is near a Gaussian.
+void Scene::make_spread()
+{
+    const LensSpec &camera = spec_.lens;
+    const double most = camera.rim_blur_px * camera.rim_blur_px;
+    spreads_ = static_cast<int>(std::ceil(most / 0.5));
+    for (int y = 0; y < camera.height && spreads_ > 0; y++) {
+        for (int x = 0; x < camera.width; x++) {
+            const double r = std::hypot(x - camera.c_u, y - camera.c_v) / lens_.circle_radius();
+            const double share2 = std::min(r * r, 1.0);
+            spread_.push_back(static_cast<float>(share2 * share2 * most / (2.0 * spreads_)));
+        }
+    }
+}
+
+void Scene::make_patterns()
+{
+    const SensorSpec &sensor = spec_.sensor;
+    const size_t n = static_cast<size_t>(spec_.lens.width) * static_cast<size_t>(spec_.lens.height);
+    if (sensor.offset_pattern > 0.0 || sensor.gain_pattern > 0.0 || sensor.hot_pixels > 0.0) {
+        for (size_t i = 0; i < n; i++) {
+            const bool hot = uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 2)) < sensor.hot_pixels;
+            const double heat = 20.0 + 235.0 * uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 3));
+            offset_.push_back(static_cast<float>(sensor.offset_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i) +
+                                                 (hot ? heat : 0.0)));
+            gain_.push_back(
+                static_cast<float>(1.0 + sensor.gain_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i + 1)));
+        }
+    }
+}
+
 bool Scene::on_sensor(const double px[2]) const
 {
     return px[0] >= -0.5 && px[1] >= -0.5 && px[0] <= spec_.lens.width - 0.5 && px[1] <= spec_.lens.height - 0.5;
@@ -119,46 +141,86 @@ bool Scene::on_sensor(const double px[2]) const
 
 bool Scene::ray(const double px[2], PixelRay &ray) const
 {
-    const double u = px[0] - spec_.lens.c_u, v = px[1] - spec_.lens.c_v, r = std::hypot(u, v);
-    double theta = 0.0;
-    if (!on_sensor(px) || !lens_.theta_of_radius(r, theta)) {
+    double theta = 0.0, phi = 0.0;
+    if (!on_sensor(px) || !lens_.angles(px[0] - spec_.lens.c_u, px[1] - spec_.lens.c_v, theta, phi)) {
         return false;
     }
-    const double s = r > 0.0 ? std::sin(theta) / r : 0.0;
-    ray = {s * u, s * v, std::cos(theta), lens_.pupil(theta)};
+    const double s = std::sin(theta);
+    ray = {s * std::cos(phi), s * std::sin(phi), std::cos(theta), lens_.pupil(theta)};
     return true;
+}
+
+double Scene::row_time(int frame, double v) const
+{
+    return frames_[static_cast<size_t>(frame)].time + (v - 0.5 * (spec_.lens.height - 1)) * spec_.sensor.line_time_s;
+}
+
+CameraState Scene::camera(int frame, double v) const
+{
+    if (spec_.sensor.line_time_s > 0.0) {
+        return trajectory_.at(row_time(frame, v));
+    }
+    return frames_[static_cast<size_t>(frame)];
 }
 
 bool Scene::cast(int frame, const double px[2], double world[3]) const
 {
+    return cast_from(camera(frame, px[1]), px, world);
+}
+
+bool Scene::cast_from(const CameraState &camera, const double px[2], double world[3]) const
+{
     PixelRay r{};
     Hit hit{};
-    const FrameState &f = frames_[static_cast<size_t>(frame)];
-    const Tube::View view(tube_, f.world_from_cam, f.centre);
+    const Tube::View view(tube_, camera.world_from_cam, camera.centre);
     if (!ray(px, r) || !view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
         return false;
     }
     const Eigen::Vector3d local(hit.t * r.dx, hit.t * r.dy, r.pupil + hit.t * r.dz);
-    Eigen::Map<Eigen::Vector3d>(world, 3) = f.centre + f.world_from_cam * local;
+    Eigen::Map<Eigen::Vector3d>(world, 3) = camera.centre + camera.world_from_cam * local;
     return true;
 }
 
 bool Scene::project(int frame, const double world[3], double px[2]) const
 {
-    const FrameState &f = frames_[static_cast<size_t>(frame)];
-    const Eigen::Vector3d p = f.world_from_cam.transpose() * (Eigen::Map<const Eigen::Vector3d>(world) - f.centre);
-    const double rho = std::hypot(p.x(), p.y());
+    const double last = spec_.lens.height - 1;
+    // The row says when, and when says which row. A row's time is a small part of what the image needs to move by one.
+    // A point that comes into the field or leaves it is not there for every row: then another start finds it.
+    for (const double start : {0.5, 0.0, 1.0, 0.25, 0.75}) {
+        double found[2] = {0.0, start * last};
+        for (int k = 0; k < 100; k++) {
+            const double row = found[1];
+            if (!project_from(camera(frame, row), world, found)) {
+                break;
+            }
+            if (spec_.sensor.line_time_s > 0.0 && !(std::abs(found[1] - row) < 1e-11)) {
+                continue;
+            }
+            if (!on_sensor(found)) {
+                return false;
+            }
+            px[0] = found[0];
+            px[1] = found[1];
+            return true;
+        }
+        if (spec_.sensor.line_time_s == 0.0) {
+            return false;
+        }
+    }
+    return false;
+}
+
+bool Scene::project_from(const CameraState &camera, const double world[3], double px[2]) const
+{
+    const Eigen::Vector3d p =
+        camera.world_from_cam.transpose() * (Eigen::Map<const Eigen::Vector3d>(world) - camera.centre);
     double theta = 0.0;
-    if (!lens_.theta_of_point(rho, p.z(), theta)) {
+    if (!lens_.theta_of_point(std::hypot(p.x(), p.y()), p.z(), theta)) {
         return false;
     }
-    const double scale = rho > 0.0 ? lens_.radius(theta) / rho : 0.0;
-    const double found[2] = {spec_.lens.c_u + scale * p.x(), spec_.lens.c_v + scale * p.y()};
-    if (!on_sensor(found)) {
-        return false;
-    }
-    px[0] = found[0];
-    px[1] = found[1];
+    const Lens::Image at = lens_.image(theta, std::atan2(p.y(), p.x()));
+    px[0] = spec_.lens.c_u + at.x;
+    px[1] = spec_.lens.c_v + at.y;
     return true;
 }
 

@@ -4,7 +4,9 @@
 
 #include "sim/lens.hpp"
 #include "sim/motion.hpp"
+#include "sim/sensor.hpp"
 #include "sim/surface.hpp"
+#include "sim/telemetry.hpp"
 #include "sim/tube.hpp"
 
 #include <memory>
@@ -24,13 +26,6 @@ struct LampSpec {
         1150.0; // linear grey level of a white wall, square to a lamp of unit intensity at the pipe's radius
 };
 
-struct SensorSpec {
-    uint64_t seed = 1;
-    double blur_px = 0.55;     // pixels, standard deviation of the optics' Gaussian blur
-    double read_noise = 1.2;   // grey levels, standard deviation
-    double shot_noise = 0.025; // variance a grey level of signal
-};
-
 struct SceneSpec {
     double diameter = 0.3; // metres
     std::vector<Piece> pieces;
@@ -41,7 +36,10 @@ struct SceneSpec {
     LampSpec lamp;
     SensorSpec sensor;
     MotionSpec motion;
+    TelemetrySpec telemetry;
 };
+
+struct RowHits;
 
 class Scene
 {
@@ -55,9 +53,15 @@ public:
     const Tube &tube() const { return tube_; }
     const Lens &lens() const { return lens_; }
     const std::vector<FrameState> &frames() const { return frames_; }
+    const std::vector<Reading> &readings() const { return readings_; }
 
-    // Draws a frame into out[height * width] on `threads` threads. One call at a time per scene; others wait.
-    void render(int frame, int threads, uint8_t *out);
+    // The camera in the middle of the exposure of row v (pixels, any real number) of a frame.
+    CameraState camera(int frame, double v) const;
+    double row_time(int frame, double v) const; // of the same, seconds since the middle of frame 0
+
+    // Draws a frame into out[height * width], uint8_t or, of more than 8 bits, uint16_t, on `threads` threads. One call
+    // at a time per scene; others wait.
+    void render(int frame, int threads, void *out);
 
     // Where the ray of a pixel meets the wall, world. False outside the circle and the sensor.
     bool cast(int frame, const double px[2], double world[3]) const;
@@ -78,14 +82,26 @@ private:
     void prepare(); // what only drawing needs, at the first frame
     void make_pixel_table();
     void make_blur_kernel();
-    void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void make_spread();
+    void make_patterns();
+    int exposures(int frame) const; // how many sharp pictures make up a blurred one
+    bool cast_from(const CameraState &camera, const double px[2], double world[3]) const;
+    bool project_from(const CameraState &camera, const double world[3], double px[2]) const;
+    RowHits cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void light_row(int row, const RowHits &hits, Buffers &buffers) const;
     void shade_row(int row, Buffers &buffers) const;
-    void develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const;
+    void blur_along_row(int row, Buffers &buffers) const;
+    void blur_across_row(int row, Buffers &buffers) const;
+    void spread_across_row(int row, Buffers &buffers) const;
+    void develop_row(int frame, int row, const Buffers &buffers, void *out) const;
+    void compress(uint8_t *image) const;
 
     SceneSpec spec_;
     Tube tube_;
     Lens lens_;
+    Trajectory trajectory_;
     std::vector<FrameState> frames_;
+    std::vector<Reading> readings_;
     Reach reach_;
     std::optional<Surface> surface_;
     std::vector<PixelRay> rays_;         // of the lit pixels, row by row
@@ -93,6 +109,9 @@ private:
     std::vector<int> row_from_, row_to_; // lit pixels of a row: columns [from, to)
     std::vector<size_t> row_offset_;     // of a row in rays_
     std::vector<float> blur_;            // half kernel: weights of 0, 1, 2, ... pixels
+    int spreads_ = 0;                    // passes of the kernel [b, 1 - 2 b, b] that add the lens's blur at the rim,
+    std::vector<float> spread_;          // with this b, of every pixel
+    std::vector<float> offset_, gain_;   // fixed pattern, of every pixel; empty = none
     std::unique_ptr<Buffers> buffers_;
     std::mutex rendering_;
 };
