@@ -207,6 +207,10 @@ class Scene:
         """What the sensors say: time in ns, encoder counts, roll and pitch in radians."""
         return self._scene.telemetry(frame)
 
+    def light_level(self, frame: int) -> float:
+        """Factor of a frame's light: the lamps' flicker times the exposure's gain."""
+        return self._scene.light_level(frame)
+
     def cast(self, frame: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) pixels -> (N, 3) wall points in the world, (N,) ok (false outside the image circle)."""
         return self._scene.cast(frame, _points(pixels, 2))
