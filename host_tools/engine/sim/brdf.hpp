@@ -22,6 +22,12 @@ inline float power5(float x)
     return x2 * x2 * x;
 }
 
+// max(x, 0) without a branch, so that loops over it become vectors.
+inline float positive(float x)
+{
+    return 0.5f * (x + std::fabs(x));
+}
+
 // The mirror-like part's share of light at this cosine.
 inline float reflected(float cosine, float alpha)
 {
@@ -32,11 +38,11 @@ inline float reflected(float cosine, float alpha)
 // pi D V F at the cosines n.l, n.v, l.v, all but the last at least 0; alpha2 = alpha^2 of D, alpha that of V.
 inline float mirrored(float nl, float nv, float lv, float alpha2, float alpha)
 {
-    const float h2 = std::max(2.0f + 2.0f * lv, 1e-6f), inverse = 1.0f / std::sqrt(h2); // h2 = |l + v|^2
-    const float nh = std::min((nl + nv) * inverse, 1.0f), vh = 0.5f * h2 * inverse;
+    const float h2 = 2.000001f + 2.0f * lv, inverse = 1.0f / std::sqrt(h2); // h2 = |l + v|^2
+    const float nh = (nl + nv) * inverse, vh = 0.5f * h2 * inverse;
     const float q = nh * nh * (alpha2 - 1.0f) + 1.0f;
     const float lambda = 2.0f * nl * nv + alpha * (nl + nv - 2.0f * nl * nv);
-    return 0.5f * alpha2 / (q * q * std::max(lambda, 1e-6f)) * (F0 + (1.0f - F0) * power5(1.0f - vh));
+    return 0.5f * alpha2 / (q * q * lambda + 1e-12f) * (F0 + (1.0f - F0) * power5(1.0f - vh));
 }
 
 } // namespace pipefish::sim

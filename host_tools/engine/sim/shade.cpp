@@ -18,45 +18,63 @@ namespace pipefish::sim
 namespace
 {
 
+constexpr size_t BLOCK = 64; // points that are lit at a time: what is known of them stays in the nearest cache
+
+// A block of points as the lamps' loop wants it.
+struct Block {
+    float alpha[BLOCK], rise[BLOCK]; // roughness; what reflected() gains towards grazing
+    float matt[BLOCK], shine[BLOCK];
+};
+
 // Light of one lamp: E (1 - R) onto `matt`, E pi D V F onto `shine`, with E the irradiance. FOGGY dims it on its way.
-template <bool FOGGY>
-void add_lamp(const Samples &p, const Lamp &lamp, const Lighting &light, std::vector<float> &matt,
-              std::vector<float> &shine)
+template <bool FOGGY, typename Power>
+void add_lamp(const Samples &p, size_t from, size_t n, const Lamp lamp, const Lighting &light, const Power &power,
+              Block &block)
 {
-    const size_t n = p.size();
-    const float *const x = p.x.data(), *const y = p.y.data(), *const z = p.z.data();
-    const float *const nx = p.nx.data(), *const ny = p.ny.data(), *const nz = p.nz.data();
-    const float *const vx = p.vx.data(), *const vy = p.vy.data(), *const vz = p.vz.data();
-    const float *const nv = p.nv.data(), *const alpha2 = p.alpha2.data();
-    float *const out_matt = matt.data(), *const out_shine = shine.data();
-    const float gloss = light.gloss, widen = light.widen;
-    const int exponent = light.exponent;
-    const auto each = [&](const auto &power) {
-        for (size_t i = 0; i < n; i++) {
-            const float dx = lamp.x - x[i], dy = lamp.y - y[i], dz = lamp.z - z[i];
-            const float d2 = dx * dx + dy * dy + dz * dz, inverse = 1.0f / std::sqrt(d2), fall = inverse * inverse;
-            const float facing = (dx * nx[i] + dy * ny[i] + dz * nz[i]) * inverse, nl = facing > 0.0f ? facing : 0.0f;
-            const float lv = (dx * vx[i] + dy * vy[i] + dz * vz[i]) * inverse;
-            const float ahead = -(dx * lamp.dx + dy * lamp.dy + dz * lamp.dz) * inverse;
-            float light_on = (lamp.side + lamp.forward * power(ahead > 0.0f ? ahead : 0.0f)) * fall * nl;
-            if constexpr (FOGGY) {
-                light_on *= std::exp(-light.density * d2 * inverse);
-            }
-            const float alpha = std::sqrt(alpha2[i]);
-            out_matt[i] += light_on * (1.0f - gloss * reflected(nl, alpha));
-            out_shine[i] += light_on * mirrored(nl, nv[i], lv, alpha2[i] + widen * fall, alpha);
+    const float *__restrict const x = p.x.data() + from, *__restrict const y = p.y.data() + from,
+                                  *__restrict const z = p.z.data() + from;
+    const float *__restrict const nx = p.nx.data() + from, *__restrict const ny = p.ny.data() + from,
+                                  *__restrict const nz = p.nz.data() + from;
+    const float *__restrict const vx = p.vx.data() + from, *__restrict const vy = p.vy.data() + from,
+                                  *__restrict const vz = p.vz.data() + from;
+    const float *__restrict const nv = p.nv.data() + from, *__restrict const alpha2 = p.alpha2.data() + from;
+    const float *__restrict const alpha = block.alpha, *__restrict const rise = block.rise;
+    float *__restrict const matt = block.matt, *__restrict const shine = block.shine;
+    const float gloss = light.gloss, widen = light.widen, density = light.density;
+    for (size_t i = 0; i < n; i++) {
+        const float dx = lamp.x - x[i], dy = lamp.y - y[i], dz = lamp.z - z[i];
+        const float d2 = dx * dx + dy * dy + dz * dz, inverse = 1.0f / std::sqrt(d2), fall = inverse * inverse;
+        const float facing = (dx * nx[i] + dy * ny[i] + dz * nz[i]) * inverse, nl = positive(facing);
+        const float lv = (dx * vx[i] + dy * vy[i] + dz * vz[i]) * inverse;
+        const float cosine = -(dx * lamp.dx + dy * lamp.dy + dz * lamp.dz) * inverse;
+        float light_on = (lamp.side + lamp.forward * power(positive(cosine))) * fall * nl;
+        if constexpr (FOGGY) {
+            light_on *= std::exp(-density * d2 * inverse);
         }
-    };
-    if (exponent == 2) {
-        each([](float c) { return c * c; });
-    } else {
-        each([exponent](float c) {
-            float power = 1.0f;
-            for (int k = 0; k < exponent; k++) {
-                power *= c;
-            }
-            return power;
-        });
+        matt[i] += light_on * (1.0f - gloss * (F0 + rise[i] * power5(1.0f - nl)));
+        shine[i] += light_on * mirrored(nl, nv[i], lv, alpha2[i] + widen * fall, alpha[i]);
+    }
+}
+
+template <bool FOGGY> void add_lamps(const Samples &p, size_t from, size_t n, const Lighting &light, Block &block)
+{
+    for (const Lamp &lamp : light.lamps) {
+        if (light.exponent == 2) {
+            add_lamp<FOGGY>(
+                p, from, n, lamp, light, [](float c) { return c * c; }, block);
+        } else {
+            const int exponent = light.exponent;
+            add_lamp<FOGGY>(
+                p, from, n, lamp, light,
+                [exponent](float c) {
+                    float power = 1.0f;
+                    for (int k = 0; k < exponent; k++) {
+                        power *= c;
+                    }
+                    return power;
+                },
+                block);
+        }
     }
 }
 
@@ -71,35 +89,50 @@ Lighting::Lighting(const LampSpec &lamp, const FogSpec &fog, double pipe_radius,
 {
 }
 
+namespace
+{
+
+// What point i sends to the camera: the lamps' light on it, the wall's, and the mirror image of the wall opposite.
+float level(const Samples &p, size_t i, const Lighting &light, float matt, float shine, float rise)
+{
+    if (p.nx[i] * p.nx[i] + p.ny[i] * p.ny[i] + p.nz[i] * p.nz[i] == 0.0f) {
+        return 0.0f;
+    }
+    const float taken = F0 + rise * power5(1.0f - p.nv[i]);
+    float seen = 0.0f;
+    if (light.bounce > 0.0f) {
+        matt += light.bounce * light.ambient.bounced(p.along[i]);
+        // A ray through the axis meets the wall again as far on as the tangent of its angle of incidence says.
+        const float tangent = std::sqrt(std::max(1.0f - p.nv[i] * p.nv[i], 0.0f)) / p.nv[i];
+        const float there = p.along[i] + std::copysign(2.0f * light.radius * tangent, p.along[i]);
+        seen =
+            light.bounce * light.albedo * (light.ambient.direct(there) + light.bounce * light.ambient.bounced(there));
+    }
+    const float sum = p.albedo[i] * (1.0f - light.gloss * taken) * matt + light.gloss * (shine + taken * seen);
+    return light.density > 0.0f
+               ? sum * std::exp(-light.density * std::sqrt(p.x[i] * p.x[i] + p.y[i] * p.y[i] + p.z[i] * p.z[i]))
+               : sum;
+}
+
+} // namespace
+
 void shade(const Samples &p, const Lighting &light, float *out)
 {
-    const size_t n = p.size();
-    std::vector<float> matt(n, 0.0f), shine(n, 0.0f);
-    for (const Lamp &lamp : light.lamps) {
+    for (size_t from = 0; from < p.size(); from += BLOCK) {
+        const size_t n = std::min(BLOCK, p.size() - from);
+        Block block{};
+        for (size_t i = 0; i < n; i++) {
+            block.alpha[i] = std::sqrt(p.alpha2[from + i]);
+            block.rise[i] = std::max(1.0f - block.alpha[i], F0) - F0;
+        }
         if (light.density > 0.0f) {
-            add_lamp<true>(p, lamp, light, matt, shine);
+            add_lamps<true>(p, from, n, light, block);
         } else {
-            add_lamp<false>(p, lamp, light, matt, shine);
+            add_lamps<false>(p, from, n, light, block);
         }
-    }
-    for (size_t i = 0; i < n; i++) {
-        const float taken = reflected(p.nv[i], std::sqrt(p.alpha2[i]));
-        float bounced = 0.0f, seen = 0.0f;
-        if (light.bounce > 0.0f && p.nx[i] * p.nx[i] + p.ny[i] * p.ny[i] + p.nz[i] * p.nz[i] > 0.0f) {
-            bounced = light.bounce * light.ambient.bounced(p.along[i]);
-            // The mirror image of the wall opposite: a ray through the axis meets the wall again as far on as the
-            // tangent of its angle of incidence says.
-            const float tangent = std::sqrt(std::max(1.0f - p.nv[i] * p.nv[i], 0.0f)) / p.nv[i];
-            const float there = p.along[i] + std::copysign(2.0f * light.radius * tangent, p.along[i]);
-            seen = light.bounce * light.albedo *
-                   (light.ambient.direct(there) + light.bounce * light.ambient.bounced(there));
+        for (size_t i = 0; i < n; i++) {
+            out[from + i] = light.scale * level(p, from + i, light, block.matt[i], block.shine[i], block.rise[i]);
         }
-        float level =
-            p.albedo[i] * (1.0f - light.gloss * taken) * (matt[i] + bounced) + light.gloss * (shine[i] + taken * seen);
-        if (light.density > 0.0f) {
-            level *= std::exp(-light.density * std::sqrt(p.x[i] * p.x[i] + p.y[i] * p.y[i] + p.z[i] * p.z[i]));
-        }
-        out[i] = light.scale * level;
     }
 }
 
