@@ -8,7 +8,7 @@ namespace
 
 constexpr double LENGTH = 0.225, HEIGHT = 0.075; // of a brick with its joint, metres
 constexpr float JOINT = 0.0045f;                 // half its width, metres
-constexpr float MORTAR = 0.35f;                  // relative albedo
+constexpr float MORTAR = 0.10f;                  // relative albedo
 constexpr uint64_t BRICKS = STREAM_SURFACE + 130;
 
 struct Brick {
@@ -34,7 +34,7 @@ void paint_bricks(const TextureSpec &spec, const Canvas &canvas, WallPaint &out)
     const double worn = 0.0008 + 0.003 * spec.wear;
     add_noise({0.035, 0.035, canvas.radius, spec.seed, BRICKS + 1}, static_cast<float>(0.5 * worn), canvas, edge);
     add_noise({0.012, 0.012, canvas.radius, spec.seed, BRICKS + 2}, static_cast<float>(0.4 * worn), canvas, edge);
-    add_noise({0.004, 0.004, canvas.radius, spec.seed, BRICKS + 3}, static_cast<float>(0.25 * worn), canvas, edge);
+    add_noise({0.004, 0.004, canvas.radius, spec.seed, BRICKS + 3}, static_cast<float>(0.4 * worn), canvas, edge);
     const float depth = static_cast<float>(0.0012 + 0.0018 * spec.wear); // of the mortar under the bricks' faces
     const float round = static_cast<float>(0.0015 + 0.003 * spec.wear);  // of the bricks' edges
     for (int i = 0; i < canvas.rows; i++) {

@@ -9,8 +9,7 @@ namespace
 {
 
 constexpr double PI = std::numbers::pi;
-constexpr double JOINT_HALF_WIDTH = 0.004; // metres
-constexpr float JOINT_DARKNESS = 0.75f;    // share of the albedo lost in it
+constexpr float JOINT_DARKNESS = 0.75f; // share of the albedo lost in it
 
 // One layer of smooth noise: cells of along x around metres, amplitude relative to the mean albedo or in metres of
 // height. The finest ones fall away where the texels cannot carry them.
@@ -92,6 +91,8 @@ private:
     void film(float albedo, float alpha, double amount, double patch);
     void wet(float darken, float alpha);
     void drops();
+    void bundles();
+    void swarms();
 };
 
 void Painter::grains_of(const Grains &g, uint64_t stream, double density)
@@ -131,7 +132,7 @@ void Painter::erode()
     noises(EDGE, PART_WEAR + 1, loss);
     const Lattice cells(0.0115, 0.0115, canvas_.radius, spec_.seed, PART_WEAR + 5);
     const size_t columns = static_cast<size_t>(canvas_.columns);
-    const float level = static_cast<float>(1.15 - 1.5 * spec_.wear);
+    const float level = static_cast<float>(1.0 - 1.5 * spec_.wear);
     for (size_t i = 0; i < loss.size(); i++) {
         loss[i] = smooth(level, level + 0.35f, loss[i] + 0.45f * down(canvas_.turn(static_cast<int>(i % columns))));
         out_.albedo[i] -= 0.22f * loss[i];
@@ -191,13 +192,16 @@ void Painter::wet(float darken, float alpha)
     Layer level(canvas_.size(), 0.0f);
     constexpr Noise LIST[] = {{0.5, 0.25, 0.35}, {0.12, 0.08, 0.22}, {0.03, 0.025, 0.10}};
     noises(LIST, PART_WET, level);
+    Layer waves(canvas_.size(), 0.0f); // of the film's own surface
+    constexpr Noise WAVES[] = {{0.011, 0.011, 4e-4}, {0.0045, 0.0045, 2e-4}};
+    noises(WAVES, PART_WET + 8, waves);
     const size_t columns = static_cast<size_t>(canvas_.columns);
     const float dry = static_cast<float>(std::cos(PI * spec_.wetness)); // the share of the circumference below it
     for (size_t i = 0; i < level.size(); i++) {
         const float w = smooth(dry - 0.06f, dry + 0.10f, level[i] + down(canvas_.turn(static_cast<int>(i % columns))));
         out_.albedo[i] = (1.0f + out_.albedo[i]) * (1.0f - darken * w) - 1.0f;
         out_.alpha[i] += w * (alpha - out_.alpha[i]);
-        out_.height[i] *= 1.0f - 0.6f * w;
+        out_.height[i] = out_.height[i] * (1.0f - 0.6f * w) + w * waves[i];
     }
 }
 
@@ -211,7 +215,7 @@ void Painter::drops()
         }
         const double a = 0.0006 + 0.0026 * std::pow(draws(), 3.0), b = a * draws.within(0.75, 1.0);
         draw({s, across, b, a, 1.0, 0.0}, canvas_, [&](size_t i, float cover, float q) {
-            out_.height[i] += cover * static_cast<float>(0.22 * b) * (1.0f - 0.9f * q * q);
+            out_.height[i] += cover * static_cast<float>(0.45 * b) * (1.0f - q * q);
             out_.alpha[i] += cover * (0.04f - out_.alpha[i]);
             out_.albedo[i] -= 0.06f * cover;
         });
@@ -220,17 +224,17 @@ void Painter::drops()
 
 void Painter::concrete()
 {
-    constexpr Noise TONE[] = {{0.410, 0.410, 0.15},   {0.170, 0.170, 0.13},   {0.063, 0.063, 0.10},
-                              {0.024, 0.024, 0.09},   {0.0087, 0.0087, 0.09}, {0.0034, 0.0034, 0.10},
-                              {0.0015, 0.0015, 0.08}, {0.006, 0.35, 0.05}}; // the last: marks of the mould, around
-    constexpr Noise RELIEF[] = {{0.024, 0.024, 3.0e-4},
-                                {0.0087, 0.0087, 1.6e-4},
-                                {0.0034, 0.0034, 0.8e-4},
-                                {0.0015, 0.0015, 0.4e-4},
-                                {0.006, 0.35, 0.5e-4}};
+    constexpr Noise TONE[] = {{0.410, 0.410, 0.13},   {0.170, 0.170, 0.10},   {0.063, 0.063, 0.08},
+                              {0.024, 0.024, 0.08},   {0.0087, 0.0087, 0.09}, {0.0034, 0.0034, 0.12},
+                              {0.0015, 0.0015, 0.12}, {0.006, 0.35, 0.05}}; // the last: marks of the mould, around
+    constexpr Noise RELIEF[] = {{0.024, 0.024, 4.0e-4},
+                                {0.0087, 0.0087, 2.4e-4},
+                                {0.0034, 0.0034, 1.4e-4},
+                                {0.0015, 0.0015, 0.7e-4},
+                                {0.006, 0.35, 0.8e-4}};
     constexpr Grains LIST[] = {
-        {0.021, 0.0025, 0.0065, 0.35, -0.30, 0.34, 0.08},   // coarse aggregate
-        {0.0085, 0.0010, 0.0030, 0.50, -0.36, 0.38, 0.10},  // fine aggregate
+        {0.021, 0.0025, 0.0065, 0.28, -0.22, 0.26, 0.06},   // coarse aggregate
+        {0.0085, 0.0010, 0.0030, 0.50, -0.34, 0.36, 0.10},  // fine aggregate
         {0.0060, 0.0004, 0.0011, 0.35, -0.55, -0.2, -0.5},  // pores
         {0.047, 0.0012, 0.0045, 0.35, -0.60, -0.30, -0.35}, // bug holes
     };
@@ -286,7 +290,6 @@ void Painter::clay()
         {0.030, 0.0004, 0.0013, 0.30, -0.7, -0.3, 0.0}, // iron specks
         {0.055, 0.0006, 0.0018, 0.25, 0.2, 0.8, 0.12},  // blisters
     };
-    std::fill(out_.alpha.begin(), out_.alpha.end(), wall_look(spec_).alpha);
     noises(TONE, PART_ALBEDO, out_.albedo);
     noises(RELIEF, PART_HEIGHT, out_.height);
     grains(LIST, 1.0);
@@ -306,29 +309,85 @@ void Painter::clay()
     drops();
 }
 
+// Bundles of fine parallel scratches, and specks in swarms: what a passing hose or a nozzle leaves.
+void Painter::bundles()
+{
+    const Lattice cells(0.10, 0.07, canvas_.radius, spec_.seed, PART_STROKES + 10);
+    scatter(cells, canvas_, 0.09, [&](double s, double across, Draws &draws) {
+        if (draws() >= 0.7 * spec_.wear) {
+            return;
+        }
+        const int lines = 5 + static_cast<int>(14.0 * draws());
+        const double length = draws.within(0.006, 0.022), heading = draws.within(-0.12, 0.12),
+                     gap = draws.within(0.0008, 0.0022);
+        const float tone = static_cast<float>(draws() < 0.6 ? draws.within(-0.35, -0.15) : draws.within(0.15, 0.4));
+        for (int k = 0; k < lines; k++) {
+            const double at = across + gap * (k + draws.within(-0.4, 0.4)),
+                         from = s + 0.4 * length * draws.within(-1.0, 1.0);
+            const double half = length * draws.within(0.4, 1.0), width = draws.within(0.00006, 0.0002);
+            const float strength = static_cast<float>(std::min(1.0, 2.0 * width / canvas_.texel));
+            draw({from, at, half, width, std::cos(heading), std::sin(heading)}, canvas_,
+                 [&](size_t i, float cover, float) {
+                     out_.albedo[i] += strength * cover * tone;
+                     out_.alpha[i] += 0.25f * strength * cover;
+                     out_.height[i] -= 2e-5f * strength * cover;
+                 });
+        }
+    });
+}
+
+void Painter::swarms()
+{
+    const Lattice cells(0.13, 0.11, canvas_.radius, spec_.seed, PART_GRAINS + 12);
+    scatter(cells, canvas_, 0.035, [&](double s, double across, Draws &draws) {
+        if (draws() >= 0.9 * spec_.dirt) {
+            return;
+        }
+        const int specks = 4 + static_cast<int>(18.0 * draws());
+        const double spread = draws.within(0.006, 0.018);
+        for (int k = 0; k < specks; k++) {
+            const double away = spread * draws(), angle = 2.0 * PI * draws(), a = draws.within(0.0002, 0.0008);
+            const float tone = static_cast<float>(draws.within(-0.8, -0.4));
+            draw({s + 1.6 * away * std::cos(angle), across + away * std::sin(angle), a, a * draws.within(0.6, 1.0), 1.0,
+                  0.0},
+                 canvas_, [&](size_t i, float cover, float) { out_.albedo[i] += cover * (tone - out_.albedo[i]); });
+        }
+    });
+}
+
 void Painter::pvc()
 {
-    // Extrusion: lines along the pipe, rings of the calibration sleeve around it, both hardly there.
-    constexpr Noise TONE[] = {
-        {0.8, 0.4, 0.025}, {1.5, 0.006, 0.012}, {0.9, 0.0021, 0.010}, {0.009, 0.5, 0.008}, {0.0035, 0.7, 0.008}};
-    constexpr Noise RELIEF[] = {
-        {0.30, 0.08, 3e-4}, {1.2, 0.006, 0.5e-5}, {0.7, 0.0021, 0.3e-5}, {0.010, 0.5, 1.4e-5}, {0.0035, 0.7, 0.5e-5}};
-    std::fill(out_.alpha.begin(), out_.alpha.end(), wall_look(spec_).alpha);
+    // Extrusion: lines along the pipe; rings of the calibration sleeve and of its starts and stops around it.
+    constexpr Noise TONE[] = {{0.8, 0.4, 0.05},   {1.5, 0.006, 0.012}, {0.9, 0.0021, 0.010}, {0.055, 0.9, 0.07},
+                              {0.018, 0.6, 0.04}, {0.006, 0.5, 0.025}, {0.0025, 0.7, 0.02},  {0.10, 0.06, 0.03}};
+    constexpr Noise RELIEF[] = {{0.30, 0.08, 3e-4},   {1.2, 0.006, 1.0e-5}, {0.7, 0.0021, 0.5e-5},
+                                {0.022, 0.7, 1.2e-4}, {0.010, 0.5, 2.5e-5}, {0.0035, 0.7, 0.8e-5}};
     noises(TONE, PART_ALBEDO, out_.albedo);
     noises(RELIEF, PART_HEIGHT, out_.height);
-    constexpr Grains SPECKS[] = {{0.034, 0.0003, 0.0011, 0.35, -0.8, -0.3, 0.1}};
+    constexpr Grains SPECKS[] = {{0.034, 0.0003, 0.0011, 0.30, -0.8, -0.3, 0.1}};
     grains(SPECKS, 0.2 + 1.6 * spec_.dirt);
-    const Layer fine = strokes({0.11, 0.035, 0.8 * spec_.wear, 12, 0.012, 0.0, 0.06, 0.02, 0.00003, 0.00012}, 0);
-    each(fine, [&](size_t i, float m) {
-        out_.albedo[i] += 0.25f * m;
-        out_.alpha[i] += 0.3f * m;
-        out_.height[i] -= 3e-5f * m;
+    swarms();
+    bundles();
+    // Rings: edges of the sleeve's marks, thin.
+    each(strokes({0.14, 0.30, 0.6, 40, 0.012, 0.5 * PI, 0.01, 0.004, 0.00015, 0.0005}, 2), [&](size_t i, float m) {
+        out_.albedo[i] += 0.16f * m;
+        out_.height[i] -= 6e-5f * m;
     });
-    const Layer deep = strokes({0.35, 0.12, 0.9 * spec_.wear, 14, 0.02, 0.0, 0.25, 0.05, 0.0002, 0.0006}, 1);
-    each(deep, [&](size_t i, float m) {
-        out_.albedo[i] -= 0.35f * m;
+    each(strokes({0.11, 0.035, 0.8 * spec_.wear, 12, 0.012, 0.0, 0.06, 0.02, 0.00003, 0.00015}, 0),
+         [&](size_t i, float m) {
+             out_.albedo[i] += 0.3f * m;
+             out_.alpha[i] += 0.3f * m;
+             out_.height[i] -= 3e-5f * m;
+         });
+    each(strokes({0.30, 0.14, 0.9 * spec_.wear, 14, 0.014, 0.0, 0.5, 0.06, 0.0002, 0.0006}, 1), [&](size_t i, float m) {
+        out_.albedo[i] -= 0.40f * m;
         out_.alpha[i] += 0.3f * m;
         out_.height[i] -= 1.2e-4f * m;
+    });
+    // Smears of dirt along the flow.
+    each(strokes({0.16, 0.10, spec_.dirt, 9, 0.010, 0.0, 0.2, 0.12, 0.0008, 0.0040}, 3), [&](size_t i, float m) {
+        out_.albedo[i] -= 0.35f * m;
+        out_.alpha[i] += 0.25f * m;
     });
     film(-0.18f, 0.40f, 0.8 * spec_.dirt, 0.20);
     wet(0.02f, 0.06f);
@@ -346,7 +405,6 @@ void Painter::lined()
         {0.045, 0.0010, 0.0040, 0.35, -0.30, -0.10, -0.06}, // dry spots
         {0.060, 0.0006, 0.0020, 0.30, 0.15, 0.40, 0.15},    // drops of resin
     };
-    std::fill(out_.alpha.begin(), out_.alpha.end(), wall_look(spec_).alpha);
     noises(TONE, PART_ALBEDO, out_.albedo);
     noises(RELIEF, PART_HEIGHT, out_.height);
     grains(LIST, 1.0);
@@ -357,10 +415,10 @@ void Painter::lined()
     const Layer folds = strokes({0.45, 0.16, 0.8, 22, 0.025, 0.0, 0.15, 0.10, 0.0025, 0.008}, 0);
     each(folds, [&](size_t i, float m) {
         out_.albedo[i] -= 0.10f * m;
-        out_.height[i] += 6e-4f * m;
+        out_.height[i] += 1e-3f * m;
     });
     const Layer wrinkles = strokes({0.25, 0.15, 0.5, 10, 0.010, 0.5 * PI, 0.3, 0.2, 0.0012, 0.0035}, 1);
-    each(wrinkles, [&](size_t i, float m) { out_.height[i] += 3.5e-4f * m; });
+    each(wrinkles, [&](size_t i, float m) { out_.height[i] += 5e-4f * m; });
     const Layer scratches = strokes({0.2, 0.08, 0.5 * spec_.wear, 10, 0.01, 0.0, 0.2, 0.05, 0.0001, 0.0003}, 2);
     each(scratches, [&](size_t i, float m) {
         out_.albedo[i] += 0.25f * m;
@@ -377,11 +435,13 @@ void dark_rings(const TextureSpec &spec, const Canvas &canvas, WallPaint &out)
     if (std::min(first, last) > canvas.rows * canvas.texel + 0.02) {
         return;
     }
+    const double half = static_cast<double>(wall_look(spec).joint_half);
     Layer ragged(canvas.size(), 0.0f);
-    add_noise({0.02, 0.02, canvas.radius, spec.seed, PART_JOINT}, 0.0015f, canvas, ragged);
+    add_noise({0.02, 0.02, canvas.radius, spec.seed, PART_JOINT}, 0.0012f, canvas, ragged);
+    add_noise({0.005, 0.005, canvas.radius, spec.seed, PART_JOINT + 1}, 0.0006f, canvas, ragged);
     for (size_t i = 0; i < ragged.size(); i++) {
         const double s = canvas.s(static_cast<int>(i / static_cast<size_t>(canvas.columns)));
-        const double off = std::abs(std::remainder(s, spec.joint_spacing)) - JOINT_HALF_WIDTH;
+        const double off = std::abs(std::remainder(s, spec.joint_spacing)) - half;
         if (off <= 0.01) {
             const double edge = (off - static_cast<double>(ragged[i])) / (1.5 * canvas.texel);
             const float cover = static_cast<float>(std::clamp(0.5 - edge, 0.0, 1.0));
@@ -396,7 +456,12 @@ void dark_rings(const TextureSpec &spec, const Canvas &canvas, WallPaint &out)
 WallLook wall_look(const TextureSpec &spec)
 {
     constexpr WallLook LOOKS[] = {
-        {0.45f, 0.55f, 0.6f}, {0.28f, 0.60f, 0.6f}, {0.22f, 0.13f, 0.4f}, {0.55f, 0.17f, 0.4f}, {0.48f, 0.16f, 0.4f}};
+        {0.45f, 0.55f, 0.8f, 0.004f},  // concrete
+        {0.28f, 0.60f, 0.8f, 0.004f},  // brick
+        {0.22f, 0.13f, 1.1f, 0.004f},  // clay
+        {0.55f, 0.17f, 1.1f, 0.0013f}, // PVC
+        {0.48f, 0.16f, 1.1f, 0.0010f}, // lined
+    };
     WallLook look = LOOKS[static_cast<int>(spec.material)];
     if (spec.contrast <= 0.0) {
         look.albedo = 0.45f;

@@ -1,8 +1,8 @@
 // What pipes are made of: procedural walls over (arc length, clock angle), and how each looks in lamp light.
 //
 // A wall is painted in three channels: albedo; roughness (GGX alpha: 0 = mirror, 1 = matt); and relief, a height in
-// metres that only tilts the normal: the true wall stays the tube, and no relief is higher than 0.6 mm (bricks' joints:
-// 3 mm), so what it would really shift in the picture stays below a pixel for DN150 and above.
+// metres that only tilts the normal: the true wall stays the tube, and relief that is higher than half a millimetre
+// (bricks' joints 3 mm, folds of a lining 1 mm) is what a picture shows as tone, not as a shift.
 #pragma once
 
 #include "sim/paint.hpp"
@@ -29,6 +29,7 @@ struct WallLook {
     float albedo;      // mean, 0..1
     float alpha;       // roughness of the plain wall
     float slope_range; // largest slope of the relief that is kept
+    float joint_half;  // half the width of a dark ring, metres
 };
 WallLook wall_look(const TextureSpec &spec);
 

@@ -14,7 +14,7 @@ namespace
 {
 
 // Codes of a byte: albedo 0..1; the root of the spread (alpha^2 + slopes^2) 0..SPREAD; slopes around 128.
-constexpr float SPREAD = 1.25f, ZERO_SLOPE = 128.0f, SLOPE_STEPS = 127.0f;
+constexpr float SPREAD = 1.8f, ZERO_SLOPE = 128.0f, SLOPE_STEPS = 127.0f;
 
 uint8_t to_byte(float x)
 {
@@ -79,11 +79,12 @@ void Surface::generate(int64_t chunk)
         draw({m.s, m.phi * radius_, m.radius, m.radius, 1.0, 0.0}, canvas,
              [&](size_t i, float cover, float) { paint.albedo[i] += cover * (1.0f - paint.albedo[i]); });
     }
-    pack(paint, level(0, 0) + static_cast<size_t>((chunk & (chunks_ - 1)) * CHUNK) * static_cast<size_t>(around_));
+    pack(chunk, paint,
+         level(0, 0) + static_cast<size_t>((chunk & (chunks_ - 1)) * CHUNK) * static_cast<size_t>(around_));
     reduce(chunk);
 }
 
-void Surface::pack(const WallPaint &paint, Packed *out) const
+void Surface::pack(int64_t chunk, const WallPaint &paint, Packed *out) const
 {
     const size_t columns = static_cast<size_t>(around_);
     const float rise = static_cast<float>(0.5 / texel_), range = look_.slope_range, code = SLOPE_STEPS / range;
@@ -95,8 +96,13 @@ void Surface::pack(const WallPaint &paint, Packed *out) const
             const float slope_c = std::clamp(rise * (height[next] - height[before]), -range, range);
             const float alpha = std::clamp(paint.alpha[i * columns + j], 0.02f, 1.0f);
             const float spread = std::sqrt(alpha * alpha + slope_s * slope_s + slope_c * slope_c);
+            // Slopes are rounded at random: steps would show as rings in a highlight.
+            const uint64_t dice = hash64(spec_.seed, STREAM_SURFACE - 1, static_cast<uint64_t>(chunk), i * columns + j);
+            const float up_s = static_cast<float>(dice & 0xffffu) * 0x1p-16f - 0.5f;
+            const float up_c = static_cast<float>((dice >> 16) & 0xffffu) * 0x1p-16f - 0.5f;
             *out++ = {to_byte(paint.albedo[i * columns + j] * 255.0f), to_byte(spread * (255.0f / SPREAD)),
-                      to_byte(slope_s * code + ZERO_SLOPE), to_byte(slope_c * code + ZERO_SLOPE)};
+                      to_byte(slope_s * code + ZERO_SLOPE + (slope_s == 0.0f ? 0.0f : up_s)),
+                      to_byte(slope_c * code + ZERO_SLOPE + (slope_c == 0.0f ? 0.0f : up_c))};
         }
     }
 }

@@ -55,7 +55,7 @@ private:
     };
     static_assert(sizeof(Packed) == 4);
     void generate(int64_t chunk);
-    void pack(const WallPaint &paint, Packed *out) const;
+    void pack(int64_t chunk, const WallPaint &paint, Packed *out) const;
     void reduce(int64_t chunk);
     const Packed *level(int around, int along) const
     {

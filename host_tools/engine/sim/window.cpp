@@ -17,9 +17,9 @@ constexpr double MINIFY = -2.2;    // a drop shows this many times its own radiu
 constexpr double SCATTERED = 0.35; // share of the light that dirt takes and gives back as haze
 constexpr uint64_t DROPS = STREAM_WINDOW, DIRT = STREAM_WINDOW + 1;
 
-double soft_disc(double q) // 1 inside, 0 beyond 1
+double soft_disc(double q, double edge) // 1 inside, 0 beyond 1
 {
-    const double t = std::clamp((1.0 - q) / 0.35, 0.0, 1.0);
+    const double t = std::clamp((1.0 - q) / edge, 0.0, 1.0);
     return t * t * (3.0 - 2.0 * t);
 }
 
@@ -28,7 +28,7 @@ double soft_disc(double q) // 1 inside, 0 beyond 1
 Window::Window(const WindowSpec &spec, int width, int height, double c_u, double c_v, double circle)
     : width_(width), height_(height)
 {
-    const auto spots = [&](uint64_t stream, int count, double largest, const auto &each) {
+    const auto spots = [&](uint64_t stream, int count, double largest, double edge, const auto &each) {
         for (int n = 0; n < count; n++) {
             const auto draw = [&](uint64_t k) {
                 return uniform_of(hash64(spec.seed, stream, static_cast<uint64_t>(n), k));
@@ -42,7 +42,7 @@ Window::Window(const WindowSpec &spec, int width, int height, double c_u, double
                     // Not quite round: three lobes and two.
                     const double shape =
                         1.0 + 0.12 * std::sin(3.0 * bearing + phase) + 0.1 * std::sin(2.0 * bearing - phase);
-                    const double cover = soft_disc(q / shape);
+                    const double cover = soft_disc(q / shape, edge);
                     if (cover > 0.0 && std::hypot(x - c_u, y - c_v) < circle) {
                         each(static_cast<uint32_t>(y * width + x), cover, tone, x - u, y - v, u, v);
                     }
@@ -50,13 +50,13 @@ Window::Window(const WindowSpec &spec, int width, int height, double c_u, double
             }
         }
     };
-    spots(DIRT, spec.dirt, spec.dirt_radius,
+    spots(DIRT, spec.dirt, spec.dirt_radius, 0.9,
           [&](uint32_t pixel, double cover, double tone, double dx, double dy, double u, double v) {
               const double taken = spec.dirt_density * (0.3 + 0.7 * tone) * cover;
               touched_.push_back({pixel, static_cast<float>(1.0 - taken), static_cast<float>(SCATTERED * taken),
                                   static_cast<float>(u + dx), static_cast<float>(v + dy)});
           });
-    spots(DROPS, spec.drops, spec.drop_radius,
+    spots(DROPS, spec.drops, spec.drop_radius, 0.35,
           [&](uint32_t pixel, double cover, double, double dx, double dy, double u, double v) {
               touched_.push_back({pixel, static_cast<float>(1.0 - cover), static_cast<float>(0.92 * cover),
                                   static_cast<float>(u + MINIFY * dx), static_cast<float>(v + MINIFY * dy)});
