@@ -29,7 +29,7 @@ struct Scene::Buffers {
 // What fog adds to every view: a table over the image, one node every STEP pixels, and over the depth d as
 // d / (d + radius).
 struct Veil {
-    static constexpr int STEP = 32, DEPTHS = 24;
+    static constexpr int STEP = 16, DEPTHS = 24;
     int columns = 0, rows = 0;
     float radius = 1.0f;
     std::vector<float> nodes{}; // rows x columns x DEPTHS

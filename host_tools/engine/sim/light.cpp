@@ -115,7 +115,7 @@ float Ambient::at(const std::vector<float> &table, float z) const
     return table[i] + (x - static_cast<float>(i)) * (table[i + 1] - table[i]);
 }
 
-double fog_veil(const FogSpec &fog, const std::vector<Lamp> &lamps, int exponent, const double origin[3],
+double fog_veil(const FogSpec &fog, const std::vector<Lamp> &lamps, int exponent, double size, const double origin[3],
                 const double direction[3], double depth)
 {
     // Gauss and Legendre on -1..1, eight nodes.
@@ -128,7 +128,8 @@ double fog_veil(const FogSpec &fog, const std::vector<Lamp> &lamps, int exponent
                               static_cast<double>(lamp.z) - origin[2]};
         const double nearest = to[0] * direction[0] + to[1] * direction[1] + to[2] * direction[2];
         const double h =
-            std::max(std::sqrt(std::max(to[0] * to[0] + to[1] * to[1] + to[2] * to[2] - nearest * nearest, 0.0)), 1e-4);
+            std::max(std::sqrt(std::max(to[0] * to[0] + to[1] * to[1] + to[2] * to[2] - nearest * nearest, 0.0)),
+                     std::max(size, 1e-3));
         const double from = std::atan2(-nearest, h), until = std::atan2(depth - nearest, h);
         for (int k = 0; k < 8; k++) {
             const double node = k < 4 ? NODE[k] : -NODE[k - 4];

@@ -72,8 +72,9 @@ private:
 };
 
 // What fog scatters into a view of this ray down to `depth` metres: depth -> veil, in the units of Ambient. By Gauss's
-// quadrature in the angle seen from each lamp, which takes the 1 / d^2 out of the integrand.
-double fog_veil(const FogSpec &fog, const std::vector<Lamp> &lamps, int exponent, const double origin[3],
+// quadrature in the angle seen from each lamp, which takes the 1 / d^2 out of the integrand; rays pass no
+// nearer to a lamp than its size.
+double fog_veil(const FogSpec &fog, const std::vector<Lamp> &lamps, int exponent, double size, const double origin[3],
                 const double direction[3], double depth);
 
 inline float beam(const Lamp &lamp, int exponent, float cosine)

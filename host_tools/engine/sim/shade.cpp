@@ -235,21 +235,21 @@ void Scene::make_veil()
     const Lighting &light = shading_->lighting;
     for (int y = 0; y < veil.rows; y++) {
         for (int x = 0; x < veil.columns; x++) {
-            // Nodes beyond the picture take the nearest ray in it.
-            double px[2] = {std::min<double>(x * Veil::STEP, spec_.lens.width - 1),
-                            std::min<double>(y * Veil::STEP, spec_.lens.height - 1)};
-            const double u = px[0] - spec_.lens.c_u, v = px[1] - spec_.lens.c_v;
-            const double inside = std::min(1.0, 0.999 * lens_.circle_radius() / std::max(std::hypot(u, v), 1.0));
-            px[0] = spec_.lens.c_u + inside * u;
-            px[1] = spec_.lens.c_v + inside * v;
-            PixelRay r{0.0, 0.0, 1.0, 0.0};
-            ray(px, r);
+            const double px[2] = {static_cast<double>(x * Veil::STEP), static_cast<double>(y * Veil::STEP)};
+            PixelRay r{};
+            if (!ray(px, r)) { // beyond the picture the field goes on evenly: those nodes serve the rim's pixels
+                const double u = px[0] - spec_.lens.c_u, v = px[1] - spec_.lens.c_v;
+                const double theta = lens_.theta_max() * std::hypot(u, v) / lens_.circle_radius();
+                const double share = std::sin(theta) / std::max(std::hypot(u, v), 1e-9);
+                r = {share * u, share * v, std::cos(theta), lens_.pupil(std::min(theta, lens_.theta_max()))};
+            }
             const double origin[3] = {0.0, 0.0, r.pupil}, direction[3] = {r.dx, r.dy, r.dz};
             for (int k = 0; k < Veil::DEPTHS; k++) {
                 const double share = static_cast<double>(k) / Veil::DEPTHS;
                 const double depth = 0.5 * spec_.diameter * share / (1.0 - share);
-                veil.nodes.push_back(light.scale * static_cast<float>(fog_veil(spec_.fog, light.lamps, light.exponent,
-                                                                               origin, direction, depth)));
+                veil.nodes.push_back(light.scale *
+                                     static_cast<float>(fog_veil(spec_.fog, light.lamps, light.exponent,
+                                                                 spec_.lamp.size, origin, direction, depth)));
             }
         }
     }
