@@ -4,9 +4,10 @@
 
 writes sheet.png and table.json into the folder and prints the table. Of every picture an annulus of lit wall is looked
 at. corners: local maxima of the smaller eigenvalue of the 5 x 5 structure tensor, a 10,000 pixels, above 5 % of the
-largest one (as goodFeaturesToTrack counts) and above (3 grey levels a pixel)^2, which the tracker can use against noise.
-gradient: percentiles of its length over the mean grey level, per cent a pixel. contrast: standard deviation over mean,
-of the whole annulus and of what remains within 32 pixels. saturated: share of pixels at 250 and above.
+largest one (as goodFeaturesToTrack counts) and above (3 grey levels a pixel)^2, which a tracker can use
+against noise. gradient: percentiles of its length over the mean grey level, per cent a pixel. contrast: standard
+deviation over mean, of the whole annulus and of what remains within 32 pixels. saturated: share of pixels at 250 and
+above.
 """
 
 import argparse

@@ -295,6 +295,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
             "of its middle row's exposure; Scene.pose(frame, v) is the camera then",
         },
         "pose_columns": POSE_COLUMNS,
+        "light": [round(scene.light_level(frame), 9) for frame in range(scene.frames)],
         "poses": poses,
         "dropped": [frame for frame in range(scene.frames) if scene.dropped(frame)],
     }

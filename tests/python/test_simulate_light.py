@@ -236,14 +236,15 @@ def test_fine_texture_is_averaged_not_skipped() -> None:
     # The same wall through a lens of four times the resolution, 4 x 4 pixels averaged: each pixel must be the mean of
     # what is under it, from the rim to the far end.
     texture = {"contrast": 1, "gloss": 0, "relief": 0, "wetness": 0, "joint_spacing": 0}
-    coarse = Scene(straight(texture=texture, lamp={"exposure": 700}))
-    lens = {"width": 1280, "height": 960, "circle_radius": 472, "c_u": 641.5, "c_v": 481.5}
+    small = {"width": 160, "height": 120, "circle_radius": 59, "c_u": 80, "c_v": 60}
+    coarse = Scene(straight(texture=texture, lens=small, lamp={"exposure": 700}))
+    lens = {"width": 640, "height": 480, "circle_radius": 236, "c_u": 321.5, "c_v": 241.5}
     fine = Scene(straight(texture=texture, lens=lens, lamp={"exposure": 700}))
     seen = coarse.render(5).astype(float)
-    truth = fine.render(5).astype(float).reshape(240, 4, 320, 4).mean((1, 3))
-    rows, columns = np.mgrid[:240, :320]
-    away = np.hypot(columns - 160, rows - 120)
-    for low, high in ((15, 50), (50, 85), (85, 114)):
+    truth = fine.render(5).astype(float).reshape(120, 4, 160, 4).mean((1, 3))
+    rows, columns = np.mgrid[:120, :160]
+    away = np.hypot(columns - 80, rows - 60)
+    for low, high in ((8, 25), (25, 42), (42, 57)):
         where = (away > low) & (away < high)
         assert seen[where].mean() == pytest.approx(truth[where].mean(), rel=0.01)
         texture_left = truth[where].std()

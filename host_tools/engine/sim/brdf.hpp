@@ -28,11 +28,10 @@ inline float positive(float x)
     return 0.5f * (x + std::fabs(x));
 }
 
-// The mirror-like part's share of light at this cosine.
-inline float reflected(float cosine, float alpha)
+// What R gains from normal incidence to grazing: R(cos) = F0 + rise (1 - cos)^5.
+inline float rise_of(float alpha)
 {
-    const float most = std::max(1.0f - alpha, F0);
-    return F0 + (most - F0) * power5(1.0f - cosine);
+    return std::max(1.0f - alpha, F0) - F0;
 }
 
 // pi D V F at the cosines n.l, n.v, l.v, all but the last at least 0; alpha2 = alpha^2 of D, alpha that of V.

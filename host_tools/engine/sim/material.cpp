@@ -43,6 +43,9 @@ public:
     Painter(const TextureSpec &spec, const Canvas &canvas, WallPaint &out)
         : spec_(spec), canvas_(canvas), out_(out), wear_(0.23, 0.23, canvas.radius, spec.seed, PART_WEAR)
     {
+        for (int j = 0; j < canvas.columns; j++) {
+            down_.push_back(static_cast<float>(-std::cos(2.0 * PI * canvas.turn(j))));
+        }
     }
 
     void concrete();
@@ -56,9 +59,7 @@ private:
     const Canvas &canvas_;
     WallPaint &out_; // while painting, albedo is relative: 0 = the mean
     Lattice wear_;
-
-    // How far towards the invert: 1 there, -1 at the crown.
-    float down(double turn) const { return static_cast<float>(-std::cos(2.0 * PI * turn)); }
+    std::vector<float> down_; // of the columns: how far towards the invert, 1 there, -1 at the crown
 
     template <size_t N> void noises(const Noise (&list)[N], uint64_t stream, Layer &layer, double scale = 1.0)
     {
@@ -134,18 +135,18 @@ void Painter::erode()
     const size_t columns = static_cast<size_t>(canvas_.columns);
     const float level = static_cast<float>(1.0 - 1.5 * spec_.wear);
     for (size_t i = 0; i < loss.size(); i++) {
-        loss[i] = smooth(level, level + 0.35f, loss[i] + 0.45f * down(canvas_.turn(static_cast<int>(i % columns))));
+        loss[i] = smooth(level, level + 0.35f, loss[i] + 0.45f * down_[i % columns]);
         out_.albedo[i] -= 0.22f * loss[i];
         out_.height[i] -= 2.5e-4f * loss[i];
         out_.alpha[i] += 0.15f * loss[i];
     }
     scatter(cells, canvas_, 0.008, [&](double s, double across, Draws &draws) {
         const double size = draws(), shape = draws(), turn = PI * draws();
-        const float tone = static_cast<float>(draws.within(-0.3, 0.55));
+        const float tone = static_cast<float>(draws.within(-0.3, 0.42));
         const double a = 0.0025 + 0.0035 * size, b = a * (0.6 + 0.4 * shape);
         draw({s, across, a, b, std::cos(turn), std::sin(turn)}, canvas_, [&](size_t i, float cover, float q) {
             const float c = cover * loss[i];
-            out_.albedo[i] += c * (tone - 0.85f * out_.albedo[i]);
+            out_.albedo[i] += c * (tone - 0.5f * out_.albedo[i]);
             out_.height[i] += c * 4e-4f * (1.0f - 0.8f * q * q);
             out_.alpha[i] -= 0.25f * c;
         });
@@ -175,7 +176,7 @@ void Painter::film(float albedo, float alpha, double amount, double patch)
     const size_t columns = static_cast<size_t>(canvas_.columns);
     const float level = static_cast<float>(1.25 - 1.6 * amount);
     for (size_t i = 0; i < cover.size(); i++) {
-        const float there = cover[i] + 0.6f * down(canvas_.turn(static_cast<int>(i % columns)));
+        const float there = cover[i] + 0.6f * down_[i % columns];
         const float c = smooth(level, level + 0.5f, there);
         out_.albedo[i] += c * (albedo - 0.7f * out_.albedo[i]);
         out_.alpha[i] += c * (alpha - out_.alpha[i]);
@@ -198,7 +199,7 @@ void Painter::wet(float darken, float alpha)
     const size_t columns = static_cast<size_t>(canvas_.columns);
     const float dry = static_cast<float>(std::cos(PI * spec_.wetness)); // the share of the circumference below it
     for (size_t i = 0; i < level.size(); i++) {
-        const float w = smooth(dry - 0.06f, dry + 0.10f, level[i] + down(canvas_.turn(static_cast<int>(i % columns))));
+        const float w = smooth(dry - 0.06f, dry + 0.10f, level[i] + down_[i % columns]);
         out_.albedo[i] = (1.0f + out_.albedo[i]) * (1.0f - darken * w) - 1.0f;
         out_.alpha[i] += w * (alpha - out_.alpha[i]);
         out_.height[i] = out_.height[i] * (1.0f - 0.6f * w) + w * waves[i];
@@ -439,10 +440,11 @@ void dark_rings(const TextureSpec &spec, const Canvas &canvas, WallPaint &out)
     Layer ragged(canvas.size(), 0.0f);
     add_noise({0.02, 0.02, canvas.radius, spec.seed, PART_JOINT}, 0.0012f, canvas, ragged);
     add_noise({0.005, 0.005, canvas.radius, spec.seed, PART_JOINT + 1}, 0.0006f, canvas, ragged);
-    for (size_t i = 0; i < ragged.size(); i++) {
-        const double s = canvas.s(static_cast<int>(i / static_cast<size_t>(canvas.columns)));
-        const double off = std::abs(std::remainder(s, spec.joint_spacing)) - half;
-        if (off <= 0.01) {
+    const size_t columns = static_cast<size_t>(canvas.columns);
+    for (int row = 0; row < canvas.rows; row++) {
+        const double off = std::abs(std::remainder(canvas.s(row), spec.joint_spacing)) - half;
+        const size_t line = static_cast<size_t>(row) * columns;
+        for (size_t i = line; off <= 0.01 && i < line + columns; i++) {
             const double edge = (off - static_cast<double>(ragged[i])) / (1.5 * canvas.texel);
             const float cover = static_cast<float>(std::clamp(0.5 - edge, 0.0, 1.0));
             out.albedo[i] *= 1.0f - JOINT_DARKNESS * cover;

@@ -69,8 +69,8 @@ template <typename Blend> void draw(const Dab &e, const Canvas &canvas, const Bl
         for (int j = j0; j <= j1; j++) {
             const double dx = (j + 0.5) * texel - e.across;
             const double u = (e.cos_t * ds + e.sin_t * dx) / e.a, v = (e.cos_t * dx - e.sin_t * ds) / e.b;
-            const double q = std::sqrt(u * u + v * v), slope = std::hypot(u / e.a, v / e.b) / std::max(q, 1e-9);
-            const double outside = q > 1e-9 ? (q - 1.0) / slope : -e.b; // metres beyond the rim, to first order
+            const double q = std::sqrt(u * u + v * v), steep = std::sqrt(u * u / (e.a * e.a) + v * v / (e.b * e.b));
+            const double outside = q > 1e-9 ? (q - 1.0) * q / steep : -e.b; // metres beyond the rim, to first order
             const double cover = fade * std::clamp(0.5 - outside / soft, 0.0, 1.0);
             if (cover > 0.0) {
                 const int column = ((j % canvas.columns) + canvas.columns) % canvas.columns;

@@ -22,7 +22,7 @@ constexpr size_t BLOCK = 64; // points that are lit at a time: what is known of 
 
 // A block of points as the lamps' loop wants it.
 struct Block {
-    float alpha[BLOCK], rise[BLOCK]; // roughness; what reflected() gains towards grazing
+    float alpha[BLOCK], rise[BLOCK]; // roughness; rise_of() it
     float matt[BLOCK], shine[BLOCK];
 };
 
@@ -123,7 +123,7 @@ void shade(const Samples &p, const Lighting &light, float *out)
         Block block{};
         for (size_t i = 0; i < n; i++) {
             block.alpha[i] = std::sqrt(p.alpha2[from + i]);
-            block.rise[i] = std::max(1.0f - block.alpha[i], F0) - F0;
+            block.rise[i] = rise_of(block.alpha[i]);
         }
         if (light.density > 0.0f) {
             add_lamps<true>(p, from, n, light, block);

@@ -38,14 +38,12 @@ const std::array<uint8_t, 65026> &roots()
 
 Surface::Surface(const TextureSpec &spec, const std::vector<Marker> &markers, double radius, int around, double reach)
     : spec_(spec), look_(wall_look(spec)), markers_(markers), radius_(radius),
-      texel_(2.0 * std::numbers::pi * radius / around), around_(around), chunks_(1),
+      texel_(2.0 * std::numbers::pi * radius / around), around_(around),
+      chunks_(static_cast<int>(std::ceil(reach / (CHUNK * texel_))) + 2),
       levels_(static_cast<size_t>(AROUND_LEVELS) * ALONG_LEVELS)
 {
     if (around < 64 || around > 16384 || (around & (around - 1)) != 0) {
         throw std::invalid_argument("texels around the pipe must be a power of two from 64 to 16384");
-    }
-    while (chunks_ * CHUNK * texel_ < reach + 2.0 * CHUNK * texel_) {
-        chunks_ *= 2;
     }
     for (int a = 0; a < AROUND_LEVELS; a++) {
         for (int l = 0; l < ALONG_LEVELS; l++) {
@@ -79,8 +77,7 @@ void Surface::generate(int64_t chunk)
         draw({m.s, m.phi * radius_, m.radius, m.radius, 1.0, 0.0}, canvas,
              [&](size_t i, float cover, float) { paint.albedo[i] += cover * (1.0f - paint.albedo[i]); });
     }
-    pack(chunk, paint,
-         level(0, 0) + static_cast<size_t>((chunk & (chunks_ - 1)) * CHUNK) * static_cast<size_t>(around_));
+    pack(chunk, paint, level(0, 0) + slot(chunk) * CHUNK * static_cast<size_t>(around_));
     reduce(chunk);
 }
 
@@ -97,7 +94,7 @@ void Surface::pack(int64_t chunk, const WallPaint &paint, Packed *out) const
             const float alpha = std::clamp(paint.alpha[i * columns + j], 0.02f, 1.0f);
             const float spread = std::sqrt(alpha * alpha + slope_s * slope_s + slope_c * slope_c);
             // Slopes are rounded at random: steps would show as rings in a highlight.
-            const uint64_t dice = hash64(spec_.seed, STREAM_SURFACE - 1, static_cast<uint64_t>(chunk), i * columns + j);
+            const uint64_t dice = hash64(spec_.seed, STREAM_ROUNDING, static_cast<uint64_t>(chunk), i * columns + j);
             const float up_s = static_cast<float>(dice & 0xffffu) * 0x1p-16f - 0.5f;
             const float up_c = static_cast<float>((dice >> 16) & 0xffffu) * 0x1p-16f - 0.5f;
             *out++ = {to_byte(paint.albedo[i * columns + j] * 255.0f), to_byte(spread * (255.0f / SPREAD)),
@@ -110,7 +107,7 @@ void Surface::pack(int64_t chunk, const WallPaint &paint, Packed *out) const
 // Box filter: each level along halves the rows of the one before, each level around the columns.
 void Surface::reduce(int64_t chunk)
 {
-    const size_t slot = static_cast<size_t>(chunk & (chunks_ - 1));
+    const size_t at = slot(chunk);
     const auto &root = roots();
     // A half is rounded up and down in turn, or every level would gain a quarter of a step.
     const auto mean = [&](const Packed &a, const Packed &b, int odd) {
@@ -125,9 +122,9 @@ void Surface::reduce(int64_t chunk)
                 continue;
             }
             const size_t columns = static_cast<size_t>(around_) >> a, rows = static_cast<size_t>(CHUNK) >> l;
-            Packed *const out = level(a, l) + slot * rows * columns;
+            Packed *const out = level(a, l) + at * rows * columns;
             if (l > 0) {
-                const Packed *const in = level(a, l - 1) + slot * 2 * rows * columns;
+                const Packed *const in = level(a, l - 1) + at * 2 * rows * columns;
                 for (size_t i = 0; i < rows; i++) {
                     for (size_t j = 0; j < columns; j++) {
                         out[i * columns + j] =
@@ -135,7 +132,7 @@ void Surface::reduce(int64_t chunk)
                     }
                 }
             } else {
-                const Packed *const in = level(a - 1, 0) + slot * rows * columns * 2;
+                const Packed *const in = level(a - 1, 0) + at * rows * columns * 2;
                 for (size_t i = 0; i < rows * columns; i++) {
                     out[i] = mean(in[2 * i], in[2 * i + 1], static_cast<int>(i & 1));
                 }
@@ -168,15 +165,16 @@ Texel Surface::sample(float row, float column, float width_row, float width_colu
         std::memcpy(&bytes, &texel, sizeof bytes);
         return __builtin_convertvector(bytes, Quad);
     };
+    const int first_row = static_cast<int>(slot(first_chunk_)) * CHUNK;
     Quad sum = {0.0f, 0.0f, 0.0f, 0.0f};
     for (int l = s_level; l <= s_level + (s_blend > 0.0f ? 1 : 0); l++) {
         const float shrink = 1.0f / static_cast<float>(1 << l);
         const float weight_s = l == s_level ? 1.0f - s_blend : s_blend;
-        const int ring = (chunks_ * CHUNK) >> l, row_base = static_cast<int>(first_chunk_ & (chunks_ - 1)) * CHUNK >> l;
+        const int ring = (chunks_ * CHUNK) >> l, row_base = first_row >> l;
         // Clamped at the ends of the prepared rows: beyond them the ring holds something else.
         const float y = std::clamp(row * shrink - 0.5f, 0.0f, rows * shrink - 1.0f);
-        const int y0 = static_cast<int>(y), i0 = (row_base + y0) & (ring - 1);
-        const int i1 = static_cast<float>(y0) < rows * shrink - 1.0f ? (i0 + 1) & (ring - 1) : i0;
+        const int y0 = static_cast<int>(y), i0 = row_base + y0 < ring ? row_base + y0 : row_base + y0 - ring;
+        const int i1 = static_cast<float>(y0) < rows * shrink - 1.0f ? (i0 + 1 < ring ? i0 + 1 : 0) : i0;
         const float fy = y - static_cast<float>(y0);
         for (int a = c_level; a <= c_level + (c_blend > 0.0f ? 1 : 0); a++) {
             const float weight = weight_s * (a == c_level ? 1.0f - c_blend : c_blend);

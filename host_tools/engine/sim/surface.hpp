@@ -54,6 +54,7 @@ private:
         uint8_t albedo, spread, slope_s, slope_clock;
     };
     static_assert(sizeof(Packed) == 4);
+    size_t slot(int64_t chunk) const { return static_cast<size_t>((chunk % chunks_ + chunks_) % chunks_); }
     void generate(int64_t chunk);
     void pack(int64_t chunk, const WallPaint &paint, Packed *out) const;
     void reduce(int64_t chunk);
