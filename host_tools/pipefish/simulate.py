@@ -208,6 +208,10 @@ class Scene:
         """What the sensors say: time in ns, encoder counts, roll and pitch in radians."""
         return self._scene.telemetry(frame)
 
+    def light_level(self, frame: int) -> float:
+        """Factor of a frame's light: the lamps' flicker times the exposure's gain."""
+        return self._scene.light_level(frame)
+
     def cast(self, frame: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N, 2) pixels -> (N, 3) wall points in the world, (N,) ok (false outside the image circle)."""
         return self._scene.cast(frame, _points(pixels, 2))
@@ -291,6 +295,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
             "of its middle row's exposure; Scene.pose(frame, v) is the camera then",
         },
         "pose_columns": POSE_COLUMNS,
+        "light": [round(scene.light_level(frame), 9) for frame in range(scene.frames)],
         "poses": poses,
         "dropped": [frame for frame in range(scene.frames) if scene.dropped(frame)],
     }

@@ -126,7 +126,7 @@ def test_light_follows_the_closed_form_on_an_even_wall() -> None:
             ovals=[],
             texture={"contrast": 0, "joint_spacing": 0},
             sensor={"read_noise": 0, "shot_noise": 0, "blur_px": 0},
-            lamp={"lamps": 1, "ring_radius": 0, "side": 0.2, "forward": 0.9, "exposure": 400},
+            lamp={"lamps": 1, "ring_radius": 0, "side": 0.2, "forward": 0.9, "exposure": 400, "bounce": 0},
             lens=small()["lens"] | {"pupil_scale": 0, "vignetting": 0.3, "rim_blur_px": 0},
         )
     )

@@ -42,7 +42,7 @@ def clear(**changes: object) -> dict:
     scene = small(
         texture=PLAIN,
         sensor=QUIET | {"bits": 10},
-        lamp={"side": 1, "forward": 2, "exposure": 170},
+        lamp={"side": 1, "forward": 2, "exposure": 170, "bounce": 0},
         lens={"width": 640, "height": 480, "circle_radius": 236, "c_u": 319.3, "c_v": 240.1, "vignetting": 0},
     )
     return merged(scene, changes)

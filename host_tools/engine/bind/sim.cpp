@@ -1,6 +1,7 @@
 // The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in a fields() here or in
 // bind/sim_*.hpp, with its range, and serves reading, checking and writing back.
 #include "bind/sim_camera.hpp"
+#include "bind/sim_light.hpp"
 #include "bind/sim_motion.hpp"
 #include "sim/scene.hpp"
 
@@ -49,22 +50,6 @@ template <typename F> void fields(F &f, Marker &m)
     f("radius", m.radius, 0, 1);
 }
 
-template <typename F> void fields(F &f, TextureSpec &t)
-{
-    f("seed", t.seed, 0, kMaxSeed);
-    f("contrast", t.contrast, 0, 3);
-    f("joint_spacing", t.joint_spacing, 0, 100);
-}
-
-template <typename F> void fields(F &f, LampSpec &l)
-{
-    f("lamps", l.lamps, 1, 64);
-    f("ring_radius", l.ring_radius, 0, 1);
-    f("side", l.side, 0, 10);
-    f("forward", l.forward, 0, 10);
-    f("exposure", l.exposure, 0, 1e5);
-}
-
 template <typename F> void fields(F &f, SceneSpec &s)
 {
     f("diameter", s.diameter, 0.02, 10);
@@ -74,6 +59,10 @@ template <typename F> void fields(F &f, SceneSpec &s)
     f("texture", s.texture);
     f("lens", s.lens);
     f("lamp", s.lamp);
+    f("fog", s.fog);
+    f("window", s.window);
+    f("exposure", s.exposure);
+    f("tone", s.tone);
     f("sensor", s.sensor);
     f("motion", s.motion);
     f("telemetry", s.telemetry);
@@ -108,8 +97,7 @@ void check_together(const SceneSpec &s)
         if (ovality > 0.5)
             Reader::fail(where + ".ovality", "all stretches together must be at most 0.5");
     }
-    if (s.lamp.ring_radius > 0.25 * s.diameter)
-        Reader::fail("lamp.ring_radius", "must be at most a quarter of the pipe's diameter");
+    check_light(s.lamp, s.diameter);
     double length = 0;
     for (const Piece &p : s.pieces)
         length += p.angle != 0 ? p.angle * p.radius : p.length;
@@ -250,6 +238,13 @@ void bind_sim(nb::module_ &m)
                 return std::make_tuple(r.time_ns, r.encoder_count, r.roll, r.pitch);
             },
             nb::arg("frame"), "(time_ns, encoder_count, roll, pitch) as the sensors say.")
+        .def(
+            "light_level",
+            [](Scene &s, int frame) {
+                checked_frame(s, frame);
+                return s.light_level(frame);
+            },
+            nb::arg("frame"), "Factor of the frame's light: flicker times the exposure's gain.")
         .def(
             "cast",
             [](const Scene &s, int frame, const Points2 &px) {

@@ -17,21 +17,6 @@ namespace
 
 constexpr int BAND = 8; // rows a work item
 
-// Adds a small lamp at (lx, ly, 0): its intensity towards the wall point, Lambert's cosine, over the squared distance.
-void add_lamp(const RowHits &row, std::vector<float> &light, float lx, float ly, float side, float forward)
-{
-    const size_t n = light.size();
-    const float *const x = row.x.data(), *const y = row.y.data(), *const z = row.z.data();
-    const float *const nx = row.nx.data(), *const ny = row.ny.data(), *const nz = row.nz.data();
-    float *const sum = light.data();
-    for (size_t i = 0; i < n; i++) {
-        const float dx = lx - x[i], dy = ly - y[i], dz = -z[i];
-        const float d2 = dx * dx + dy * dy + dz * dz, ahead = std::max(z[i], 0.0f);
-        const float along = dx * nx[i] + dy * ny[i] + dz * nz[i];
-        sum[i] += (side + forward * ahead * ahead / d2) * std::max(along, 0.0f) / (d2 * std::sqrt(d2));
-    }
-}
-
 } // namespace
 
 void Scene::render(int frame, int threads, void *out)
@@ -57,9 +42,9 @@ void Scene::render(int frame, int threads, void *out)
         const double late = spec_.sensor.exposure_s * ((k + 0.5) / passes - 0.5); // seconds after mid-exposure
         const CameraState camera = passes > 1 ? trajectory_.at(f.time + late) : static_cast<const CameraState &>(f);
         const Tube::View view(tube_, camera.world_from_cam, camera.centre);
+        prepare_shading(camera);
         const auto draw = [&](int y, const Tube::View &from) {
-            const RowHits hits = cast_row(from, y, *buffers_);
-            light_row(y, hits, *buffers_);
+            buffers_->hits[static_cast<size_t>(y)] = cast_row(from, y, *buffers_);
         };
         each_row([&](int y) {
             if (spec_.sensor.line_time_s > 0.0) {
@@ -69,8 +54,9 @@ void Scene::render(int frame, int threads, void *out)
                 draw(y, view);
             }
         });
-        each_row([&](int y) { shade_row(y, *buffers_); });
+        each_row([&](int y) { shade_row(frame, y, *buffers_); });
     }
+    shading_->window.apply(buffers_->image);
     each_row([&](int y) { blur_along_row(y, *buffers_); });
     each_row([&](int y) { blur_across_row(y, *buffers_); });
     std::swap(buffers_->image, buffers_->spare);
@@ -109,64 +95,6 @@ int Scene::exposures(int frame) const
         }
     }
     return std::clamp(static_cast<int>(std::ceil(most / STEP)), 1, MOST);
-}
-
-// Light on a row's wall points, from a white wall.
-void Scene::light_row(int row, const RowHits &hits, Buffers &buffers) const
-{
-    const size_t first = row_offset_[static_cast<size_t>(row)], n = hits.x.size();
-    const LampSpec &lamp = spec_.lamp;
-    std::vector<float> sum(n, 0.0f);
-    for (int k = 0; k < lamp.lamps; k++) {
-        const double angle = 2.0 * std::numbers::pi * k / lamp.lamps;
-        add_lamp(hits, sum, static_cast<float>(lamp.ring_radius * std::sin(angle)),
-                 static_cast<float>(-lamp.ring_radius * std::cos(angle)), static_cast<float>(lamp.side),
-                 static_cast<float>(lamp.forward));
-    }
-    const double radius = 0.5 * spec_.diameter;
-    const float exposure = static_cast<float>(lamp.exposure * radius * radius / lamp.lamps);
-    for (size_t i = 0; i < n; i++) {
-        buffers.light[first + i] = exposure * sum[i] * vignette_[first + i];
-    }
-}
-
-void Scene::shade_row(int row, Buffers &buffers) const
-{
-    const int width = spec_.lens.width, height = spec_.lens.height;
-    const float around = static_cast<float>(surface_->around());
-    std::vector<float> line(static_cast<size_t>(width), 0.0f);
-    // Index of the lit pixel (x, y), or of (x, row) itself where (x, y) is dark.
-    const auto lit_or = [&](int x, int y, size_t own) {
-        const size_t at = static_cast<size_t>(y);
-        const bool lit = y >= 0 && y < height && x >= row_from_[at] && x < row_to_[at];
-        return lit ? row_offset_[at] + static_cast<size_t>(x - row_from_[at]) : own;
-    };
-    const auto spread = [&](size_t a, size_t b, float steps, float &along, float &across) {
-        if (steps == 0.0f) {
-            return;
-        }
-        const float d_row = (buffers.texel_row[a] - buffers.texel_row[b]) / steps;
-        float d_column = buffers.texel_column[a] - buffers.texel_column[b];
-        d_column = (d_column - around * std::nearbyint(d_column / around)) / steps;
-        along += d_row * d_row;
-        across += d_column * d_column;
-    };
-    const size_t at = static_cast<size_t>(row);
-    for (int x = row_from_[at]; x < row_to_[at]; x++) {
-        const size_t own = row_offset_[at] + static_cast<size_t>(x - row_from_[at]);
-        const size_t left = lit_or(x - 1, row, own), right = lit_or(x + 1, row, own);
-        const size_t above = lit_or(x, row - 1, own), below = lit_or(x, row + 1, own);
-        float along = 0.0f, across = 0.0f;
-        spread(right, left, static_cast<float>((right != own) + (left != own)), along, across);
-        spread(below, above, static_cast<float>((below != own) + (above != own)), along, across);
-        line[static_cast<size_t>(x)] =
-            buffers.light[own] *
-            surface_->sample(buffers.texel_row[own], buffers.texel_column[own], std::sqrt(along), std::sqrt(across));
-    }
-    float *const out = buffers.image.data() + at * static_cast<size_t>(width);
-    for (int x = 0; x < width; x++) {
-        out[x] += buffers.share * line[static_cast<size_t>(x)];
-    }
 }
 
 } // namespace pipefish::sim

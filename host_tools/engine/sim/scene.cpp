@@ -32,7 +32,7 @@ int texels_around(const Lens &lens)
 Scene::Reach Scene::lit_reach(const SceneSpec &spec)
 {
     const double brightest =
-        spec.lamp.exposure * (spec.lamp.side + spec.lamp.forward) * static_cast<double>(Surface::MEAN);
+        spec.lamp.exposure * (spec.lamp.side + spec.lamp.forward) * static_cast<double>(wall_look(spec.texture).albedo);
     const double radii = std::clamp(std::cbrt(brightest / 0.1), 4.0, 30.0);
     const double ahead = 0.5 * spec.diameter * radii;
     const bool turns = std::any_of(spec.motion.head.begin(), spec.motion.head.end(),
@@ -59,8 +59,9 @@ void Scene::prepare()
     make_blur_kernel();
     make_spread();
     make_patterns();
-    buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width) *
-                                                           static_cast<size_t>(spec_.lens.height));
+    make_shading();
+    buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width),
+                                         static_cast<size_t>(spec_.lens.height));
 }
 
 void Scene::make_pixel_table()

@@ -2,12 +2,16 @@
 // the description: any order, any number of threads, the same bits.
 #pragma once
 
+#include "sim/exposure.hpp"
 #include "sim/lens.hpp"
+#include "sim/light.hpp"
 #include "sim/motion.hpp"
 #include "sim/sensor.hpp"
 #include "sim/surface.hpp"
 #include "sim/telemetry.hpp"
+#include "sim/tone.hpp"
 #include "sim/tube.hpp"
+#include "sim/window.hpp"
 
 #include <memory>
 #include <mutex>
@@ -15,16 +19,6 @@
 
 namespace pipefish::sim
 {
-
-// A ring of small lamps around the lens, in the plane of the camera centre. Each shines with the intensity
-// side + forward cos^2 a at the angle a from the optical axis, and with `side` alone behind it; the ring's mean counts.
-struct LampSpec {
-    int lamps = 8;
-    double ring_radius = 0.03; // metres; 0 = one lamp at the camera centre
-    double side = 0.12, forward = 1.0;
-    double exposure =
-        1150.0; // linear grey level of a white wall, square to a lamp of unit intensity at the pipe's radius
-};
 
 struct SceneSpec {
     double diameter = 0.3; // metres
@@ -34,6 +28,10 @@ struct SceneSpec {
     TextureSpec texture;
     LensSpec lens;
     LampSpec lamp;
+    FogSpec fog;
+    WindowSpec window;
+    ExposureSpec exposure;
+    ToneSpec tone;
     SensorSpec sensor;
     MotionSpec motion;
     TelemetrySpec telemetry;
@@ -63,6 +61,9 @@ public:
     // at a time per scene; others wait.
     void render(int frame, int threads, void *out);
 
+    // Factor of a frame's light: lamps' flicker (in its middle row) times the exposure's gain.
+    double light_level(int frame);
+
     // Where the ray of a pixel meets the wall, world. False outside the circle and the sensor.
     bool cast(int frame, const double px[2], double world[3]) const;
     // The pixel of a world point, not asking what stands between. False outside the field, the circle and the sensor.
@@ -88,8 +89,17 @@ private:
     bool cast_from(const CameraState &camera, const double px[2], double world[3]) const;
     bool project_from(const CameraState &camera, const double world[3], double px[2]) const;
     RowHits cast_row(const Tube::View &view, int row, Buffers &buffers) const;
-    void light_row(int row, const RowHits &hits, Buffers &buffers) const;
-    void shade_row(int row, Buffers &buffers) const;
+    struct Shading;
+    struct Footprint {
+        float along, across; // texels
+    };
+    void make_shading();
+    void make_veil();
+    double flicker(int frame, double row) const;
+    std::vector<float> meter(int frame) const;
+    void prepare_shading(const CameraState &camera);
+    Footprint footprint(int row, int x, size_t own, const Buffers &buffers) const;
+    void shade_row(int frame, int row, Buffers &buffers) const;
     void blur_along_row(int row, Buffers &buffers) const;
     void blur_across_row(int row, Buffers &buffers) const;
     void spread_across_row(int row, Buffers &buffers) const;
@@ -113,6 +123,7 @@ private:
     std::vector<float> spread_;          // with this b, of every pixel
     std::vector<float> offset_, gain_;   // fixed pattern, of every pixel; empty = none
     std::unique_ptr<Buffers> buffers_;
+    std::unique_ptr<Shading> shading_;
     std::mutex rendering_;
 };
 

@@ -117,6 +117,9 @@ void Scene::develop_row(int frame, int row, const Buffers &buffers, void *out) c
             line[x] += offset_[first + x];
         }
     }
+    for (float &grey : line) {
+        grey = tone(spec_.tone, grey);
+    }
     if (sensor.bits > 8) {
         uint16_t *const pixels = static_cast<uint16_t *>(out) + first;
         const float most = static_cast<float>((1 << sensor.bits) - 1);
