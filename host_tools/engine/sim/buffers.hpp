@@ -6,6 +6,13 @@
 namespace pipefish::sim
 {
 
+// Positions and inward normals of a row's wall points, in the camera's frame, metres.
+struct RowHits {
+    std::vector<float> x, y, z, nx, ny, nz;
+
+    explicit RowHits(size_t n) : x(n), y(n), z(n), nx(n), ny(n), nz(n) {}
+};
+
 struct Scene::Buffers {
     // Of the lit pixels: where each sees the wall, in texels, and the light that reaches it from a white wall.
     std::vector<float> texel_row, texel_column, light;

@@ -18,20 +18,13 @@ namespace
 
 constexpr int BAND = 8; // rows a work item
 
-// Positions and normals of a row's wall points in the camera's frame, and the light on them.
-struct RowLight {
-    std::vector<float> x, y, z, nx, ny, nz, sum;
-
-    explicit RowLight(size_t n) : x(n), y(n), z(n), nx(n), ny(n), nz(n), sum(n, 0.0f) {}
-};
-
 // Adds a small lamp at (lx, ly, 0): its intensity towards the wall point, Lambert's cosine, over the squared distance.
-void add_lamp(RowLight &row, float lx, float ly, float side, float forward)
+void add_lamp(const RowHits &row, std::vector<float> &light, float lx, float ly, float side, float forward)
 {
-    const size_t n = row.sum.size();
+    const size_t n = light.size();
     const float *const x = row.x.data(), *const y = row.y.data(), *const z = row.z.data();
     const float *const nx = row.nx.data(), *const ny = row.ny.data(), *const nz = row.nz.data();
-    float *const sum = row.sum.data();
+    float *const sum = light.data();
     for (size_t i = 0; i < n; i++) {
         const float dx = lx - x[i], dy = ly - y[i], dz = -z[i];
         const float d2 = dx * dx + dy * dy + dz * dz, ahead = std::max(z[i], 0.0f);
@@ -77,47 +70,30 @@ void Scene::render(int frame, int threads, uint8_t *out)
     };
     surface_->prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
     const Tube::View view(tube_, f.world_from_cam, f.centre);
-    each_row([&](int y) { cast_row(view, y, *buffers_); });
+    each_row([&](int y) {
+        const RowHits hits = cast_row(view, y, *buffers_);
+        light_row(y, hits, *buffers_);
+    });
     each_row([&](int y) { shade_row(y, *buffers_); });
     each_row([&](int y) { develop_row(frame, y, *buffers_, out); });
 }
 
-void Scene::cast_row(const Tube::View &view, int row, Buffers &buffers) const
+// Light on a row's wall points, from a white wall.
+void Scene::light_row(int row, const RowHits &hits, Buffers &buffers) const
 {
-    const size_t first = row_offset_[static_cast<size_t>(row)];
-    const size_t n = static_cast<size_t>(row_to_[static_cast<size_t>(row)] - row_from_[static_cast<size_t>(row)]);
-    const double texels_a_metre = 1.0 / surface_->texel(), base = surface_->base();
-    const double texels_a_radian = surface_->around() / (2.0 * std::numbers::pi);
+    const size_t first = row_offset_[static_cast<size_t>(row)], n = hits.x.size();
     const LampSpec &lamp = spec_.lamp;
-    RowLight lit(n);
-    for (size_t i = 0; i < n; i++) {
-        const PixelRay &r = rays_[first + i];
-        Hit hit{};
-        if (!view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
-            buffers.texel_row[first + i] = -1.0f; // with a zero normal: black
-            buffers.texel_column[first + i] = 0.0f;
-            lit.z[i] = 1.0f;
-            continue;
-        }
-        buffers.texel_row[first + i] = static_cast<float>((hit.s - base) * texels_a_metre);
-        buffers.texel_column[first + i] = static_cast<float>(hit.clock * texels_a_radian);
-        lit.x[i] = static_cast<float>(hit.t * r.dx);
-        lit.y[i] = static_cast<float>(hit.t * r.dy);
-        lit.z[i] = static_cast<float>(r.pupil + hit.t * r.dz);
-        lit.nx[i] = static_cast<float>(hit.normal.x());
-        lit.ny[i] = static_cast<float>(hit.normal.y());
-        lit.nz[i] = static_cast<float>(hit.normal.z());
-    }
+    std::vector<float> sum(n, 0.0f);
     for (int k = 0; k < lamp.lamps; k++) {
         const double angle = 2.0 * std::numbers::pi * k / lamp.lamps;
-        add_lamp(lit, static_cast<float>(lamp.ring_radius * std::sin(angle)),
+        add_lamp(hits, sum, static_cast<float>(lamp.ring_radius * std::sin(angle)),
                  static_cast<float>(-lamp.ring_radius * std::cos(angle)), static_cast<float>(lamp.side),
                  static_cast<float>(lamp.forward));
     }
     const double radius = 0.5 * spec_.diameter;
     const float exposure = static_cast<float>(lamp.exposure * radius * radius / lamp.lamps);
     for (size_t i = 0; i < n; i++) {
-        buffers.light[first + i] = exposure * lit.sum[i] * vignette_[first + i];
+        buffers.light[first + i] = exposure * sum[i] * vignette_[first + i];
     }
 }
 

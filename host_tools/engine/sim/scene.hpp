@@ -43,6 +43,8 @@ struct SceneSpec {
     MotionSpec motion;
 };
 
+struct RowHits;
+
 class Scene
 {
 public:
@@ -78,7 +80,8 @@ private:
     void prepare(); // what only drawing needs, at the first frame
     void make_pixel_table();
     void make_blur_kernel();
-    void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    RowHits cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void light_row(int row, const RowHits &hits, Buffers &buffers) const;
     void shade_row(int row, Buffers &buffers) const;
     void develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const;
 
