@@ -44,6 +44,11 @@ enum Stream : uint64_t {
     STREAM_ROLL = 3,
     STREAM_PITCH = 4,
     STREAM_PIXEL = 5,
+    STREAM_JOINT = 20,
+    STREAM_GRAIN = 21,
+    STREAM_CRACK = 22,
+    STREAM_ROOT = 23,
+    STREAM_RIPPLE = 24,
     STREAM_SURFACE = 1000, // and up: one a layer of the surface
 };
 

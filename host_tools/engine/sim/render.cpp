@@ -69,7 +69,7 @@ void Scene::render(int frame, int threads, uint8_t *out)
         });
     };
     surface_->prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
-    const Tube::View view(tube_, f.world_from_cam, f.centre);
+    const Tube::View view = this->view(frame);
     each_row([&](int y) {
         const RowHits hits = cast_row(view, y, *buffers_);
         light_row(y, hits, *buffers_);

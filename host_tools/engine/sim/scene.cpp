@@ -57,7 +57,7 @@ Scene::Reach Scene::lit_reach(const SceneSpec &spec)
 }
 
 Scene::Scene(const SceneSpec &spec)
-    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(lens_table(spec.lens)),
+    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals, spec.features), lens_(lens_table(spec.lens)),
       frames_(drive(tube_, spec.motion)), reach_(lit_reach(spec))
 {
     spec_.lens.theta_max = lens_.theta_max();
@@ -129,18 +129,49 @@ bool Scene::ray(const double px[2], PixelRay &ray) const
     return true;
 }
 
-bool Scene::cast(int frame, const double px[2], double world[3]) const
+Tube::View Scene::view(int frame) const
+{
+    const FrameState &f = frames_[static_cast<size_t>(frame)];
+    return {tube_, f.world_from_cam, f.centre, 1e-9 * static_cast<double>(f.time_ns)};
+}
+
+bool Scene::see(const Tube::View &view, int frame, const double px[2], Seen &seen) const
 {
     PixelRay r{};
-    Hit hit{};
-    const FrameState &f = frames_[static_cast<size_t>(frame)];
-    const Tube::View view(tube_, f.world_from_cam, f.centre);
-    if (!ray(px, r) || !view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
+    if (!ray(px, r)) {
         return false;
     }
-    const Eigen::Vector3d local(hit.t * r.dx, hit.t * r.dy, r.pupil + hit.t * r.dz);
-    Eigen::Map<Eigen::Vector3d>(world, 3) = f.centre + f.world_from_cam * local;
+    const Eigen::Vector3d origin(0.0, 0.0, r.pupil), direction(r.dx, r.dy, r.dz);
+    Sight &sight = seen.sight;
+    if (!view.see(origin, direction, sight)) {
+        return false;
+    }
+    const FrameState &f = frames_[static_cast<size_t>(frame)];
+    seen.point = f.centre + f.world_from_cam * (origin + sight.first.t * direction);
+    seen.normal = f.world_from_cam * sight.first.normal;
+    if (sight.mirrors) {
+        seen.mirrored = f.centre + f.world_from_cam * (sight.origin + sight.second.t * sight.direction);
+    }
     return true;
+}
+
+bool Scene::visible(const Tube::View &view, int frame, const double world[3], double px[2]) const
+{
+    Seen seen{};
+    if (!project(frame, world, px) || !see(view, frame, px, seen)) {
+        return false;
+    }
+    const FrameState &f = frames_[static_cast<size_t>(frame)];
+    const double distance = (Eigen::Map<const Eigen::Vector3d>(world) - f.centre).norm();
+    return (seen.point - f.centre).norm() > distance - 1e-6 * tube_.radius();
+}
+
+bool Scene::flow(const Tube::View &view_a, int a, const Tube::View &view_b, int b, const double px[2],
+                 double out[2]) const
+{
+    Seen seen{};
+    return see(view_a, a, px, seen) && seen.sight.first.material != Material::WATER &&
+           visible(view_b, b, seen.point.data(), out);
 }
 
 bool Scene::project(int frame, const double world[3], double px[2]) const

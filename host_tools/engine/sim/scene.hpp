@@ -36,11 +36,17 @@ struct SceneSpec {
     std::vector<Piece> pieces;
     std::vector<OvalStretch> ovals;
     std::vector<Marker> markers;
+    FeatureSpec features;
     TextureSpec texture;
     LensSpec lens;
     LampSpec lamp;
     SensorSpec sensor;
     MotionSpec motion;
+};
+
+struct Seen {
+    Sight sight;                             // in the camera's frame
+    Eigen::Vector3d point, normal, mirrored; // world; `mirrored` if sight.mirrors
 };
 
 struct RowHits;
@@ -61,10 +67,18 @@ public:
     // Draws a frame into out[height * width] on `threads` threads. One call at a time per scene; others wait.
     void render(int frame, int threads, uint8_t *out);
 
-    // Where the ray of a pixel meets the wall, world. False outside the circle and the sensor.
-    bool cast(int frame, const double px[2], double world[3]) const;
+    // The tube as the frame's camera sees it, for the calls below.
+    Tube::View view(int frame) const;
+    // What the ray of a pixel meets first, and what that mirrors. False outside the circle and the sensor.
+    bool see(const Tube::View &view, int frame, const double px[2], Seen &seen) const;
     // The pixel of a world point, not asking what stands between. False outside the field, the circle and the sensor.
     bool project(int frame, const double world[3], double px[2]) const;
+    // Does nothing stand between the camera and the point? It must project.
+    bool visible(const Tube::View &view, int frame, const double world[3], double px[2]) const;
+    // Where the wall point seen by a pixel of frame `a` is in frame `b`; false where it is hidden or outside, and on
+    // water.
+    bool flow(const Tube::View &view_a, int a, const Tube::View &view_b, int b, const double px[2],
+              double out[2]) const;
 
 private:
     struct PixelRay {

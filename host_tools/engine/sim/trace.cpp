@@ -1,0 +1,662 @@
+// Rays in the tube. Its free space is the union of the main pipe, which is marched segment by segment, and of what
+// opens from it: a ray that meets the main wall inside an opening goes on to the opening's own end, and from there, if
+// that lies in the main pipe, on in it.
+#include "sim/tube.hpp"
+
+#include "sim/random.hpp"
+
+#include <Eigen/Geometry>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numbers>
+
+namespace pipefish::sim
+{
+
+namespace
+{
+
+constexpr double TWO_PI = 2.0 * std::numbers::pi;
+constexpr double INFINITE = std::numeric_limits<double>::infinity();
+constexpr int MAX_STEPS = 4000;
+constexpr double NEAR = 1e-12;         // of the wall's function: half a picometre per metre of radius
+constexpr double LEAST_DEPOSIT = 2e-4; // metres: less is wall with dirt on it
+
+double wrap_clock(double clock)
+{
+    const double c = std::fmod(clock, TWO_PI);
+    return c < 0.0 ? c + TWO_PI : c;
+}
+
+// The first root h of value + rate h + bound h^2 / 2 = 0, for value <= 0.
+double safe_step(double value, double rate, double bound)
+{
+    return -2.0 * value / (rate + std::sqrt(rate * rate - 2.0 * bound * value));
+}
+
+} // namespace
+
+// A ray in a segment's frame. In a bend, the plane of the centreline and the direction across it: u points from the
+// bend's centre to the segment's start, z along the start's tangent, w across.
+struct Tube::SegmentRay {
+    struct State {
+        double x, y, u, z, q;      // (right, down) in the section; in a bend u, z and q = hypot(u, z)
+        double vx, vy, vs;         // their rates along the ray, and the arc length's
+        double rho, clock;         // where the segment has reliefs
+        bool inner;                // so near to the axis that no wall can be; g is then that of the cylinder around it
+        double g, rate;            // the wall's function and its derivative along the ray
+        Eigen::Vector2d g_section; // gradient of g by (right, down)
+        double g_s;                // and by the arc length
+    };
+
+    const Tube &tube;
+    const Segment &segment;
+    Eigen::Vector3d o, d;
+    double ou, du, ow, dw;
+
+    SegmentRay(const Tube &the_tube, const Segment &the_segment, const Eigen::Vector3d &origin,
+               const Eigen::Vector3d &direction)
+        : tube(the_tube), segment(the_segment), o(origin), d(direction),
+          ou(segment.bend_radius - (o.x() * segment.nx + o.y() * segment.ny)),
+          du(-(d.x() * segment.nx + d.y() * segment.ny)), ow(o.y() * segment.nx - o.x() * segment.ny),
+          dw(d.y() * segment.nx - d.x() * segment.ny)
+    {
+    }
+
+    bool bend() const { return segment.bend_radius > 0.0; }
+    bool detailed() const { return !segment.reliefs.empty(); }
+
+    // Where the ray passes the segment's end (step +1) or its start (step -1).
+    double exit(bool has_next, bool has_previous, int &step) const
+    {
+        double t_exit = INFINITE;
+        const double end_rate = segment.end_normal.dot(d), start_rate = segment.start_normal.dot(d);
+        if (has_next && end_rate > 0.0) {
+            t_exit = (segment.end_offset - segment.end_normal.dot(o)) / end_rate;
+            step = 1;
+        }
+        if (has_previous && start_rate < 0.0) {
+            const double t = -segment.start_normal.dot(o) / start_rate;
+            if (t < t_exit) {
+                t_exit = t;
+                step = -1;
+            }
+        }
+        return t_exit;
+    }
+
+    // A bound of g'' = 2 |w'|^2 + 2 w.w'' along the ray inside the segment, from w = A^-1 p, |w| <= 1, |A'| <= slope,
+    // |A''| <= curvature and |A^-1| <= l.
+    double ellipse_bound(double l, double slope, double curvature) const
+    {
+        if (!bend()) {
+            const double across = std::sqrt(d.x() * d.x() + d.y() * d.y()), grow = l * (across + slope);
+            return 2.0 * grow * grow + 2.0 * l * (2.0 * l * slope * (across + slope) + curvature);
+        }
+        const double q = segment.curvature_radius, ds = segment.bend_radius / q, dds = 2.0 * ds / q;
+        const double grow = l * (1.0 + slope * ds);
+        return 2.0 * grow * grow +
+               2.0 * l * (1.0 / q + 2.0 * l * slope * ds * (1.0 + slope * ds) + curvature * ds * ds + slope * dds);
+    }
+
+    // The same for g = 2 (rho - r(s, clock)) / radius at least 0.7 `inner` from the axis.
+    double relief_bound() const
+    {
+        const double least = 0.7 * segment.inner, q = bend() ? segment.curvature_radius : INFINITE;
+        const double v2 = bend() ? 1.0 : d.x() * d.x() + d.y() * d.y(), turn = std::sqrt(v2) / least;
+        const double along = bend() ? segment.bend_radius / q : std::abs(d.z());
+        const double rho2 = v2 / least + 1.0 / q, clock2 = v2 / (least * least) + 1.0 / (q * least);
+        const double s2 = bend() ? 2.0 * along / q : 0.0;
+        const HeightBounds &b = segment.bounds;
+        return 2.0 / tube.radius_ *
+               (rho2 + b.by_ss * along * along + 2.0 * b.by_sphi * along * turn + b.by_phiphi * turn * turn +
+                b.by_phi * clock2 + b.by_s * s2);
+    }
+
+    void place(double t, State &st) const
+    {
+        st.z = o.z() + t * d.z();
+        if (!bend()) {
+            st.x = o.x() + t * d.x();
+            st.y = o.y() + t * d.y();
+            st.vx = d.x();
+            st.vy = d.y();
+            st.vs = d.z();
+            return;
+        }
+        st.u = ou + t * du;
+        st.q = std::sqrt(st.u * st.u + st.z * st.z);
+        const double w = ow + t * dw, n = segment.bend_radius - st.q, vn = -(st.u * du + st.z * d.z()) / st.q;
+        st.x = n * segment.nx - w * segment.ny;
+        st.y = n * segment.ny + w * segment.nx;
+        st.vx = vn * segment.nx - dw * segment.ny;
+        st.vy = vn * segment.ny + dw * segment.nx;
+        st.vs = segment.bend_radius * (st.u * d.z() - st.z * du) / (st.q * st.q);
+    }
+
+    State at(double t) const
+    {
+        State st{};
+        place(t, st);
+        if (detailed()) {
+            wall_with_reliefs(st, 0.0);
+        } else {
+            ellipse(st);
+        }
+        st.rate = st.g_section.x() * st.vx + st.g_section.y() * st.vy + st.g_s * st.vs;
+        return st;
+    }
+
+    void ellipse(State &st) const
+    {
+        Section sec = segment.constant;
+        if (segment.varying) {
+            sec = tube.section(arc(st));
+            sec.rho += segment.groove;
+        }
+        const double inv_det = 1.0 / (sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s);
+        const auto inverse = [&](double px, double py) {
+            return Eigen::Vector2d(((sec.rho + sec.e_c) * px + sec.e_s * py) * inv_det,
+                                   (sec.e_s * px + (sec.rho - sec.e_c) * py) * inv_det);
+        };
+        const Eigen::Vector2d w = inverse(st.x, st.y);
+        st.g = w.squaredNorm() - 1.0;
+        st.g_section = 2.0 * inverse(w.x(), w.y());
+        if (segment.varying) { // d(A^-1 p)/ds = -A^-1 A' w with A' = [-d_c, -d_s; -d_s, d_c]
+            st.g_s = -2.0 * w.dot(inverse(-sec.d_c * w.x() - sec.d_s * w.y(), -sec.d_s * w.x() + sec.d_c * w.y()));
+        }
+    }
+
+    // `deeper`: metres by which the surface lies behind the wall.
+    void wall_with_reliefs(State &st, double deeper) const
+    {
+        const double rho2 = st.x * st.x + st.y * st.y, inner = segment.inner;
+        st.inner = rho2 < inner * inner * (1.0 - 2e-7);
+        if (st.inner) {
+            st.g = rho2 / (inner * inner) - 1.0;
+            st.g_section = {2.0 * st.x / (inner * inner), 2.0 * st.y / (inner * inner)};
+            return;
+        }
+        st.rho = std::sqrt(rho2);
+        st.clock = wrap_clock(std::atan2(st.x, -st.y));
+        Height wall;
+        const double scale = 2.0 / tube.radius_, r = tube.radius_at(segment, arc(st), st.clock, &wall);
+        const double turn = wall.by_phi / rho2;
+        st.g = scale * (st.rho - r - deeper);
+        st.g_section = {scale * (st.x / st.rho + turn * st.y), scale * (st.y / st.rho - turn * st.x)};
+        st.g_s = -scale * wall.by_s;
+    }
+
+    double arc(const State &st) const
+    {
+        return segment.s0 + (bend() ? segment.bend_radius * std::atan2(st.z, st.u) : st.z);
+    }
+
+    // The gradient in the segment's frame of a function with these derivatives by (right, down) and the arc length. In
+    // a bend the section at the angle a has the axes cos a n - sin a z (to the bend's centre) and sin a n + cos a z
+    // (tangent), and an arc length of bend_radius / q per metre.
+    Eigen::Vector3d gradient(const State &st, const Eigen::Vector2d &section, double by_s) const
+    {
+        if (!bend()) {
+            return {section.x(), section.y(), by_s};
+        }
+        const double gn = section.x() * segment.nx + section.y() * segment.ny;
+        const double gw = section.y() * segment.nx - section.x() * segment.ny;
+        const double gt = by_s * segment.bend_radius / st.q, c = st.u / st.q, s = st.z / st.q;
+        const double n = gn * c + gt * s;
+        return {n * segment.nx - gw * segment.ny, n * segment.ny + gw * segment.nx, gt * c - gn * s};
+    }
+
+    // Marches from t to the wall, or to `limit`; t is then there. Along the ray g(t + h) <= g + g' h + K h^2 / 2 with K
+    // a bound of g'' over the segment, so the root h of the right side never passes the first hit and converges to it
+    // like Newton's method. On a straight segment of constant section K is exact and the first step lands on the wall.
+    // Reliefs: the same, first up to the cylinder inside which there is no wall, from there with their own bound, in
+    // steps that keep 0.7 of its radius away from the axis. Returns true at the wall.
+    bool to_wall(double &t, double limit, int &steps) const
+    {
+        const double inner_bound = detailed() ? ellipse_bound(1.0 / segment.inner, 0.0, 0.0)
+                                              : ellipse_bound(segment.inverse_axis, segment.slope, segment.curvature);
+        const double bound = detailed() ? relief_bound() : inner_bound, longest = 0.3 * segment.inner;
+        for (; steps < MAX_STEPS; steps++) {
+            const State st = at(t);
+            if (!st.inner && st.g > -NEAR) {
+                return true;
+            }
+            double h = safe_step(st.g, st.rate, st.inner ? inner_bound : bound);
+            if (detailed() && !st.inner) {
+                h = std::min(h, longest);
+            }
+            if (t + h >= limit) {
+                break;
+            }
+            t += h;
+        }
+        t = std::max(t, limit);
+        return false;
+    }
+};
+
+struct Tube::View::Walk {
+    Eigen::Vector3d o, d;
+    double t = 0.0;
+    int index = 0;
+    bool with_water = true;
+    int steps = 0;
+    int branch = -1, crack = -1; // the opening that the ray is in
+    Hit hit{};
+};
+
+Tube::View::View(const Tube &tube, const Eigen::Matrix3d &world_from_cam, const Eigen::Vector3d &centre, double seconds)
+    : tube_(tube), seconds_(seconds), start_(-1)
+{
+    WallPoint at{};
+    start_ = tube.find(centre, at);
+    for (const Segment &segment : tube.segments_) {
+        const Eigen::Matrix3d segment_from_world = segment.frame.world_from_frame.transpose();
+        local_.push_back({segment_from_world * world_from_cam, segment_from_world * (centre - segment.frame.origin)});
+    }
+    const Eigen::Matrix3d cam_from_world = world_from_cam.transpose();
+    for (Branch branch : tube.branches_) {
+        branch.origin = cam_from_world * (branch.origin - centre);
+        branch.axis = cam_from_world * branch.axis;
+        branch.across = cam_from_world * branch.across;
+        branches_.push_back(branch);
+    }
+    for (const Bundle &bundle : tube.bundles_) {
+        bundles_.push_back(moved(bundle, cam_from_world, centre));
+    }
+    for (WaterPlane plane : tube.planes_) {
+        plane.level -= plane.normal.dot(centre);
+        plane.right_0 = plane.right.dot(centre);
+        plane.along_0 = plane.along.dot(centre);
+        plane.normal = cam_from_world * plane.normal;
+        plane.right = cam_from_world * plane.right;
+        plane.along = cam_from_world * plane.along;
+        water_.push_back(plane);
+    }
+}
+
+Tube::SegmentRay Tube::View::ray_in(const Walk &walk) const
+{
+    const Local &local = local_[static_cast<size_t>(walk.index)];
+    return {tube_, tube_.segments_[static_cast<size_t>(walk.index)], local.rotation * walk.o + local.offset,
+            local.rotation * walk.d};
+}
+
+// The segment in which the ray is at t, near to the one it is taken for.
+void Tube::View::settle(Walk &walk) const
+{
+    const int last = static_cast<int>(tube_.segments_.size()) - 1;
+    for (int direction = 0; true;) {
+        const SegmentRay ray = ray_in(walk);
+        const Eigen::Vector3d p = ray.o + walk.t * ray.d;
+        if (walk.index < last && direction >= 0 && ray.segment.end_normal.dot(p) > ray.segment.end_offset) {
+            direction = 1;
+        } else if (walk.index > 0 && direction <= 0 && ray.segment.start_normal.dot(p) < 0.0) {
+            direction = -1;
+        } else {
+            return;
+        }
+        walk.index += direction;
+    }
+}
+
+// What the main pipe's wall is at t.
+Hit Tube::View::at(const Walk &walk, const SegmentRay &ray, double t) const
+{
+    const SegmentRay::State st = ray.at(t);
+    const Segment &segment = ray.segment;
+    const Local &local = local_[static_cast<size_t>(walk.index)];
+    Hit hit{t,
+            ray.arc(st),
+            wrap_clock(std::atan2(st.x, -st.y)),
+            -(local.rotation.transpose() * ray.gradient(st, st.g_section, st.g_s)).normalized(),
+            segment.joint >= 0 ? Material::JOINT : Material::WALL,
+            segment.joint >= 0 ? segment.joint : segment.pipe,
+            walk.index};
+    for (const Relief *relief : segment.reliefs) {
+        Height height;
+        if (relief->deposit >= 0) {
+            relief->add(hit.s, hit.clock, height);
+        }
+        if (height.h < -LEAST_DEPOSIT) {
+            hit.material = Material::DEPOSIT;
+            hit.part = relief->deposit;
+        }
+    }
+    return hit;
+}
+
+double Tube::View::water_ahead(const Walk &walk, const Segment &segment) const
+{
+    if (!walk.with_water || segment.water < 0) {
+        return INFINITE;
+    }
+    const WaterPlane &plane = water_[static_cast<size_t>(segment.water)];
+    const double fall = -plane.normal.dot(walk.d), t = (plane.normal.dot(walk.o) - plane.level) / fall;
+    return fall > 0.0 && t >= walk.t ? t : INFINITE;
+}
+
+// From walk.t on in the main pipe to walk.hit. False: lost.
+bool Tube::View::march(Walk &walk) const
+{
+    const double far = 1000.0 * tube_.radius_;
+    const int last = static_cast<int>(tube_.segments_.size()) - 1;
+    while (walk.steps < MAX_STEPS && walk.t < far) {
+        const SegmentRay ray = ray_in(walk);
+        const Segment &segment = ray.segment;
+        int hop = 0;
+        const double t_exit = ray.exit(walk.index<last, walk.index> 0, hop), t_water = water_ahead(walk, segment);
+        if (ray.to_wall(walk.t, std::min(t_exit, t_water), walk.steps)) {
+            walk.hit = at(walk, ray, walk.t);
+            return true;
+        }
+        if (walk.steps >= MAX_STEPS || walk.t >= far) {
+            return false;
+        }
+        if (t_water < t_exit) {
+            SegmentRay::State st{};
+            ray.place(walk.t, st);
+            walk.hit = {walk.t,
+                        ray.arc(st),
+                        wrap_clock(std::atan2(st.x, -st.y)),
+                        water_[static_cast<size_t>(segment.water)].normal,
+                        Material::WATER,
+                        segment.water,
+                        walk.index};
+            return true;
+        }
+        walk.index += hop;
+        const SegmentRay next = ray_in(walk);
+        const bool face = hop > 0 ? next.segment.face : segment.face;
+        const int water = next.segment.water;
+        const Eigen::Vector3d plane = hop > 0 ? segment.end_normal : Eigen::Vector3d(-segment.start_normal);
+        const Local &local = local_[static_cast<size_t>(walk.index - hop)];
+        if (face && next.at(walk.t).g > -NEAR && !next.at(walk.t).inner) {
+            walk.hit = at(walk, next, walk.t);
+            walk.hit.normal = -(local.rotation.transpose() * plane);
+            walk.hit.material = Material::JOINT;
+            walk.hit.part = next.segment.joint >= 0 ? next.segment.joint : segment.joint;
+            walk.hit.part = walk.hit.part >= 0 ? walk.hit.part : std::min(segment.pipe, next.segment.pipe);
+            return true;
+        }
+        if (walk.with_water && water >= 0 && water != segment.water) {
+            const WaterPlane &surface = water_[static_cast<size_t>(water)];
+            if (surface.normal.dot(walk.o + walk.t * walk.d) < surface.level) { // the end of a stretch, from its side
+                walk.hit = at(walk, next, walk.t);
+                walk.hit.normal = -(local.rotation.transpose() * plane);
+                walk.hit.material = Material::WATER;
+                walk.hit.part = water;
+                return true;
+            }
+        }
+    }
+    return false;
+}
+
+// Is the hit on the main wall, or on an opening's, inside another opening? walk.branch or walk.crack says in which.
+bool Tube::View::in_opening(Walk &walk) const
+{
+    if (walk.hit.material == Material::WATER) {
+        return false;
+    }
+    const Segment &segment = tube_.segments_[static_cast<size_t>(walk.index)];
+    for (const int i : segment.branches) {
+        const Branch &b = branches_[static_cast<size_t>(i)];
+        const Eigen::Vector3d p = walk.o + walk.t * walk.d - b.origin;
+        const double along = p.dot(b.axis);
+        if (along > 0.0 && along < b.length * (1.0 - 1e-9) &&
+            (p - along * b.axis).squaredNorm() < b.radius * b.radius * (1.0 - 1e-9)) {
+            walk.branch = i;
+            return true;
+        }
+    }
+    if (segment.cracks.empty()) {
+        return false;
+    }
+    const SegmentRay ray = ray_in(walk);
+    SegmentRay::State st{};
+    ray.place(walk.t, st);
+    const double s = ray.arc(st), clock = wrap_clock(std::atan2(st.x, -st.y)), tiny = 1e-9 * tube_.radius_;
+    const double behind = std::hypot(st.x, st.y) - tube_.radius_at(segment, s, clock);
+    for (const int i : segment.cracks) {
+        const CrackPath &crack = tube_.cracks_[static_cast<size_t>(i)];
+        if (behind > -tiny && behind < crack.depth() - tiny &&
+            crack.distance(s, clock, crack.half_width()) < crack.half_width() - tiny) {
+            walk.crack = i;
+            return true;
+        }
+    }
+    return false;
+}
+
+// At the end of an opening: solid, or in the main pipe again.
+Tube::View::After Tube::View::after(Walk &walk) const
+{
+    settle(walk);
+    const SegmentRay::State st = ray_in(walk).at(walk.t);
+    return st.inner || st.g < -1e-9 ? After::MAIN : After::SOLID;
+}
+
+Tube::View::After Tube::View::leave_branch(Walk &walk) const
+{
+    const Branch &b = branches_[static_cast<size_t>(walk.branch)];
+    walk.branch = -1;
+    const Eigen::Vector3d p = walk.o - b.origin;
+    const double y = p.dot(b.axis), dy = walk.d.dot(b.axis);
+    const Eigen::Vector3d q = p - y * b.axis, dq = walk.d - dy * b.axis;
+    const double a = dq.squaredNorm(), half = q.dot(dq);
+    const double side =
+        (-half + std::sqrt(std::max(0.0, half * half - a * (q.squaredNorm() - b.radius * b.radius)))) / a;
+    const double cap = dy > 0.0 ? (b.length - y) / dy : dy < 0.0 ? -y / dy : INFINITE;
+    const bool capped = !(side < cap);
+    walk.t = std::max(walk.t, capped ? cap : side);
+    const Eigen::Vector3d r = (q + walk.t * dq).normalized();
+    walk.hit.t = walk.t;
+    walk.hit.s = y + walk.t * dy;
+    walk.hit.clock = wrap_clock(std::atan2(r.dot(b.axis.cross(b.across)), r.dot(b.across)));
+    walk.hit.normal = capped ? Eigen::Vector3d(-b.axis) : Eigen::Vector3d(-r);
+    walk.hit.material = b.material;
+    walk.hit.part = b.part;
+    const After then = after(walk);
+    walk.hit.segment = walk.index;
+    return then;
+}
+
+// Inside a crack: to its side, its floor, or back into the main pipe. The distance d from the path of a ray's place
+// grows at most by its speed; above a quarter of the half width w its second derivative stays below 4 speed^2 / w and
+// the place's own acceleration.
+Tube::View::After Tube::View::leave_crack(Walk &walk) const
+{
+    const CrackPath &crack = tube_.cracks_[static_cast<size_t>(walk.crack)];
+    const int last = static_cast<int>(tube_.segments_.size()) - 1;
+    const double w = crack.half_width(), radius = tube_.radius_, tiny = 1e-10 * radius;
+    const int part = walk.crack;
+    walk.crack = -1;
+    for (int steps = 0; true; steps++) {
+        const SegmentRay ray = ray_in(walk);
+        const Local &local = local_[static_cast<size_t>(walk.index)];
+        SegmentRay::State st{};
+        ray.place(walk.t, st);
+        ray.wall_with_reliefs(st, crack.depth());
+        if (st.inner || st.g < -(crack.depth() + 1e-9 * radius) * 2.0 / radius) {
+            return After::MAIN;
+        }
+        const double floor_rate = st.g_section.x() * st.vx + st.g_section.y() * st.vy + st.g_s * st.vs;
+        const double s = ray.arc(st), rho2 = st.rho * st.rho;
+        const double turn = (st.vy * st.x - st.vx * st.y) / rho2 * radius;
+        double by_s = 0.0, by_arc = 0.0;
+        const double d = crack.distance(s, st.clock, 4.0 * w, &by_s, &by_arc);
+        const bool side = d > w - tiny || steps > 1000, ground = st.g * 0.5 * radius > -tiny;
+        if (side || ground) {
+            const Eigen::Vector2d clockwise(-st.y / rho2 * radius, st.x / rho2 * radius);
+            const Eigen::Vector3d normal =
+                ground ? ray.gradient(st, st.g_section, st.g_s) : ray.gradient(st, by_arc * clockwise, by_s);
+            walk.hit = {walk.t,          s,    st.clock,  -(local.rotation.transpose() * normal).normalized(),
+                        Material::CRACK, part, walk.index};
+            return After::SOLID;
+        }
+        const double bent = ray.bend() ? 4.0 / ray.segment.curvature_radius * (1.0 + radius / st.rho) : 0.0;
+        const double speed = std::hypot(st.vs, turn), pull = 4.0 * radius / rho2 + bent;
+        double h = safe_step(d - w, speed, pull);
+        if (d > 0.25 * w) {
+            h = std::max(h, safe_step(d - w, by_s * st.vs + by_arc * turn, pull + 4.0 * speed * speed / w));
+        }
+        h = std::min({h, safe_step(st.g, floor_rate, ray.relief_bound()), 0.3 * ray.segment.inner});
+        int hop = 0;
+        const double t_exit = ray.exit(walk.index<last, walk.index> 0, hop);
+        if (walk.t + h < t_exit) {
+            walk.t += h;
+            continue;
+        }
+        walk.t = std::max(walk.t, t_exit);
+        walk.index += hop;
+        const SegmentRay next = ray_in(walk);
+        SegmentRay::State beyond{};
+        next.place(walk.t, beyond);
+        next.wall_with_reliefs(beyond, crack.depth());
+        if (!beyond.inner && beyond.g * 0.5 * radius > -tiny) { // the next pipe's solid face
+            const Eigen::Vector3d plane = hop > 0 ? ray.segment.end_normal : Eigen::Vector3d(-ray.segment.start_normal);
+            walk.hit = {walk.t, s, st.clock, -(local.rotation.transpose() * plane), Material::CRACK, part, walk.index};
+            return After::SOLID;
+        }
+    }
+}
+
+bool Tube::View::roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Hit &hit) const
+{
+    bool found = false;
+    for (size_t i = 0; i < bundles_.size(); i++) {
+        double t = 0.0;
+        Eigen::Vector3d normal;
+        if (hit_bundle(bundles_[i], o, d, hit.t, 0.0, t, normal)) {
+            const Root &root = tube_.roots_[i];
+            hit = {t, root.s, root.clock, normal, Material::ROOT, static_cast<int>(i), hit.segment};
+            found = true;
+        }
+    }
+    return found;
+}
+
+bool Tube::View::trace(const Eigen::Vector3d &o, const Eigen::Vector3d &d, int start, bool with_water, Hit &hit) const
+{
+    constexpr int MAX_OPENINGS = 32;
+    if (start < 0) {
+        return false;
+    }
+    Walk walk;
+    walk.o = o;
+    walk.d = d;
+    walk.index = start;
+    walk.with_water = with_water;
+    settle(walk);
+    const SegmentRay::State st = ray_in(walk).at(0.0);
+    if ((!st.inner && st.g >= 0.0) || !march(walk)) {
+        return false;
+    }
+    for (int i = 0; i < MAX_OPENINGS && in_opening(walk); i++) {
+        const After then = walk.branch >= 0 ? leave_branch(walk) : leave_crack(walk);
+        if (then == After::MAIN && !march(walk)) {
+            return false;
+        }
+    }
+    hit = walk.hit;
+    roots_before(o, d, hit);
+    return true;
+}
+
+bool Tube::View::cast(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, Hit &hit) const
+{
+    return trace(origin, direction, start_, true, hit);
+}
+
+bool Tube::View::see(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, Sight &sight) const
+{
+    if (!trace(origin, direction, start_, true, sight.first)) {
+        return false;
+    }
+    sight.mirrors = false;
+    if (sight.first.material == Material::WATER) {
+        sight.origin = origin + sight.first.t * direction;
+        mirror(direction, sight);
+    }
+    return true;
+}
+
+// Ripples: four waves that run along the flow, a little across each other, as slopes of the surface. Fresnel's
+// equations, the mean of both polarisations.
+void Tube::View::mirror(const Eigen::Vector3d &d, Sight &sight) const
+{
+    constexpr int WAVES = 4;
+    const size_t i = static_cast<size_t>(sight.first.part);
+    const Water &water = tube_.water_[i];
+    const WaterPlane &plane = water_[i];
+    const double right = plane.right.dot(sight.origin) + plane.right_0;
+    const double along = plane.along.dot(sight.origin) + plane.along_0;
+    Eigen::Vector3d normal = sight.first.normal;
+    for (int k = 0; k < WAVES; k++) {
+        const auto random = [&](uint64_t what) {
+            return uniform_of(hash64(water.seed, STREAM_RIPPLE, static_cast<uint64_t>(k), what));
+        };
+        const double length = water.ripple_length * std::pow(0.62, k), angle = 1.6 * (random(0) - 0.5);
+        const double phase =
+            TWO_PI *
+            ((along * std::cos(angle) + right * std::sin(angle) - water.velocity * seconds_) / length + random(1));
+        const double slope = water.ripple / WAVES * std::cos(phase);
+        normal += slope * (std::cos(angle) * plane.along + std::sin(angle) * plane.right);
+    }
+    normal.normalize();
+    if (d.dot(normal) > -1e-3 || (d - 2.0 * d.dot(normal) * normal).dot(sight.first.normal) < 1e-3) {
+        normal = sight.first.normal; // so flat that the ripple would hide itself
+    }
+    sight.first.normal = normal;
+    const double c = -d.dot(normal), n = water.refraction, inside = std::sqrt(1.0 - (1.0 - c * c) / (n * n));
+    const double across = (c - n * inside) / (c + n * inside), within = (n * c - inside) / (n * c + inside);
+    sight.mirrored = 0.5 * (across * across + within * within);
+    sight.direction = d + 2.0 * c * normal;
+    sight.mirrors = trace(sight.origin, sight.direction, sight.first.segment, false, sight.second);
+}
+
+bool Tube::View::blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to) const
+{
+    const double distance = (to - from).norm();
+    Hit hit{};
+    return !trace(from, (to - from) / distance, start_, true, hit) || hit.t < distance * (1.0 - 1e-6);
+}
+
+bool Tube::View::thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, const Hit &hit,
+                           double pixel) const
+{
+    for (const Bundle &bundle : bundles_) {
+        double t = 0.0;
+        Eigen::Vector3d normal;
+        if (hit_bundle(bundle, origin, direction, hit.t, 0.75 * pixel, t, normal)) {
+            return true;
+        }
+    }
+    if (hit.material > Material::DEPOSIT) {
+        return false;
+    }
+    const size_t index = static_cast<size_t>(hit.segment);
+    const Segment &segment = tube_.segments_[index];
+    const double reach = 0.75 * pixel * hit.t / std::max(0.02, -hit.normal.dot(direction));
+    const bool next = index + 1 < tube_.segments_.size() && tube_.segments_[index + 1].face;
+    if ((segment.face && hit.s - segment.s0 < reach) || (next && segment.s0 + segment.length - hit.s < reach)) {
+        return true;
+    }
+    for (const int i : segment.branches) {
+        const Branch &b = branches_[static_cast<size_t>(i)];
+        const Eigen::Vector3d p = origin + hit.t * direction - b.origin;
+        if (p.dot(b.axis) > 0.0 && (p - p.dot(b.axis) * b.axis).norm() < b.radius + reach) {
+            return true;
+        }
+    }
+    return std::ranges::any_of(segment.cracks, [&](int i) {
+        const CrackPath &crack = tube_.cracks_[static_cast<size_t>(i)];
+        return crack.distance(hit.s, hit.clock, crack.half_width() + reach) < INFINITE;
+    });
+}
+
+} // namespace pipefish::sim
