@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from pipefish import __version__, _engine
 from pipefish.errors import ArgumentError, FormatError, PipefishError
 from pipefish.progress import track
+from pipefish.wallgrid import with_wall_grid
 
 TRUTH_FORMAT = "pipefish-truth"
 TRUTH_VERSION = 1
@@ -42,6 +44,25 @@ PRESETS: dict[str, dict[str, Any]] = {
         "motion": {"frames": 20, "metres_per_count": 0.0005},
     },
 }
+
+
+MATERIALS = ("wall", "joint", "deposit", "hole", "crack", "lateral", "root", "water")
+_KINDS = ("egg", "corrugation", "deposit", "hole", "crack", "lateral", "root")
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What N pixels see; rows with ok false hold NaN and -1. World frame, metres, radians."""
+
+    ok: np.ndarray
+    point: np.ndarray  # (N, 3)
+    normal: np.ndarray  # (N, 3), unit, towards the camera's side
+    s: np.ndarray  # along the centreline; in a lateral or hole along its own axis; of a root its base
+    clock: np.ndarray  # in a lateral or hole around its own axis
+    material: np.ndarray  # index in MATERIALS
+    part: np.ndarray  # index in the scene's list of that kind; of the wall: how many joints lie before it
+    mirrored_point: np.ndarray  # (N, 3): what water shows there, else NaN
+    mirrored: np.ndarray  # share of the light that the water mirrors
 
 
 def presets() -> list[str]:
@@ -73,6 +94,7 @@ class Scene:
         """
         if not isinstance(scene, dict):
             raise FormatError(source, None, "a scene must be an object")
+        scene = with_wall_grid(scene, source)
         try:
             self._scene = _engine.Scene(scene)
         except ValueError as error:
@@ -160,6 +182,25 @@ class Scene:
         """(N, 3) world points -> (N, 2) pixels, (N,) ok (false beyond the field; what is in between is not asked)."""
         return self._scene.project(frame, _points(points, 3))
 
+    def visible(self, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As project(), but ok is false also where something stands between camera and point."""
+        return self._scene.visible(frame, _points(points, 3))
+
+    def flow(self, frame_a: int, frame_b: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where what `pixels` (N, 2) of frame a show is in frame b: (N, 2), (N,) ok.
+
+        ok is false where it is hidden or outside the picture in b, and on water.
+        """
+        return self._scene.flow(frame_a, frame_b, _points(pixels, 2))
+
+    def sights(self, frame: int, pixels: np.ndarray) -> Sights:
+        """Everything about what `pixels` (N, 2) see."""
+        rows, ok = self._scene.sights(frame, _points(pixels, 2))
+        material, part = (np.where(ok, rows[:, k], -1).astype(int) for k in (8, 9))
+        return Sights(
+            ok, rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7], material, part, rows[:, 10:13], rows[:, 13]
+        )
+
     def locate(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle; NaN far outside the pipe."""
         return self._scene.locate(_points(points, 3))[0]
@@ -168,8 +209,34 @@ class Scene:
         """The wall point at arc length s and clock angle phi, (3,)."""
         return self._scene.wall(s, phi)
 
+    def wall_radius(self, s: float, phi: float) -> float:
+        """From the axis to the wall at arc length s and clock angle phi, metres: section, reliefs, grooves, cracks."""
+        return self._scene.wall_radius(s, phi)
+
+    def outline(self, s: float, points: int = 360) -> np.ndarray:
+        """The section's wall at arc length s as a polygon (points, 2): right and down of the axis, metres."""
+        phi = np.arange(points) * (2 * np.pi / points)
+        radius = np.array([self.wall_radius(s, p) for p in phi])
+        return np.column_stack([radius * np.sin(phi), -radius * np.cos(phi)])
+
+    def events(self) -> list[dict[str, Any]]:
+        """What is in the pipe, in order of arc length: kind, index in its list, s, clock (if it has one), its sizes."""
+        spec = self.spec
+        lists = {"joint": self._scene.joints} | {kind: spec[kind + "s"] for kind in _KINDS} | {"water": spec["water"]}
+        events = []
+        for kind, items in lists.items():
+            for index, item in enumerate(items):
+                event = {"kind": kind, "index": index} | {k: v for k, v in item.items() if k not in ("seed", "path")}
+                if kind == "crack":
+                    path = [list(p) for p in self._scene.crack_path(index)]
+                    event |= {"s": path[0][0], "clock": path[0][1] % (2 * math.pi), "path": path}
+                elif kind in ("egg", "corrugation", "water"):
+                    event["s"] = max(0.0, item["start"])
+                events.append(event)
+        return sorted(events, key=lambda event: event["s"])
+
     def section(self, s: float) -> tuple[float, float, float]:
-        """D_max and D_min in metres, clock angle of D_max, at arc length s."""
+        """D_max and D_min in metres, clock angle of D_max, of the ellipse at arc length s (outline() has the rest)."""
         return self._scene.section(s)
 
     def lens(self) -> dict[str, list[float]]:
@@ -219,6 +286,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
         "software": f"pipefish {__version__}",
         "scene": scene.spec,
         "pipe_length_m": scene.length,
+        "events": scene.events(),
         "lens": scene.lens(),
         "pose_columns": ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven"],
         "poses": poses,

@@ -19,17 +19,19 @@ namespace
 constexpr int BAND = 8; // rows a work item
 
 // Adds a small lamp at (lx, ly, 0): its intensity towards the wall point, Lambert's cosine, over the squared distance.
-void add_lamp(const RowHits &row, std::vector<float> &light, float lx, float ly, float side, float forward)
+void add_lamp(const RowPoints &row, const std::vector<float> &lit, std::vector<float> &light, float lx, float ly,
+              float side, float forward)
 {
     const size_t n = light.size();
     const float *const x = row.x.data(), *const y = row.y.data(), *const z = row.z.data();
     const float *const nx = row.nx.data(), *const ny = row.ny.data(), *const nz = row.nz.data();
+    const float *const share = lit.data();
     float *const sum = light.data();
     for (size_t i = 0; i < n; i++) {
         const float dx = lx - x[i], dy = ly - y[i], dz = -z[i];
         const float d2 = dx * dx + dy * dy + dz * dz, ahead = std::max(z[i], 0.0f);
         const float along = dx * nx[i] + dy * ny[i] + dz * nz[i];
-        sum[i] += (side + forward * ahead * ahead / d2) * std::max(along, 0.0f) / (d2 * std::sqrt(d2));
+        sum[i] += share[i] * (side + forward * ahead * ahead / d2) * std::max(along, 0.0f) / (d2 * std::sqrt(d2));
     }
 }
 
@@ -70,30 +72,44 @@ void Scene::render(int frame, int threads, uint8_t *out)
     };
     surface_->prepare(f.s - reach_.behind, f.s + reach_.ahead, threads);
     const Tube::View view = this->view(frame);
-    each_row([&](int y) {
-        const RowHits hits = cast_row(view, y, *buffers_);
-        light_row(y, hits, *buffers_);
-    });
+    each_row([&](int y) { cast_row(view, y, *buffers_); });
+    each_row([&](int y) { light_row(view, y, *buffers_); });
     each_row([&](int y) { shade_row(y, *buffers_); });
     each_row([&](int y) { develop_row(frame, y, *buffers_, out); });
 }
 
-// Light on a row's wall points, from a white wall.
-void Scene::light_row(int row, const RowHits &hits, Buffers &buffers) const
+// Light on a row's wall points, from a white wall, and the grey levels of what has no texture.
+void Scene::light_row(const Tube::View &view, int row, Buffers &buffers) const
 {
-    const size_t first = row_offset_[static_cast<size_t>(row)], n = hits.x.size();
+    const RowPoints points = gather_row(view, row, buffers);
+    const size_t first = row_offset_[static_cast<size_t>(row)], n = points.x.size();
     const LampSpec &lamp = spec_.lamp;
-    std::vector<float> sum(n, 0.0f);
+    std::vector<float> sum(n, 0.0f), lit(n, 1.0f);
     for (int k = 0; k < lamp.lamps; k++) {
         const double angle = 2.0 * std::numbers::pi * k / lamp.lamps;
-        add_lamp(hits, sum, static_cast<float>(lamp.ring_radius * std::sin(angle)),
-                 static_cast<float>(-lamp.ring_radius * std::cos(angle)), static_cast<float>(lamp.side),
-                 static_cast<float>(lamp.forward));
+        const float x = static_cast<float>(lamp.ring_radius * std::sin(angle));
+        const float y = static_cast<float>(-lamp.ring_radius * std::cos(angle));
+        for (size_t i = 0; i < n; i++) {
+            const RowPoints::Shadow shadow = points.shadow[i];
+            // Of a divided pixel's points each asks a quarter of the lamps, for all of them.
+            const bool asked = shadow != RowPoints::QUARTER || (i + static_cast<size_t>(k)) % 4 == 0;
+            if (shadow != RowPoints::NONE) {
+                const bool dark = !asked || view.blocked({x, y, 0.0}, {points.x[i], points.y[i], points.z[i]},
+                                                         shadow == RowPoints::ROOTS);
+                lit[i] = dark ? 0.0f : shadow == RowPoints::QUARTER ? 4.0f : 1.0f;
+            }
+        }
+        add_lamp(points, lit, sum, x, y, static_cast<float>(lamp.side), static_cast<float>(lamp.forward));
     }
     const double radius = 0.5 * spec_.diameter;
     const float exposure = static_cast<float>(lamp.exposure * radius * radius / lamp.lamps);
+    const size_t width = static_cast<size_t>(row_to_[static_cast<size_t>(row)] - row_from_[static_cast<size_t>(row)]);
+    std::fill_n(buffers.light.begin() + static_cast<std::ptrdiff_t>(first), width, 0.0f);
+    std::fill_n(buffers.plain.begin() + static_cast<std::ptrdiff_t>(first), width, 0.0f);
     for (size_t i = 0; i < n; i++) {
-        buffers.light[first + i] = exposure * sum[i] * vignette_[first + i];
+        const size_t at = first + points.pixel[i];
+        buffers.light[at] += exposure * sum[i] * vignette_[at] * points.textured[i];
+        buffers.plain[at] += exposure * sum[i] * vignette_[at] * points.plain[i];
     }
 }
 
@@ -127,8 +143,9 @@ void Scene::shade_row(int row, Buffers &buffers) const
         spread(right, left, static_cast<float>((right != own) + (left != own)), along, across);
         spread(below, above, static_cast<float>((below != own) + (above != own)), along, across);
         line[static_cast<size_t>(x)] =
-            buffers.light[own] *
-            surface_->sample(buffers.texel_row[own], buffers.texel_column[own], std::sqrt(along), std::sqrt(across));
+            buffers.plain[own] + buffers.light[own] * surface_->sample(buffers.texel_row[own],
+                                                                       buffers.texel_column[own], std::sqrt(along),
+                                                                       std::sqrt(across));
     }
     const int reach = static_cast<int>(blur_.size()) - 1;
     float *const out = buffers.image.data() + at * static_cast<size_t>(width);

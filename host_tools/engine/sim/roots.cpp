@@ -13,11 +13,31 @@ namespace pipefish::sim
 namespace
 {
 
-constexpr int NODES = 10;                                     // cones a strand
+constexpr int NODES = static_cast<int>(Bundle::STRAND);       // cones a strand
 constexpr double THINNEST = 0.2;                              // of a strand's diameter, at its end
 constexpr double GRAVITY = 0.12;                              // pull on the direction, a cone
 constexpr double RESTLESS = 0.28;                             // random change of direction, a cone
 constexpr double BRANCH_LENGTH = 0.45, BRANCH_DIAMETER = 0.5; // of its strand's
+
+Ball ball_around(const std::vector<RoundCone> &cones, size_t from, size_t to)
+{
+    Eigen::Vector3d low = cones[from].a, high = low;
+    double thickest = 0.0;
+    for (size_t i = from; i < to; i++) {
+        low = low.cwiseMin(cones[i].a).cwiseMin(cones[i].b);
+        high = high.cwiseMax(cones[i].a).cwiseMax(cones[i].b);
+        thickest = std::max({thickest, cones[i].radius_a, cones[i].radius_b});
+    }
+    return {0.5 * (low + high), 0.5 * (high - low).norm() + thickest};
+}
+
+// May the ray touch what is in the ball, all radii being `grow` metres larger a metre of the way?
+bool near_ball(const Ball &ball, const Eigen::Vector3d &o, const Eigen::Vector3d &d, double t_max, double grow)
+{
+    const Eigen::Vector3d to = ball.centre - o;
+    const double along = to.dot(d), reach = ball.radius + grow * std::max(0.0, along + ball.radius);
+    return along > -reach && along < t_max + reach && (to - along * d).squaredNorm() < reach * reach;
+}
 
 struct Grower {
     const Root &spec;
@@ -35,6 +55,12 @@ struct Grower {
 
     void strand(Eigen::Vector3d at, Eigen::Vector3d direction, double length, double diameter, int branches)
     {
+        struct Twig {
+            Eigen::Vector3d at, direction;
+            double diameter;
+        };
+        std::vector<Twig> twigs;
+        int done = 0;
         for (int i = 0; i < NODES; i++) {
             const auto radius_at = [&](int k) { return 0.5 * diameter * (1.0 - (1.0 - THINNEST) * k / NODES); };
             direction = (direction + GRAVITY * down + RESTLESS * random_vector()).normalized();
@@ -42,12 +68,13 @@ struct Grower {
             out.push_back({at, next, radius_at(i), radius_at(i + 1)});
             at = next;
             // Branches leave at the cones between a fifth and nine tenths of the strand, spread evenly.
-            const int due = branches * std::max(0, i - 1) / (NODES - 2),
-                      done = branches * std::max(0, i - 2) / (NODES - 2);
-            for (int k = done; k < due; k++) {
-                strand(at, (direction + 0.9 * random_vector()).normalized(), length * BRANCH_LENGTH,
-                       2.0 * radius_at(i) * BRANCH_DIAMETER, 0);
+            const int due = branches * std::max(0, i - 1) / (NODES - 2);
+            for (; done < due; done++) {
+                twigs.push_back({at, (direction + 0.9 * random_vector()).normalized(), 2.0 * radius_at(i)});
             }
+        }
+        for (const Twig &twig : twigs) {
+            strand(twig.at, twig.direction, length * BRANCH_LENGTH, twig.diameter * BRANCH_DIAMETER, 0);
         }
     }
 };
@@ -106,20 +133,20 @@ Bundle grow_roots(const Root &spec, const Eigen::Vector3d &base, const Eigen::Ve
         const Eigen::Vector3d start = base - spec.diameter * inward + 2.0 * spec.diameter * aside;
         grower.strand(start, (inward + aside).normalized(), spec.length * share, spec.diameter * share, spec.branches);
     }
-    Eigen::Vector3d low = bundle.cones[0].a, high = low;
-    for (const RoundCone &c : bundle.cones) {
-        low = low.cwiseMin(c.a).cwiseMin(c.b);
-        high = high.cwiseMax(c.a).cwiseMax(c.b);
+    for (size_t i = 0; i < bundle.cones.size(); i += Bundle::STRAND) {
+        bundle.strands.push_back(ball_around(bundle.cones, i, i + Bundle::STRAND));
     }
-    bundle.centre = 0.5 * (low + high);
-    bundle.radius = 0.5 * (high - low).norm() + spec.diameter;
+    bundle.all = ball_around(bundle.cones, 0, bundle.cones.size());
     return bundle;
 }
 
 Bundle moved(const Bundle &bundle, const Eigen::Matrix3d &rotation, const Eigen::Vector3d &origin)
 {
     Bundle out = bundle;
-    out.centre = rotation * (bundle.centre - origin);
+    out.all.centre = rotation * (bundle.all.centre - origin);
+    for (Ball &ball : out.strands) {
+        ball.centre = rotation * (ball.centre - origin);
+    }
     for (RoundCone &c : out.cones) {
         c.a = rotation * (c.a - origin);
         c.b = rotation * (c.b - origin);
@@ -131,21 +158,24 @@ bool hit_bundle(const Bundle &bundle, const Eigen::Vector3d &origin, const Eigen
                 double grow, double &t, Eigen::Vector3d &normal)
 {
     // Does the ray pass within `reach` of the segment from a to b? Only then a cone is worth its square roots.
-    const Eigen::Vector3d to_all = bundle.centre - origin;
-    const double along_all = to_all.dot(direction), reach_all = bundle.radius + grow * (along_all + bundle.radius);
-    if (along_all < -bundle.radius || (to_all - along_all * direction).squaredNorm() > reach_all * reach_all) {
+    if (!near_ball(bundle.all, origin, direction, t_max, grow)) {
         return false;
     }
     bool found = false;
     double best = t_max;
-    for (const RoundCone &cone : bundle.cones) {
+    for (size_t i = 0; i < bundle.cones.size(); i++) {
+        if (i % Bundle::STRAND == 0 && !near_ball(bundle.strands[i / Bundle::STRAND], origin, direction, best, grow)) {
+            i += Bundle::STRAND - 1;
+            continue;
+        }
+        const RoundCone &cone = bundle.cones[i];
         const Eigen::Vector3d to = 0.5 * (cone.a + cone.b) - origin;
         const double along = to.dot(direction), more = grow * std::max(along, 0.0);
-        const double reach = 0.5 * (cone.b - cone.a).norm() + std::max(cone.radius_a, cone.radius_b) + more;
-        if ((to - along * direction).squaredNorm() < reach * reach) {
-            const RoundCone wide{cone.a, cone.b, cone.radius_a + more, cone.radius_b + more};
-            hit_cone(grow > 0.0 ? wide : cone, origin, direction, best, normal, found);
+        const double thick = std::max(cone.radius_a, cone.radius_b) + more;
+        if ((to - along * direction).squaredNorm() > 0.5 * (cone.b - cone.a).squaredNorm() + 2.0 * thick * thick) {
+            continue; // (half a length + radius)^2 is less
         }
+        hit_cone({cone.a, cone.b, cone.radius_a + more, cone.radius_b + more}, origin, direction, best, normal, found);
     }
     t = best;
     return found;

@@ -15,10 +15,16 @@ struct RoundCone {
     double radius_a, radius_b;
 };
 
-struct Bundle {
-    std::vector<RoundCone> cones;
-    Eigen::Vector3d centre; // of a sphere around them all
+struct Ball { // around something
+    Eigen::Vector3d centre;
     double radius;
+};
+
+struct Bundle {
+    static constexpr size_t STRAND = 10; // cones
+    std::vector<RoundCone> cones;        // strand by strand
+    std::vector<Ball> strands;
+    Ball all;
 };
 
 // Grows a bundle from `base` along the unit vector `inward`, bending towards `down`.

@@ -49,7 +49,7 @@ struct Seen {
     Eigen::Vector3d point, normal, mirrored; // world; `mirrored` if sight.mirrors
 };
 
-struct RowHits;
+struct RowPoints;
 
 class Scene
 {
@@ -94,8 +94,12 @@ private:
     void prepare(); // what only drawing needs, at the first frame
     void make_pixel_table();
     void make_blur_kernel();
-    RowHits cast_row(const Tube::View &view, int row, Buffers &buffers) const;
-    void light_row(int row, const RowHits &hits, Buffers &buffers) const;
+    void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
+    RowPoints gather_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void add_point(const Tube::View &view, const PixelRay &r, const Hit &hit, float weight, uint32_t pixel,
+                   RowPoints &out) const;
+    void place_texel(const Hit &hit, size_t pixel, Buffers &buffers) const;
+    void light_row(const Tube::View &view, int row, Buffers &buffers) const;
     void shade_row(int row, Buffers &buffers) const;
     void develop_row(int frame, int row, const Buffers &buffers, uint8_t *out) const;
 

@@ -38,18 +38,21 @@ double safe_step(double value, double rate, double bound)
 
 } // namespace
 
+// A place on a ray, in its segment.
+struct Tube::RayState {
+    double x, y, u, z, q;      // (right, down) in the section; in a bend u, z and q = hypot(u, z)
+    double vx, vy, vs;         // their rates along the ray, and the arc length's
+    double rho, clock;         // where the segment has reliefs
+    bool inner;                // so near to the axis that no wall can be; g is then that of the cylinder around it
+    double g, rate;            // the wall's function and its derivative along the ray
+    Eigen::Vector2d g_section; // gradient of g by (right, down)
+    double g_s;                // and by the arc length
+};
+
 // A ray in a segment's frame. In a bend, the plane of the centreline and the direction across it: u points from the
 // bend's centre to the segment's start, z along the start's tangent, w across.
 struct Tube::SegmentRay {
-    struct State {
-        double x, y, u, z, q;      // (right, down) in the section; in a bend u, z and q = hypot(u, z)
-        double vx, vy, vs;         // their rates along the ray, and the arc length's
-        double rho, clock;         // where the segment has reliefs
-        bool inner;                // so near to the axis that no wall can be; g is then that of the cylinder around it
-        double g, rate;            // the wall's function and its derivative along the ray
-        Eigen::Vector2d g_section; // gradient of g by (right, down)
-        double g_s;                // and by the arc length
-    };
+    using State = RayState;
 
     const Tube &tube;
     const Segment &segment;
@@ -182,7 +185,8 @@ struct Tube::SegmentRay {
         st.rho = std::sqrt(rho2);
         st.clock = wrap_clock(std::atan2(st.x, -st.y));
         Height wall;
-        const double scale = 2.0 / tube.radius_, r = tube.radius_at(segment, arc(st), st.clock, &wall);
+        const double scale = 2.0 / tube.radius_,
+                     r = tube.radius_at(segment, arc(st), st.clock, st.x / st.rho, st.y / st.rho, wall);
         const double turn = wall.by_phi / rho2;
         st.g = scale * (st.rho - r - deeper);
         st.g_section = {scale * (st.x / st.rho + turn * st.y), scale * (st.y / st.rho - turn * st.x)};
@@ -214,13 +218,13 @@ struct Tube::SegmentRay {
     // like Newton's method. On a straight segment of constant section K is exact and the first step lands on the wall.
     // Reliefs: the same, first up to the cylinder inside which there is no wall, from there with their own bound, in
     // steps that keep 0.7 of its radius away from the axis. Returns true at the wall.
-    bool to_wall(double &t, double limit, int &steps) const
+    bool to_wall(double &t, double limit, int &steps, State &st) const
     {
         const double inner_bound = detailed() ? ellipse_bound(1.0 / segment.inner, 0.0, 0.0)
                                               : ellipse_bound(segment.inverse_axis, segment.slope, segment.curvature);
         const double bound = detailed() ? relief_bound() : inner_bound, longest = 0.3 * segment.inner;
         for (; steps < MAX_STEPS; steps++) {
-            const State st = at(t);
+            st = at(t);
             if (!st.inner && st.g > -NEAR) {
                 return true;
             }
@@ -303,30 +307,28 @@ void Tube::View::settle(Walk &walk) const
     }
 }
 
-// What the main pipe's wall is at t.
-Hit Tube::View::at(const Walk &walk, const SegmentRay &ray, double t) const
+// walk.hit is the main pipe's wall at walk.t, where `st` is.
+void Tube::View::set_wall_hit(Walk &walk, const SegmentRay &ray, const RayState &st) const
 {
-    const SegmentRay::State st = ray.at(t);
     const Segment &segment = ray.segment;
     const Local &local = local_[static_cast<size_t>(walk.index)];
-    Hit hit{t,
-            ray.arc(st),
-            wrap_clock(std::atan2(st.x, -st.y)),
-            -(local.rotation.transpose() * ray.gradient(st, st.g_section, st.g_s)).normalized(),
-            segment.joint >= 0 ? Material::JOINT : Material::WALL,
-            segment.joint >= 0 ? segment.joint : segment.pipe,
-            walk.index};
+    walk.hit = {walk.t,
+                ray.arc(st),
+                wrap_clock(std::atan2(st.x, -st.y)),
+                -(local.rotation.transpose() * ray.gradient(st, st.g_section, st.g_s)).normalized(),
+                segment.joint >= 0 ? Material::JOINT : Material::WALL,
+                segment.joint >= 0 ? segment.joint : segment.pipe,
+                walk.index};
     for (const Relief *relief : segment.reliefs) {
         Height height;
         if (relief->deposit >= 0) {
-            relief->add(hit.s, hit.clock, height);
+            relief->add(walk.hit.s, walk.hit.clock, height);
         }
         if (height.h < -LEAST_DEPOSIT) {
-            hit.material = Material::DEPOSIT;
-            hit.part = relief->deposit;
+            walk.hit.material = Material::DEPOSIT;
+            walk.hit.part = relief->deposit;
         }
     }
-    return hit;
 }
 
 double Tube::View::water_ahead(const Walk &walk, const Segment &segment) const
@@ -339,6 +341,12 @@ double Tube::View::water_ahead(const Walk &walk, const Segment &segment) const
     return fall > 0.0 && t >= walk.t ? t : INFINITE;
 }
 
+bool Tube::View::under(const Walk &walk, int water) const
+{
+    const WaterPlane &plane = water_[static_cast<size_t>(water)];
+    return plane.normal.dot(walk.o + walk.t * walk.d) < plane.level;
+}
+
 // From walk.t on in the main pipe to walk.hit. False: lost.
 bool Tube::View::march(Walk &walk) const
 {
@@ -349,15 +357,15 @@ bool Tube::View::march(Walk &walk) const
         const Segment &segment = ray.segment;
         int hop = 0;
         const double t_exit = ray.exit(walk.index<last, walk.index> 0, hop), t_water = water_ahead(walk, segment);
-        if (ray.to_wall(walk.t, std::min(t_exit, t_water), walk.steps)) {
-            walk.hit = at(walk, ray, walk.t);
+        RayState st{};
+        if (ray.to_wall(walk.t, std::min(t_exit, t_water), walk.steps, st)) {
+            set_wall_hit(walk, ray, st);
             return true;
         }
         if (walk.steps >= MAX_STEPS || walk.t >= far) {
             return false;
         }
         if (t_water < t_exit) {
-            SegmentRay::State st{};
             ray.place(walk.t, st);
             walk.hit = {walk.t,
                         ray.arc(st),
@@ -369,29 +377,31 @@ bool Tube::View::march(Walk &walk) const
             return true;
         }
         walk.index += hop;
-        const SegmentRay next = ray_in(walk);
-        const bool face = hop > 0 ? next.segment.face : segment.face;
-        const int water = next.segment.water;
-        const Eigen::Vector3d plane = hop > 0 ? segment.end_normal : Eigen::Vector3d(-segment.start_normal);
+        const Segment &next = tube_.segments_[static_cast<size_t>(walk.index)];
+        const bool face = hop > 0 ? next.face : segment.face;
+        const bool shore = walk.with_water && next.water >= 0 && next.water != segment.water;
+        if (!face && !shore) {
+            continue;
+        }
+        const SegmentRay beyond = ray_in(walk);
         const Local &local = local_[static_cast<size_t>(walk.index - hop)];
-        if (face && next.at(walk.t).g > -NEAR && !next.at(walk.t).inner) {
-            walk.hit = at(walk, next, walk.t);
-            walk.hit.normal = -(local.rotation.transpose() * plane);
+        const Eigen::Vector3d plane = hop > 0 ? segment.end_normal : Eigen::Vector3d(-segment.start_normal);
+        st = beyond.at(walk.t);
+        const bool solid = face && !st.inner && st.g > -NEAR;
+        if (!solid && !(shore && under(walk, next.water))) {
+            continue;
+        }
+        set_wall_hit(walk, beyond, st);
+        walk.hit.normal = -(local.rotation.transpose() * plane);
+        if (solid) {
+            const int groove = next.joint >= 0 ? next.joint : segment.joint;
             walk.hit.material = Material::JOINT;
-            walk.hit.part = next.segment.joint >= 0 ? next.segment.joint : segment.joint;
-            walk.hit.part = walk.hit.part >= 0 ? walk.hit.part : std::min(segment.pipe, next.segment.pipe);
-            return true;
+            walk.hit.part = groove >= 0 ? groove : std::min(segment.pipe, next.pipe);
+        } else { // the end of a stretch of water, from its side
+            walk.hit.material = Material::WATER;
+            walk.hit.part = next.water;
         }
-        if (walk.with_water && water >= 0 && water != segment.water) {
-            const WaterPlane &surface = water_[static_cast<size_t>(water)];
-            if (surface.normal.dot(walk.o + walk.t * walk.d) < surface.level) { // the end of a stretch, from its side
-                walk.hit = at(walk, next, walk.t);
-                walk.hit.normal = -(local.rotation.transpose() * plane);
-                walk.hit.material = Material::WATER;
-                walk.hit.part = water;
-                return true;
-            }
-        }
+        return true;
     }
     return false;
 }
@@ -417,10 +427,12 @@ bool Tube::View::in_opening(Walk &walk) const
         return false;
     }
     const SegmentRay ray = ray_in(walk);
-    SegmentRay::State st{};
+    RayState st{};
     ray.place(walk.t, st);
     const double s = ray.arc(st), clock = wrap_clock(std::atan2(st.x, -st.y)), tiny = 1e-9 * tube_.radius_;
-    const double behind = std::hypot(st.x, st.y) - tube_.radius_at(segment, s, clock);
+    const double rho = std::hypot(st.x, st.y);
+    Height wall;
+    const double behind = rho - tube_.radius_at(segment, s, clock, st.x / rho, st.y / rho, wall);
     for (const int i : segment.cracks) {
         const CrackPath &crack = tube_.cracks_[static_cast<size_t>(i)];
         if (behind > -tiny && behind < crack.depth() - tiny &&
@@ -436,7 +448,7 @@ bool Tube::View::in_opening(Walk &walk) const
 Tube::View::After Tube::View::after(Walk &walk) const
 {
     settle(walk);
-    const SegmentRay::State st = ray_in(walk).at(walk.t);
+    const RayState st = ray_in(walk).at(walk.t);
     return st.inner || st.g < -1e-9 ? After::MAIN : After::SOLID;
 }
 
@@ -478,7 +490,7 @@ Tube::View::After Tube::View::leave_crack(Walk &walk) const
     for (int steps = 0; true; steps++) {
         const SegmentRay ray = ray_in(walk);
         const Local &local = local_[static_cast<size_t>(walk.index)];
-        SegmentRay::State st{};
+        RayState st{};
         ray.place(walk.t, st);
         ray.wall_with_reliefs(st, crack.depth());
         if (st.inner || st.g < -(crack.depth() + 1e-9 * radius) * 2.0 / radius) {
@@ -514,7 +526,7 @@ Tube::View::After Tube::View::leave_crack(Walk &walk) const
         walk.t = std::max(walk.t, t_exit);
         walk.index += hop;
         const SegmentRay next = ray_in(walk);
-        SegmentRay::State beyond{};
+        RayState beyond{};
         next.place(walk.t, beyond);
         next.wall_with_reliefs(beyond, crack.depth());
         if (!beyond.inner && beyond.g * 0.5 * radius > -tiny) { // the next pipe's solid face
@@ -552,7 +564,7 @@ bool Tube::View::trace(const Eigen::Vector3d &o, const Eigen::Vector3d &d, int s
     walk.index = start;
     walk.with_water = with_water;
     settle(walk);
-    const SegmentRay::State st = ray_in(walk).at(0.0);
+    const RayState st = ray_in(walk).at(0.0);
     if ((!st.inner && st.g >= 0.0) || !march(walk)) {
         return false;
     }
@@ -619,11 +631,20 @@ void Tube::View::mirror(const Eigen::Vector3d &d, Sight &sight) const
     sight.mirrors = trace(sight.origin, sight.direction, sight.first.segment, false, sight.second);
 }
 
-bool Tube::View::blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to) const
+bool Tube::View::blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to, bool roots_only) const
 {
-    const double distance = (to - from).norm();
+    const double distance = (to - from).norm(), most = distance * (1.0 - 1e-6);
+    const Eigen::Vector3d direction = (to - from) / distance;
     Hit hit{};
-    return !trace(from, (to - from) / distance, start_, true, hit) || hit.t < distance * (1.0 - 1e-6);
+    hit.t = most;
+    return roots_only ? roots_before(from, direction, hit) : !trace(from, direction, start_, true, hit) || hit.t < most;
+}
+
+bool Tube::View::near_roots(const Eigen::Vector3d &point) const
+{
+    return std::ranges::any_of(bundles_, [&](const Bundle &bundle) {
+        return (point - bundle.all.centre).squaredNorm() < 9.0 * bundle.all.radius * bundle.all.radius;
+    });
 }
 
 bool Tube::View::thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, const Hit &hit,
@@ -653,9 +674,11 @@ bool Tube::View::thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d 
             return true;
         }
     }
-    return std::ranges::any_of(segment.cracks, [&](int i) {
+    return std::ranges::any_of(segment.cracks, [&](int i) { // across the footprint, which is long along the pipe
         const CrackPath &crack = tube_.cracks_[static_cast<size_t>(i)];
-        return crack.distance(hit.s, hit.clock, crack.half_width() + reach) < INFINITE;
+        double by_s = 0.0, by_arc = 0.0;
+        const double d = crack.distance(hit.s, hit.clock, crack.half_width() + reach, &by_s, &by_arc);
+        return d < crack.half_width() + std::hypot(by_s * reach, by_arc * 0.75 * pixel * hit.t);
     });
 }
 

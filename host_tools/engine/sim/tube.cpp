@@ -364,22 +364,23 @@ Frame3 Tube::frame(double s) const
     return advance(segment.frame, segment, s - segment.s0);
 }
 
-double Tube::radius_at(const Segment &segment, double s, double clock, Height *height) const
+double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const
 {
     Section sec = segment.constant;
     if (segment.varying) {
         sec = section(s);
         sec.rho += segment.groove;
     }
-    const double ux = std::sin(clock), uy = -std::cos(clock);
-    const double inv_det = 1.0 / (sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s);
-    const auto inverse = [&](double px, double py) {
-        return Eigen::Vector2d(((sec.rho + sec.e_c) * px + sec.e_s * py) * inv_det,
-                               (sec.e_s * px + (sec.rho - sec.e_c) * py) * inv_det);
-    };
-    const Eigen::Vector2d w = inverse(ux, uy);
-    Height sum{1.0 / w.norm(), 0.0, 0.0};
-    if (height != nullptr) {
+    if (!segment.varying && sec.e_c == 0.0 && sec.e_s == 0.0) {
+        sum = {sec.rho, 0.0, 0.0};
+    } else {
+        const double inv_det = 1.0 / (sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s);
+        const auto inverse = [&](double px, double py) {
+            return Eigen::Vector2d(((sec.rho + sec.e_c) * px + sec.e_s * py) * inv_det,
+                                   (sec.e_s * px + (sec.rho - sec.e_c) * py) * inv_det);
+        };
+        const Eigen::Vector2d w = inverse(ux, uy);
+        sum.h = 1.0 / w.norm();
         const double cube = sum.h * sum.h * sum.h;
         sum.by_phi = -cube * w.dot(inverse(-uy, ux));
         sum.by_s = cube * w.dot(inverse(-sec.d_c * w.x() - sec.d_s * w.y(), -sec.d_s * w.x() + sec.d_c * w.y()));
@@ -388,9 +389,6 @@ double Tube::radius_at(const Segment &segment, double s, double clock, Height *h
         if (s > relief->from && s < relief->to) {
             relief->add(s, clock, sum);
         }
-    }
-    if (height != nullptr) {
-        *height = sum;
     }
     return sum.h;
 }
@@ -405,7 +403,8 @@ double Tube::wall_radius(double s, double clock) const
             deepest = std::max(deepest, crack.depth());
         }
     }
-    return radius_at(segment, s, wrap_clock(clock)) + deepest;
+    Height wall;
+    return radius_at(segment, s, wrap_clock(clock), std::sin(clock), -std::cos(clock), wall) + deepest;
 }
 
 Eigen::Vector3d Tube::wall(double s, double clock) const

@@ -99,6 +99,7 @@ public:
 private:
     struct Segment;
     struct SegmentRay;
+    struct RayState;
     struct Branch { // of laterals and holes: a closed cylinder, in the frame of its owner
         Eigen::Vector3d origin, axis, across;
         double radius, length;
@@ -119,8 +120,12 @@ public:
         bool cast(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, Hit &hit) const;
         // The same, with what water mirrors.
         bool see(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, Sight &sight) const;
-        // Does anything stand between the points (camera frame)? The first 1 - 1e-6 of the way counts.
-        bool blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to) const;
+        // Of a ray along `direction` that met water: sight.first and sight.origin say where; sets the rest.
+        void mirror(const Eigen::Vector3d &direction, Sight &sight) const;
+        // Does anything, or any root, stand between the points (camera frame)? The first 1 - 1e-6 of the way counts.
+        bool blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to, bool roots_only) const;
+        // So near to roots (three radii of their bundle) that they may shade it?
+        bool near_roots(const Eigen::Vector3d &point) const;
         // May a pixel of `pixel` radians around this hit show something thinner than itself: a crack, a gap, a root?
         bool thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, const Hit &hit,
                        double pixel) const;
@@ -134,9 +139,10 @@ public:
 
         enum class After : uint8_t { SOLID, MAIN, LOST };
 
-        Hit at(const Walk &walk, const SegmentRay &ray, double t) const;
         bool trace(const Eigen::Vector3d &o, const Eigen::Vector3d &d, int start, bool with_water, Hit &hit) const;
         SegmentRay ray_in(const Walk &walk) const;
+        void set_wall_hit(Walk &walk, const SegmentRay &ray, const RayState &st) const;
+        bool under(const Walk &walk, int water) const;
         void settle(Walk &walk) const;
         bool march(Walk &walk) const;
         bool in_opening(Walk &walk) const;
@@ -145,7 +151,6 @@ public:
         After after(Walk &walk) const;
         double water_ahead(const Walk &walk, const Segment &segment) const;
         bool roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Hit &hit) const;
-        void mirror(const Eigen::Vector3d &d, Sight &sight) const;
 
         const Tube &tube_;
         std::vector<Local> local_;
@@ -198,7 +203,8 @@ private:
     void add_openings(const FeatureSpec &features);
     int segment_at(double s) const;
     int find(const Eigen::Vector3d &world, WallPoint &out) const; // the segment, or -1
-    double radius_at(const Segment &segment, double s, double clock, Height *height = nullptr) const;
+    // The wall's radius and its derivatives at (s, clock); (ux, uy) is the clock's direction.
+    double radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const;
     static Frame3 advance(const Frame3 &frame, const Segment &segment, double along);
     static WallPoint to_section(const Segment &segment, const Eigen::Vector3d &p);
 

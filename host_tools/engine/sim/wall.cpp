@@ -417,35 +417,49 @@ CrackPath::CrackPath(const Crack &spec, double radius)
         }
     }
     path_.push_back(spec.path.back());
-    s_low_ = s_high_ = path_[0].s;
-    phi_low_ = phi_high_ = path_[0].phi;
-    for (const PathPoint &p : path_) {
-        s_low_ = std::min(s_low_, p.s);
-        s_high_ = std::max(s_high_, p.s);
-        phi_low_ = std::min(phi_low_, p.phi);
-        phi_high_ = std::max(phi_high_, p.phi);
+    all_ = {path_[0].s, path_[0].s, path_[0].phi, path_[0].phi};
+    for (size_t i = 0; i + 1 < path_.size(); i++) {
+        if (i % GROUP == 0) {
+            boxes_.push_back({path_[i].s, path_[i].s, path_[i].phi, path_[i].phi});
+        }
+        for (Box *box : {&boxes_.back(), &all_}) {
+            box->s_low = std::min(box->s_low, path_[i + 1].s);
+            box->s_high = std::max(box->s_high, path_[i + 1].s);
+            box->phi_low = std::min(box->phi_low, path_[i + 1].phi);
+            box->phi_high = std::max(box->phi_high, path_[i + 1].phi);
+        }
     }
 }
 
 double CrackPath::distance(double s, double phi, double reach, double *by_s, double *by_arc) const
 {
     double best = std::numeric_limits<double>::infinity();
-    if (s < s_low_ - reach || s > s_high_ + reach) {
+    if (s < all_.s_low - reach || s > all_.s_high + reach) {
         return best;
     }
     const double margin = reach / radius_;
-    for (double turn = phi + TWO_PI * std::ceil((phi_low_ - margin - phi) / TWO_PI); turn <= phi_high_ + margin;
+    for (double turn = phi + TWO_PI * std::ceil((all_.phi_low - margin - phi) / TWO_PI); turn <= all_.phi_high + margin;
          turn += TWO_PI) {
-        for (size_t i = 0; i + 1 < path_.size(); i++) {
-            const PathPoint &a = path_[i], &b = path_[i + 1];
-            const double bs = b.s - a.s, bp = (b.phi - a.phi) * radius_, ps = s - a.s, pp = (turn - a.phi) * radius_;
-            const double x = std::clamp((ps * bs + pp * bp) / (bs * bs + bp * bp), 0.0, 1.0);
-            const double es = ps - x * bs, ep = pp - x * bp, d = std::hypot(es, ep);
-            if (d < best) {
-                best = d;
-                if (by_s != nullptr && d > 0.0) {
-                    *by_s = es / d;
-                    *by_arc = ep / d;
+        for (size_t first = 0; first + 1 < path_.size(); first += GROUP) {
+            const Box &box = boxes_[first / GROUP];
+            const double out_s = std::max({box.s_low - s, s - box.s_high, 0.0});
+            const double out_p = std::max({box.phi_low - turn, turn - box.phi_high, 0.0}) * radius_;
+            const double nearest = std::min(best, reach);
+            if (out_s * out_s + out_p * out_p > nearest * nearest) {
+                continue;
+            }
+            for (size_t i = first; i < std::min(first + GROUP, path_.size() - 1); i++) {
+                const PathPoint &a = path_[i], &b = path_[i + 1];
+                const double bs = b.s - a.s, bp = (b.phi - a.phi) * radius_;
+                const double ps = s - a.s, pp = (turn - a.phi) * radius_;
+                const double x = std::clamp((ps * bs + pp * bp) / (bs * bs + bp * bp), 0.0, 1.0);
+                const double es = ps - x * bs, ep = pp - x * bp, d = std::hypot(es, ep);
+                if (d < best) {
+                    best = d;
+                    if (by_s != nullptr && d > 0.0) {
+                        *by_s = es / d;
+                        *by_arc = ep / d;
+                    }
                 }
             }
         }

@@ -158,8 +158,8 @@ public:
 
     double half_width() const { return half_width_; }
     double depth() const { return depth_; }
-    double from() const { return s_low_ - half_width_; }
-    double to() const { return s_high_ + half_width_; }
+    double from() const { return all_.s_low - half_width_; }
+    double to() const { return all_.s_high + half_width_; }
     const std::vector<PathPoint> &path() const { return path_; }
 
     // Distance of (s, phi) from the path, metres; infinite if above `reach`. (by_s, by_arc): its gradient by the arc
@@ -167,9 +167,15 @@ public:
     double distance(double s, double phi, double reach, double *by_s = nullptr, double *by_arc = nullptr) const;
 
 private:
+    static constexpr size_t GROUP = 8;
+    struct Box {
+        double s_low, s_high, phi_low, phi_high;
+    };
+
     double radius_, half_width_, depth_;
     std::vector<PathPoint> path_;
-    double s_low_, s_high_, phi_low_, phi_high_;
+    Box all_;
+    std::vector<Box> boxes_; // of every GROUP pieces
 };
 
 } // namespace pipefish::sim
