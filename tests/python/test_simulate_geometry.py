@@ -43,7 +43,7 @@ def scenes(d: float) -> dict[str, dict]:
         "mitre": pipe(d, joints=[{"s": 1.0, "gap": 0, "yaw": 0.1, "step_down": 0.05 * d}]),
         "egg": pipe(d, eggs=[{"start": 0.7, "end": 1.9, "ramp": 0.3}], ovals=[{"start": 1, "end": 2, "ovality": 0.1}]),
         "corrugation": pipe(d, corrugations=[{"start": 0.8, "end": 1.6, "amplitude": 0.02 * d, "wavelength": 0.1 * d}]),
-        "deposit": pipe(d, deposits=[{"s": 1.1, "length": d, "height": 0.2 * d, "roughness": 0.01 * d, "grain": d / 25}]),
+        "deposit": pipe(d, deposits=[{"s": 1.1, "length": d, "height": d / 5, "roughness": d / 99, "grain": d / 25}]),
         "grid": pipe(d, grid=grid_wall(d)),
         "hole": pipe(d, holes=[{"s": 1.0, "clock": 2.0, "diameter": 0.2 * d, "depth": 0.3 * d}]),
         "crack": pipe(
@@ -233,7 +233,7 @@ def test_flow_is_that_of_the_drawn_pictures(feature: str) -> None:
     rng, half = np.random.default_rng(11), 7
     grid = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1).T
     left = []
-    for _ in range(1500):
+    for _ in range(400):
         radius, angle = 215 * math.sqrt(rng.uniform(0.15, 1)), rng.uniform(0, TURN)
         outward = np.array([math.cos(angle), math.sin(angle)])
         pixels = np.round([318.3, 241.1] + radius * outward) + grid
@@ -251,7 +251,7 @@ def test_flow_is_that_of_the_drawn_pictures(feature: str) -> None:
         shift = np.linalg.lstsq(fit, cubic(second, *there.T), rcond=None)[0][:2]
         left.append([shift @ outward, shift @ [-outward[1], outward[0]]])
     left = np.array(left)
-    assert len(left) > 150
+    assert len(left) > 60
     assert np.abs(np.median(left, axis=0)).max() < 0.01, np.median(left, axis=0)
     assert np.median(np.abs(left)) < 0.1
 

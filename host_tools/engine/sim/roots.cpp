@@ -136,6 +136,10 @@ Bundle grow_roots(const Root &spec, const Eigen::Vector3d &base, const Eigen::Ve
     for (size_t i = 0; i < bundle.cones.size(); i += Bundle::STRAND) {
         bundle.strands.push_back(ball_around(bundle.cones, i, i + Bundle::STRAND));
     }
+    bundle.limb = Bundle::STRAND * static_cast<size_t>(1 + spec.branches);
+    for (size_t i = 0; i < bundle.cones.size(); i += bundle.limb) {
+        bundle.limbs.push_back(ball_around(bundle.cones, i, i + bundle.limb));
+    }
     bundle.all = ball_around(bundle.cones, 0, bundle.cones.size());
     return bundle;
 }
@@ -144,8 +148,10 @@ Bundle moved(const Bundle &bundle, const Eigen::Matrix3d &rotation, const Eigen:
 {
     Bundle out = bundle;
     out.all.centre = rotation * (bundle.all.centre - origin);
-    for (Ball &ball : out.strands) {
-        ball.centre = rotation * (ball.centre - origin);
+    for (std::vector<Ball> *balls : {&out.strands, &out.limbs}) {
+        for (Ball &ball : *balls) {
+            ball.centre = rotation * (ball.centre - origin);
+        }
     }
     for (RoundCone &c : out.cones) {
         c.a = rotation * (c.a - origin);
@@ -164,6 +170,10 @@ bool hit_bundle(const Bundle &bundle, const Eigen::Vector3d &origin, const Eigen
     bool found = false;
     double best = t_max;
     for (size_t i = 0; i < bundle.cones.size(); i++) {
+        if (i % bundle.limb == 0 && !near_ball(bundle.limbs[i / bundle.limb], origin, direction, best, grow)) {
+            i += bundle.limb - 1;
+            continue;
+        }
         if (i % Bundle::STRAND == 0 && !near_ball(bundle.strands[i / Bundle::STRAND], origin, direction, best, grow)) {
             i += Bundle::STRAND - 1;
             continue;

@@ -23,7 +23,8 @@ struct Ball { // around something
 struct Bundle {
     static constexpr size_t STRAND = 10; // cones
     std::vector<RoundCone> cones;        // strand by strand
-    std::vector<Ball> strands;
+    size_t limb;                         // cones of a first strand and its branches
+    std::vector<Ball> strands, limbs;
     Ball all;
 };
 

@@ -105,14 +105,13 @@ struct Tube::SegmentRay {
     }
 
     // The same for g = 2 (rho - r(s, clock)) / radius at least 0.7 `inner` from the axis.
-    double relief_bound() const
+    double relief_bound(const HeightBounds &b) const
     {
         const double least = 0.7 * segment.inner, q = bend() ? segment.curvature_radius : INFINITE;
         const double v2 = bend() ? 1.0 : d.x() * d.x() + d.y() * d.y(), turn = std::sqrt(v2) / least;
         const double along = bend() ? segment.bend_radius / q : std::abs(d.z());
         const double rho2 = v2 / least + 1.0 / q, clock2 = v2 / (least * least) + 1.0 / (q * least);
         const double s2 = bend() ? 2.0 * along / q : 0.0;
-        const HeightBounds &b = segment.bounds;
         return 2.0 / tube.radius_ *
                (rho2 + b.by_ss * along * along + 2.0 * b.by_sphi * along * turn + b.by_phiphi * turn * turn +
                 b.by_phi * clock2 + b.by_s * s2);
@@ -213,16 +212,30 @@ struct Tube::SegmentRay {
         return {n * segment.nx - gw * segment.ny, n * segment.ny + gw * segment.nx, gt * c - gn * s};
     }
 
+    // The way to the nearest deposit at least, from its clock angle alone; 0 inside one's.
+    double clear(const State &st) const
+    {
+        double least = INFINITE;
+        for (const Relief *relief : segment.reliefs) {
+            if (relief->deposit >= 0) {
+                least = std::min(least, st.rho * std::sin(std::min(0.5 * std::numbers::pi, relief->outside(st.clock))));
+            }
+        }
+        return least;
+    }
+
     // Marches from t to the wall, or to `limit`; t is then there. Along the ray g(t + h) <= g + g' h + K h^2 / 2 with K
     // a bound of g'' over the segment, so the root h of the right side never passes the first hit and converges to it
     // like Newton's method. On a straight segment of constant section K is exact and the first step lands on the wall.
-    // Reliefs: the same, first up to the cylinder inside which there is no wall, from there with their own bound, in
-    // steps that keep 0.7 of its radius away from the axis. Returns true at the wall.
+    // Reliefs: the same, first up to the cylinder inside which there is no wall, from there with their own bound (that
+    // without the deposits as far as the ray cannot reach one), in steps that keep 0.7 of its radius off the axis.
+    // Returns true at the wall.
     bool to_wall(double &t, double limit, int &steps, State &st) const
     {
         const double inner_bound = detailed() ? ellipse_bound(1.0 / segment.inner, 0.0, 0.0)
                                               : ellipse_bound(segment.inverse_axis, segment.slope, segment.curvature);
-        const double bound = detailed() ? relief_bound() : inner_bound, longest = 0.3 * segment.inner;
+        const double bound = detailed() ? relief_bound(segment.bounds) : inner_bound;
+        const double calm_bound = detailed() ? relief_bound(segment.calm) : 0.0, longest = 0.3 * segment.inner;
         for (; steps < MAX_STEPS; steps++) {
             st = at(t);
             if (!st.inner && st.g > -NEAR) {
@@ -230,7 +243,7 @@ struct Tube::SegmentRay {
             }
             double h = safe_step(st.g, st.rate, st.inner ? inner_bound : bound);
             if (detailed() && !st.inner) {
-                h = std::min(h, longest);
+                h = std::min(std::max(h, std::min(safe_step(st.g, st.rate, calm_bound), clear(st))), longest);
             }
             if (t + h >= limit) {
                 break;
@@ -516,7 +529,7 @@ Tube::View::After Tube::View::leave_crack(Walk &walk) const
         if (d > 0.25 * w) {
             h = std::max(h, safe_step(d - w, by_s * st.vs + by_arc * turn, pull + 4.0 * speed * speed / w));
         }
-        h = std::min({h, safe_step(st.g, floor_rate, ray.relief_bound()), 0.3 * ray.segment.inner});
+        h = std::min({h, safe_step(st.g, floor_rate, ray.relief_bound(ray.segment.bounds)), 0.3 * ray.segment.inner});
         int hop = 0;
         const double t_exit = ray.exit(walk.index<last, walk.index> 0, hop);
         if (walk.t + h < t_exit) {
@@ -643,7 +656,7 @@ bool Tube::View::blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to,
 bool Tube::View::near_roots(const Eigen::Vector3d &point) const
 {
     return std::ranges::any_of(bundles_, [&](const Bundle &bundle) {
-        return (point - bundle.all.centre).squaredNorm() < 9.0 * bundle.all.radius * bundle.all.radius;
+        return (point - bundle.all.centre).squaredNorm() < 4.0 * bundle.all.radius * bundle.all.radius;
     });
 }
 

@@ -247,8 +247,13 @@ void Tube::set_radius_bounds(Segment &segment, double largest, double from, doub
     b.by_ss = 0.75 * std::pow(a, 5) * f_s * f_s + 0.5 * a * a * a * f_ss;
     b.by_phiphi = 3.0 * std::pow(a, 5) * k * k + 2.0 * a * a * a * k;
     b.by_sphi = 0.75 * std::pow(a, 5) * f_s * 2.0 * k + 0.5 * a * a * a * 4.0 * l * l * l * segment.slope;
+    segment.calm = b;
     for (const Relief *relief : segment.reliefs) {
-        b.add(relief->bounds(from, to));
+        const HeightBounds more = relief->bounds(from, to);
+        b.add(more);
+        if (relief->deposit < 0) {
+            segment.calm.add(more);
+        }
     }
     segment.inner = 1.0 / l + b.least;
     if (!(segment.inner > 0.25 * radius_)) {

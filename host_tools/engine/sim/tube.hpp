@@ -124,7 +124,7 @@ public:
         void mirror(const Eigen::Vector3d &direction, Sight &sight) const;
         // Does anything, or any root, stand between the points (camera frame)? The first 1 - 1e-6 of the way counts.
         bool blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to, bool roots_only) const;
-        // So near to roots (three radii of their bundle) that they may shade it?
+        // So near to roots (two radii of their bundle) that they may shade it?
         bool near_roots(const Eigen::Vector3d &point) const;
         // May a pixel of `pixel` radians around this hit show something thinner than itself: a crack, a gap, a root?
         bool thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, const Hit &hit,
@@ -182,6 +182,7 @@ private:
         std::vector<const Relief *> reliefs;
         double inner;
         HeightBounds bounds;       // of the radius
+        HeightBounds calm;         // the same without the deposits
         std::vector<int> cracks;   // whose range touches it
         std::vector<int> branches; // the same; laterals first, then holes
         int water;                 // the stretch, or -1

@@ -178,6 +178,11 @@ public:
         sum.by_phi -= n.by_phi * bx * by + n.h * bx * dy;
     }
 
+    double outside(double phi) const override
+    {
+        return std::max(0.0, std::abs(turn_between(phi, spec_.clock)) - 0.5 * spec_.extent);
+    }
+
     HeightBounds bounds(double, double) const override
     {
         // Of (1 - x^2)^3: slope up to 1.7174 (x^2 = 1/5), curvature up to 6 (x = 0).

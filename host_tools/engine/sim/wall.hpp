@@ -141,6 +141,8 @@ public:
     // Adds to `sum` at arc length s and clock angle phi in [0, 2 pi).
     virtual void add(double s, double phi, Height &sum) const = 0;
     virtual HeightBounds bounds(double s_from, double s_to) const = 0;
+    // By how much, radians, a clock angle lies outside the relief's extent; 0 inside and where it has no limits.
+    virtual double outside(double) const { return 0.0; }
     virtual std::vector<double> cuts() const { return {from, to}; } // arc lengths where its bounds had better change
 };
 
