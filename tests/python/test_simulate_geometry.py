@@ -286,6 +286,17 @@ def test_a_joint_displaces_and_turns_what_follows() -> None:
     assert scene.wall_radius(1.03, 2.0) == pytest.approx(0.15, abs=1e-12)
 
 
+def test_the_camera_rolls_smoothly_over_a_joint() -> None:
+    joint = {"s": 1.0, "gap": 0.01, "step_right": 0.01, "step_down": 0.01, "yaw": 0.02}
+    motion = pipe()["motion"] | {"frames": 200, "speed": 0.05, "wobble_m": 0, "wobble_rad": 0, "ramp": 0}
+    scene = Scene(pipe(joints=[joint]) | {"motion": motion})
+    path = np.array([scene.centre(f) for f in range(200)])
+    # A quintic of 0.3 m that climbs 0.014 m: second derivative up to 0.9 a metre, times (0.0025 m)^2 a frame.
+    assert np.abs(np.diff(path, 2, axis=0)).max() < 1e-5
+    straight = np.linalg.norm(path[-1] - path[0])
+    assert scene.driven(199) == pytest.approx(straight, rel=2e-3)
+
+
 def test_a_deposit_has_the_stated_height_and_extent() -> None:
     scene = Scene(pipe(deposits=[{"s": 1.1, "clock": 3.0, "length": 0.4, "extent": 1.2, "height": 0.05}]))
     assert scene.wall_radius(1.1, 3.0) == pytest.approx(0.1, abs=1e-12)

@@ -33,7 +33,7 @@ double distance_at(const MotionSpec &spec, double t)
 
 Eigen::Vector3d nominal(const Tube &tube, double drop, double s)
 {
-    const Frame3 f = tube.frame(s);
+    const Frame3 f = tube.ride(s);
     return f.origin + drop * f.world_from_frame.col(1);
 }
 
@@ -66,7 +66,7 @@ std::vector<FrameState> drive(const Tube &tube, const MotionSpec &spec)
         f.arc = arc;
 
         const Eigen::Vector3d here = nominal(tube, spec.below_axis, f.s);
-        const Eigen::Matrix3d section = tube.frame(f.s).world_from_frame;
+        const Eigen::Matrix3d section = tube.ride(f.s).world_from_frame;
         const Eigen::Vector3d z = (nominal(tube, spec.below_axis, f.s + spec.lookahead) - here).normalized();
         const Eigen::Vector3d y = z.cross(section.col(0)).normalized();
         Eigen::Matrix3d look;

@@ -167,6 +167,8 @@ void Tube::add_segment(const Piece &piece, double from, double to, Growth &growt
             segment.groove = joint.depth;
         }
         if (std::abs(to - end) < 1e-9) { // the next pipe begins
+            before_.push_back(growth.frame);
+            before_.back().origin -= joint.gap * growth.frame.world_from_frame.col(2);
             const double angle = std::hypot(joint.yaw, joint.pitch);
             const Eigen::Vector3d z = Eigen::Vector3d::UnitZ(), step(joint.step_right, joint.step_down, 0.0);
             Eigen::Matrix3d turn = Eigen::Matrix3d::Identity();
@@ -182,6 +184,7 @@ void Tube::add_segment(const Piece &piece, double from, double to, Growth &growt
             } else {
                 growth.start_normal = turn.transpose() * z;
             }
+            after_.push_back(growth.frame);
             growth.face = true;
             growth.pipe = static_cast<int>(j) + 1;
         } else if (std::abs(to - joint.s) < 1e-9) {
@@ -367,6 +370,30 @@ Frame3 Tube::frame(double s) const
 {
     const Segment &segment = segments_[static_cast<size_t>(segment_at(s))];
     return advance(segment.frame, segment, s - segment.s0);
+}
+
+Frame3 Tube::ride(double s) const
+{
+    for (size_t j = 0; j < joints_.size(); j++) {
+        const double from = joints_[j].s, to = from + joints_[j].gap, middle = 0.5 * (from + to);
+        const double to_last = j > 0 ? from - joints_[j - 1].s - joints_[j - 1].gap : INFINITE;
+        const double to_next = j + 1 < joints_.size() ? joints_[j + 1].s - to : INFINITE;
+        const double reach = 0.5 * joints_[j].gap + std::min({radius_, 0.45 * to_last, 0.45 * to_next});
+        if (std::abs(s - middle) >= reach) {
+            continue;
+        }
+        const auto along = [](const Frame3 &f, double way) {
+            return Frame3{f.world_from_frame, f.origin + way * f.world_from_frame.col(2)};
+        };
+        const Frame3 first = s <= from ? frame(s) : along(before_[j], s - from);
+        const Frame3 second = s >= to ? frame(s) : along(after_[j], s - to);
+        double slope = 0.0;
+        const double share = smooth_step(0.5 + 0.5 * (s - middle) / reach, slope);
+        const Eigen::AngleAxisd turn(first.world_from_frame.transpose() * second.world_from_frame);
+        return {first.world_from_frame * Eigen::AngleAxisd(share * turn.angle(), turn.axis()).toRotationMatrix(),
+                (1.0 - share) * first.origin + share * second.origin};
+    }
+    return frame(s);
 }
 
 double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const

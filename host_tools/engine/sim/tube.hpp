@@ -88,8 +88,11 @@ public:
     double length() const { return length_; }
     const std::vector<JointSpec> &joints() const { return joints_; }
     const std::vector<CrackPath> &cracks() const { return cracks_; }
-    Section section(double s) const;                    // without reliefs and grooves
-    Frame3 frame(double s) const;                       // of the section at s
+    Section section(double s) const; // without reliefs and grooves
+    Frame3 frame(double s) const;    // of the section at s
+    // The same, but smooth: half a diameter before and behind a joint it blends from one pipe to the next, as what
+    // rolls over it does.
+    Frame3 ride(double s) const;
     double wall_radius(double s, double clock) const;   // from the axis: section, reliefs, grooves and cracks
     Eigen::Vector3d wall(double s, double clock) const; // world point at that radius
     // The nearest section through a world point within 1.5 radii of the centreline (or 1.2 of the largest). False when
@@ -214,6 +217,7 @@ private:
     std::vector<Eigen::Vector2d> largest_; // of each stretch: (e_c, e_s) between its ramps
     std::vector<std::unique_ptr<Relief>> reliefs_;
     std::vector<JointSpec> joints_;
+    std::vector<Frame3> before_, after_; // of every joint: where its first pipe ends, where the next begins
     std::vector<CrackPath> cracks_;
     std::vector<Water> water_;
     std::vector<WaterPlane> planes_;
