@@ -190,7 +190,6 @@ private:
         std::vector<int> branches; // the same; laterals first, then holes
         int water;                 // the stretch, or -1
     };
-    struct SegmentRay;
 
     struct Growth { // where the next segment begins
         double s;
