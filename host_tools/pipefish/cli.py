@@ -209,9 +209,16 @@ def run_simulate(args: argparse.Namespace) -> Result:
         room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
         return {"files": [args.contact_sheet]}, table([("written", args.contact_sheet)])
     if args.picture:
-        room.picture(args.scene, Path(args.picture), args.frame)
+        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set))
         return {"files": [args.picture]}, table([("written", args.picture)])
-    document = room.simulate(args.scene, Path(args.output), frames=args.frames, seed=args.seed, quiet=args.json)
+    document = room.simulate(
+        args.scene,
+        Path(args.output),
+        changes=dict(args.set),
+        frames=args.frames,
+        seed=args.seed,
+        quiet=args.json,
+    )
     rows = [
         ("frames", f"{document['frames']} of {document['width']} x {document['height']} pixels"),
         ("driven", f"{document['driven_m']:.2f} m"),
@@ -280,6 +287,19 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
 
 
 # ---- the parser
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """KEY=VALUE with a value as in TOML, or a bare word."""
+    import tomllib
+
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"'{text}' is not KEY=VALUE")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
 
 
 def positive(text: str) -> int:
@@ -357,6 +377,15 @@ def build_parser() -> argparse.ArgumentParser:
     what.add_argument("--list", action="store_true", help="tell which scenes there are")
     what.add_argument("--picture", metavar="FILE", help="draw one frame into FILE (.png, .jpg, .webp)")
     what.add_argument("--contact-sheet", metavar="FILE", help="draw one frame of each scene of --list into FILE")
+    p.add_argument(
+        "--set",
+        type=setting,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="another value in the scene, as in its file: diameter=0.15, motion.speed=0.4, texture.material=pvc; "
+        "may be repeated",
+    )
     p.add_argument("--frames", type=positive, help="stop after so many frames")
     p.add_argument("--seed", type=int, help="of all that is random [the scene's]")
     p.add_argument("--frame", type=int, metavar="N", help="which, for --picture [at three quarters of the drive]")
@@ -366,6 +395,8 @@ def build_parser() -> argparse.ArgumentParser:
             refuse("which SCENE? `pipefish simulate --list` tells what there is")
         if not args.output and (args.frames or args.seed is not None):
             refuse("--frames and --seed are for a recording: -o STEM")
+        if args.set and not (args.output or args.picture):
+            refuse("--set is for -o and --picture")
         if args.frame is not None and not args.picture:
             refuse("--frame is for --picture")
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
 import os
 import re
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,31 @@ import numpy as np
 from pipefish import __version__, _engine
 from pipefish.errors import ArgumentError, FormatError, PipefishError
 from pipefish.progress import track
+from pipefish.wallgrid import with_wall_grid
 
 TRUTH_FORMAT = "pipefish-truth"
 TRUTH_VERSION = 2
 POSE_COLUMNS = ["s", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "driven", "pushed", "time_s", "roll", "pitch"]
 
 SCENARIOS = Path(__file__).with_name("scenarios")
-SEEDED = ("texture", "sensor", "motion", "telemetry")  # the parts that have a seed
+SEEDED = ("texture", "sensor", "motion", "telemetry", "window")  # the parts that have a seed
+MATERIALS = ("wall", "joint", "deposit", "hole", "crack", "lateral", "root", "water")
+_KINDS = ("egg", "corrugation", "deposit", "hole", "crack", "lateral", "root")
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What N pixels see; rows with ok false hold NaN and -1. World frame, metres, radians."""
+
+    ok: np.ndarray
+    point: np.ndarray  # (N, 3)
+    normal: np.ndarray  # (N, 3), unit, towards the camera's side
+    s: np.ndarray  # along the centreline; in a lateral or hole along its own axis; of a root its base
+    clock: np.ndarray  # in a lateral or hole around its own axis
+    material: np.ndarray  # index in MATERIALS
+    part: np.ndarray  # index in the scene's list of that kind; of the wall: how many joints lie before it
+    mirrored_point: np.ndarray  # (N, 3): what water shows there, else NaN
+    mirrored: np.ndarray  # share of the light that the water mirrors
 
 
 def scenarios() -> dict[str, str]:
@@ -70,6 +90,34 @@ def read_scene(path: Path) -> tuple[dict[str, Any], str]:
     return scene, about
 
 
+def described(
+    scene: str | os.PathLike[str] | dict[str, Any], changes: dict[str, Any] | None = None
+) -> tuple[dict[str, Any], Path | None]:
+    """A scene's description (by a built-in name, of a TOML or JSON file, or itself) and the file it is from.
+
+    changes: values to put in, {"motion.speed": 0.2, "texture.material": "pvc"}. Raises FormatError, OSError,
+    PipefishError.
+    """
+    if isinstance(scene, dict):
+        source, made = None, copy.deepcopy(scene)
+    else:
+        source = SCENARIOS / f"{scene}.toml"
+        if Path(scene).name != str(scene) or not source.exists():
+            source = Path(scene)
+        if not source.exists():
+            raise PipefishError(f"there is no scene '{scene}': a file, or one of {', '.join(scenarios())}")
+        made = read_scene(source)[0]
+    for key, value in (changes or {}).items():
+        *parts, last = key.split(".")
+        place = made
+        for depth, part in enumerate(parts):
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise FormatError(source, ".".join(parts[: depth + 1]), f"has no key '{last}' of its own")
+        place[last] = value
+    return made, source
+
+
 def with_profile(lens: dict[str, Any], profile: Path, source: Path | None = None) -> dict[str, Any]:
     """The key `lens` of a scene whose lens is exactly that profile (docs/profile.md), evaluated by the simulator.
 
@@ -111,6 +159,7 @@ class Scene:
         """
         if not isinstance(scene, dict):
             raise FormatError(source, None, "a scene must be an object")
+        scene = with_wall_grid(scene, source)
         try:
             self._scene = _engine.Scene(scene)
         except ValueError as error:
@@ -119,14 +168,10 @@ class Scene:
         self._middle_row = (self.spec["lens"]["height"] - 1) / 2
 
     @staticmethod
-    def load(name_or_path: str | os.PathLike[str]) -> Scene:
-        """A built-in scene by name, or a TOML or JSON file. Raises FormatError, OSError, PipefishError."""
-        path = SCENARIOS / f"{name_or_path}.toml"
-        if Path(name_or_path).name != str(name_or_path) or not path.exists():
-            path = Path(name_or_path)
-        if not path.exists():
-            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {', '.join(scenarios())}")
-        return Scene(read_scene(path)[0], path)
+    def load(name_or_path: str | os.PathLike[str], changes: dict[str, Any] | None = None) -> Scene:
+        """A built-in scene by name, or a TOML or JSON file, with other values: changes = {"motion.speed": 0.2}. Raises
+        FormatError, OSError, PipefishError."""
+        return Scene(*described(name_or_path, changes))
 
     @staticmethod
     def from_truth(path: str | os.PathLike[str]) -> Scene:
@@ -220,14 +265,24 @@ class Scene:
         """(N, 3) world points -> (N, 2) pixels, (N,) ok (false beyond the field; what is in between is not asked)."""
         return self._scene.project(frame, _points(points, 3))
 
-    def flow(self, frame: int, pixels: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where frame `other` sees what `frame` sees at the pixels: (N, 2) -> (N, 2), (N,) ok: in its field and in
-        front of everything else."""
-        points, _ = self.cast(frame, pixels)
-        moved, seen = self.project(other, points)
-        hit, _ = self.cast(other, moved)
-        gap = np.linalg.norm(hit - points, axis=1)
-        return moved, seen & (gap < 1e-6)
+    def visible(self, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As project(), but ok is false also where something stands between camera and point."""
+        return self._scene.visible(frame, _points(points, 3))
+
+    def flow(self, frame_a: int, frame_b: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where what `pixels` (N, 2) of frame a show is in frame b: (N, 2), (N,) ok.
+
+        ok is false where it is hidden or outside the picture in b, and on water.
+        """
+        return self._scene.flow(frame_a, frame_b, _points(pixels, 2))
+
+    def sights(self, frame: int, pixels: np.ndarray) -> Sights:
+        """Everything about what `pixels` (N, 2) see."""
+        rows, ok = self._scene.sights(frame, _points(pixels, 2))
+        material, part = (np.where(ok, rows[:, k], -1).astype(int) for k in (8, 9))
+        return Sights(
+            ok, rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7], material, part, rows[:, 10:13], rows[:, 13]
+        )
 
     def locate(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) world points -> (N, 3): arc length, distance from the axis, clock angle; NaN far outside the pipe."""
@@ -237,8 +292,34 @@ class Scene:
         """The wall point at arc length s and clock angle phi, (3,)."""
         return self._scene.wall(s, phi)
 
+    def wall_radius(self, s: float, phi: float) -> float:
+        """From the axis to the wall at arc length s and clock angle phi, metres: section, reliefs, grooves, cracks."""
+        return self._scene.wall_radius(s, phi)
+
+    def outline(self, s: float, points: int = 360) -> np.ndarray:
+        """The section's wall at arc length s as a polygon (points, 2): right and down of the axis, metres."""
+        phi = np.arange(points) * (2 * np.pi / points)
+        radius = np.array([self.wall_radius(s, p) for p in phi])
+        return np.column_stack([radius * np.sin(phi), -radius * np.cos(phi)])
+
+    def events(self) -> list[dict[str, Any]]:
+        """What is in the pipe, in order of arc length: kind, index in its list, s, clock (if it has one), its sizes."""
+        spec = self.spec
+        lists = {"joint": self._scene.joints} | {kind: spec[kind + "s"] for kind in _KINDS} | {"water": spec["water"]}
+        events = []
+        for kind, items in lists.items():
+            for index, item in enumerate(items):
+                event = {"kind": kind, "index": index} | {k: v for k, v in item.items() if k not in ("seed", "path")}
+                if kind == "crack":
+                    path = [list(p) for p in self._scene.crack_path(index)]
+                    event |= {"s": path[0][0], "clock": path[0][1] % (2 * math.pi), "path": path}
+                elif kind in ("egg", "corrugation", "water"):
+                    event["s"] = max(0.0, item["start"])
+                events.append(event)
+        return sorted(events, key=lambda event: event["s"])
+
     def section(self, s: float) -> tuple[float, float, float]:
-        """D_max and D_min in metres, clock angle of D_max, at arc length s."""
+        """D_max and D_min in metres, clock angle of D_max, of the ellipse at arc length s (outline() has the rest)."""
         return self._scene.section(s)
 
     def lens(self) -> dict[str, list[float]]:
@@ -288,6 +369,7 @@ def truth_of(scene: Scene) -> dict[str, Any]:
         "software": f"pipefish {__version__}",
         "scene": scene.spec,
         "pipe_length_m": scene.length,
+        "events": scene.events(),
         "lens": scene.lens(),
         "rows": {
             "line_time_s": scene.spec["sensor"]["line_time_s"],
@@ -355,6 +437,7 @@ def simulate(
     scene: str | os.PathLike[str] | dict[str, Any],
     stem: Path,
     *,
+    changes: dict[str, Any] | None = None,
     frames: int | None = None,
     seed: int | None = None,
     threads: int | None = None,
@@ -362,17 +445,16 @@ def simulate(
 ) -> dict[str, Any]:
     """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all.
 
-    scene: a scenario's name, a TOML or JSON file, or the description itself. frames: stop after so many. seed: of all
-    that is random. Returns what was written. Raises FormatError, PipefishError, OSError.
+    scene: a scenario's name, a TOML or JSON file, or the description itself. changes: other values, as described()
+    takes them. frames: stop after so many. seed: of all that is random but the shapes of what is in the pipe. Returns
+    what was written. Raises FormatError, PipefishError, OSError.
     """
-    made = Scene(scene) if isinstance(scene, dict) else Scene.load(scene)
-    if frames is not None or seed is not None:
-        spec = copy.deepcopy(made.spec)
-        if frames is not None:
-            spec["motion"]["frames"] = frames
-        for part in SEEDED if seed is not None else ():
-            spec[part]["seed"] = seed
-        made = Scene(spec)
+    changes = dict(changes or {})
+    if frames is not None:
+        changes["motion.frames"] = frames
+    if seed is not None:
+        changes |= {f"{part}.seed": seed for part in SEEDED}
+    made = Scene(*described(scene, changes))
     stem = Path(stem)
     stem.parent.mkdir(parents=True, exist_ok=True)
     files = {kind: stem.with_name(stem.name + kind) for kind in (".y4m", ".csv", ".truth.json", ".profile.json")}
@@ -425,10 +507,16 @@ def _write_csv(scene: Scene, path: Path) -> None:
             out.write(f"{frame},{time_ns},{count},{attitude}\n")
 
 
-def picture(scene: str | os.PathLike[str], path: Path, frame: int | None = None, width: int = 480) -> None:
+def picture(
+    scene: str | os.PathLike[str],
+    path: Path,
+    frame: int | None = None,
+    width: int = 480,
+    changes: dict[str, Any] | None = None,
+) -> None:
     """Writes one frame of a scene [at three quarters of the drive] as a small picture; what kind, the name's end says.
     Raises FormatError, PipefishError, OSError."""
-    made = Scene.load(scene)
+    made = Scene.load(scene, changes)
     frame = made.frames * 3 // 4 if frame is None else frame
     if not 0 <= frame < made.frames:
         raise PipefishError(f"there is no frame {frame}: the scene has {made.frames}")

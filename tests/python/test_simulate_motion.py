@@ -227,10 +227,10 @@ def test_dropped_frames_are_gaps_of_the_recording(tmp_path: Path) -> None:
 def test_flow_is_that_of_the_wall_and_knows_what_is_hidden() -> None:
     scene = Scene(small(pieces=[{"length": 1.0}, {"angle": 1.5, "radius": 0.3}, {"length": 3}], motion={"start": 0.6}))
     pixels = np.array([[150.0, 60.0], [100, 120], [200, 150]])
-    moved, ok = scene.flow(10, pixels, 14)
+    moved, ok = scene.flow(10, 14, pixels)
     assert ok.all()
     assert 0.5 < np.linalg.norm(moved - pixels, axis=1).max() < 30
-    back, _ = scene.flow(14, moved, 10)
+    back, _ = scene.flow(14, 10, moved)
     assert np.abs(back - pixels).max() < 1e-7
     # From the bend's end, what its beginning cannot see although it is in its field: the straight way to it runs
     # through the wall.
@@ -238,7 +238,7 @@ def test_flow_is_that_of_the_wall_and_knows_what_is_hidden() -> None:
     pixels = np.column_stack([columns, rows]).astype(float)
     there, lit = scene.cast(60, pixels)
     _, seen = scene.project(0, there)
-    hidden = lit & seen & ~scene.flow(60, pixels, 0)[1]
+    hidden = lit & seen & ~scene.flow(60, 0, pixels)[1]
     assert hidden.sum() > 50
     for point in there[hidden][::10]:
         way = scene.centre(0) + np.linspace(0, 1, 200)[:, None] * (point - scene.centre(0))
@@ -351,8 +351,25 @@ def test_the_command_lists_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "pictures end in" in capsys.readouterr().err
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--frame", "99"]) == 1
     assert "there is no frame 99" in capsys.readouterr().err
+    assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--set", "diameter"]) == 2
+    assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--set", "diametre=0.1"]) == 1
+    assert "diametre" in capsys.readouterr().err
+    assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--set", "diameter.d=0.1"]) == 1
+    assert "diameter" in capsys.readouterr().err
     assert main(["simulate", "-o", str(tmp_path / "a")]) == 2
     assert main(["simulate", "tiny"]) == 2
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--seed", "3"]) == 2
     assert main(["simulate", "tiny", "-o", str(tmp_path / "a"), "--frame", "3"]) == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_set_changes_the_scene_before_it_is_checked(tmp_path: Path) -> None:
+    # Twice as fast, tiny would drive out of its pipe but for the fewer frames.
+    changes = ["diameter=0.15", "motion.speed=2", "texture.material=pvc", "lamp.ring_radius=0.01"]
+    command = ["simulate", "tiny", "-o", str(tmp_path / "a"), "--frames", "2", "--seed", "7"]
+    for change in changes:
+        command += ["--set", change]
+    assert main(command) == 0
+    spec = Scene.from_truth(tmp_path / "a.truth.json").spec
+    assert (spec["diameter"], spec["motion"]["speed"], spec["motion"]["frames"]) == (0.15, 2, 2)
+    assert (spec["texture"]["material"], spec["texture"]["seed"], spec["telemetry"]["seed"]) == ("pvc", 7, 7)

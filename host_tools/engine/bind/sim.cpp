@@ -3,6 +3,7 @@
 #include "bind/sim_camera.hpp"
 #include "bind/sim_light.hpp"
 #include "bind/sim_motion.hpp"
+#include "bind/sim_wall.hpp"
 #include "sim/scene.hpp"
 
 #include <nanobind/eigen/dense.h>
@@ -56,6 +57,7 @@ template <typename F> void fields(F &f, SceneSpec &s)
     f("pieces", s.pieces);
     f("ovals", s.ovals);
     f("markers", s.markers);
+    fields(f, s.features);
     f("texture", s.texture);
     f("lens", s.lens);
     f("lamp", s.lamp);
@@ -97,6 +99,7 @@ void check_together(const SceneSpec &s)
         if (ovality > 0.5)
             Reader::fail(where + ".ovality", "all stretches together must be at most 0.5");
     }
+    check_wall(s.features);
     check_light(s.lamp, s.diameter);
     double length = 0;
     for (const Piece &p : s.pieces)
@@ -143,16 +146,16 @@ const FrameState &state(const Scene &scene, int frame)
     return scene.frames()[static_cast<size_t>(checked_frame(scene, frame))];
 }
 
-// Applies map(frame, in, out) -> ok to each row of the points; rows where it fails are NaN.
+// Applies map(in, out) -> ok to each row of the points; rows where it fails are NaN.
 template <size_t In, size_t Out, typename Points, typename Map>
-nb::tuple map_points(int frame, const Points &points, const Map &map)
+nb::tuple map_points(const Points &points, const Map &map)
 {
     const size_t n = points.shape(0);
     std::vector<double> out(Out * n, NAN);
     std::vector<uint8_t> ok(n, 0);
     for (size_t i = 0; i < n; i++) {
         double item[Out];
-        ok[i] = map(frame, points.data() + In * i, item);
+        ok[i] = map(points.data() + In * i, item);
         if (ok[i])
             std::copy(item, item + Out, out.data() + Out * i);
     }
@@ -170,6 +173,8 @@ void bind_sim(nb::module_ &m)
                 const SceneSpec spec = read_scene(source);
                 try {
                     new (self) Scene(spec);
+                } catch (const SpecError &error) {
+                    throw nb::value_error(error.what());
                 } catch (const std::invalid_argument &error) { // what only the lens knows; the rest is checked above
                     Reader::fail("lens", error.what());
                 }
@@ -248,21 +253,68 @@ void bind_sim(nb::module_ &m)
         .def(
             "cast",
             [](const Scene &s, int frame, const Points2 &px) {
-                return map_points<2, 3>(checked_frame(s, frame), px,
-                                        [&s](int f, const double *in, double *out) { return s.cast(f, in, out); });
+                FrameView view(s, checked_frame(s, frame));
+                return map_points<2, 3>(px, [&](const double *in, double *out) {
+                    Seen seen{};
+                    const bool ok = s.see(view, in, seen);
+                    std::copy_n(seen.point.data(), 3, out);
+                    return ok;
+                });
             },
-            nb::arg("frame"), nb::arg("px"), "(N, 2) pixels -> wall points (N, 3) in metres, ok (N,).")
+            nb::arg("frame"), nb::arg("px"), "(N, 2) pixels -> surface points (N, 3) in metres, ok (N,).")
+        .def(
+            "sights",
+            [](const Scene &s, int frame, const Points2 &px) {
+                FrameView view(s, checked_frame(s, frame));
+                return map_points<2, 14>(px, [&](const double *in, double *out) {
+                    Seen seen{};
+                    if (!s.see(view, in, seen))
+                        return false;
+                    const Sight &sight = seen.sight;
+                    const Hit &hit = sight.first;
+                    std::copy_n(seen.point.data(), 3, out);
+                    std::copy_n(seen.normal.data(), 3, out + 3);
+                    const double rest[] = {hit.s, hit.clock, static_cast<double>(hit.material),
+                                           static_cast<double>(hit.part)};
+                    std::copy_n(rest, 4, out + 6);
+                    const bool water = hit.material == Material::WATER;
+                    std::fill_n(out + 10, 3, NAN);
+                    if (water && sight.mirrors)
+                        std::copy_n(seen.mirrored.data(), 3, out + 10);
+                    out[13] = water ? sight.mirrored : 0.0;
+                    return true;
+                });
+            },
+            nb::arg("frame"), nb::arg("px"),
+            "(N, 2) pixels -> (N, 14): point, normal, s, clock, material, part, mirrored point, mirrored share; ok.")
         .def(
             "project",
             [](const Scene &s, int frame, const Points3 &points) {
-                return map_points<3, 2>(checked_frame(s, frame), points,
-                                        [&s](int f, const double *in, double *out) { return s.project(f, in, out); });
+                checked_frame(s, frame);
+                return map_points<3, 2>(points,
+                                        [&](const double *in, double *out) { return s.project(frame, in, out); });
             },
             nb::arg("frame"), nb::arg("points"), "World points (N, 3) -> pixels (N, 2), ok (N,).")
         .def(
+            "visible",
+            [](const Scene &s, int frame, const Points3 &points) {
+                FrameView view(s, checked_frame(s, frame));
+                return map_points<3, 2>(points,
+                                        [&](const double *in, double *out) { return s.visible(view, in, out); });
+            },
+            nb::arg("frame"), nb::arg("points"), "As project, but ok is false also where something stands between.")
+        .def(
+            "flow",
+            [](const Scene &s, int a, int b, const Points2 &px) {
+                FrameView view_a(s, checked_frame(s, a)), view_b(s, checked_frame(s, b));
+                return map_points<2, 2>(px,
+                                        [&](const double *in, double *out) { return s.flow(view_a, view_b, in, out); });
+            },
+            nb::arg("a"), nb::arg("b"), nb::arg("px"), "(N, 2) pixels of frame a -> (N, 2) pixels of frame b, ok (N,).")
+        .def(
             "locate",
             [](const Scene &s, const Points3 &points) {
-                return map_points<3, 3>(0, points, [&s](int, const double *in, double *out) {
+                return map_points<3, 3>(points, [&s](const double *in, double *out) {
                     WallPoint at{};
                     const bool ok = s.tube().locate(Eigen::Map<const Eigen::Vector3d>(in), at);
                     out[0] = at.s;
@@ -276,6 +328,30 @@ void bind_sim(nb::module_ &m)
         .def(
             "wall", [](const Scene &s, double at, double phi) { return s.tube().wall(at, phi); }, nb::arg("s"),
             nb::arg("phi"), "The wall point at arc length s and clock angle phi, (3,).")
+        .def(
+            "wall_radius", [](const Scene &s, double at, double phi) { return s.tube().wall_radius(at, phi); },
+            nb::arg("s"), nb::arg("phi"), "From the axis to the wall, metres.")
+        .def_prop_ro(
+            "joints",
+            [](const Scene &s) {
+                nb::list out;
+                for (JointSpec joint : s.tube().joints()) {
+                    Writer writer;
+                    fields(writer, joint);
+                    out.append(writer.out);
+                }
+                return out;
+            },
+            "All joints, those of the series among them, in order.")
+        .def(
+            "crack_path",
+            [](const Scene &s, size_t crack) {
+                std::vector<std::pair<double, double>> out;
+                for (const PathPoint &p : s.tube().cracks().at(crack).path())
+                    out.emplace_back(p.s, p.phi);
+                return out;
+            },
+            nb::arg("crack"), "Its corners (s, phi), with the meander.")
         .def(
             "section",
             [](const Scene &s, double at) {

@@ -59,6 +59,18 @@ public:
             number(path_ + name + "[" + std::to_string(i) + "]", nb::handle(item[i]), values[i], least, most);
     }
 
+    void operator()(const char *name, std::vector<double> &list, double least, double most)
+    {
+        const nb::handle item = take(name);
+        if (!item.is_valid())
+            return;
+        if (!nb::isinstance<nb::list>(item))
+            fail(path_ + name, "must be a list of numbers");
+        list.resize(nb::len(item));
+        for (size_t i = 0; i < list.size(); i++)
+            number(path_ + name + "[" + std::to_string(i) + "]", nb::handle(item[i]), list[i], least, most);
+    }
+
     void operator()(const char *name, bool &value)
     {
         const nb::handle item = take(name);
@@ -166,6 +178,14 @@ public:
     {
         nb::list items;
         for (T value : values)
+            items.append(value);
+        out[name] = items;
+    }
+
+    void operator()(const char *name, std::vector<double> &list, double, double)
+    {
+        nb::list items;
+        for (double value : list)
             items.append(value);
         out[name] = items;
     }

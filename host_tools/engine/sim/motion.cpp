@@ -176,7 +176,7 @@ double Trajectory::walked_roll(double distance) const
 
 Eigen::Vector3d Trajectory::nominal(double s) const
 {
-    const Frame3 f = tube_.frame(s);
+    const Frame3 f = tube_.ride(s);
     return f.origin + spec_.below_axis * f.world_from_frame.col(1);
 }
 
@@ -186,7 +186,7 @@ CameraState Trajectory::at(double time) const
     CameraState c{};
     c.s = spec_.start + d;
     const Eigen::Vector3d here = nominal(c.s);
-    const Eigen::Matrix3d section = tube_.frame(c.s).world_from_frame;
+    const Eigen::Matrix3d section = tube_.ride(c.s).world_from_frame;
     const Eigen::Vector3d z = (nominal(c.s + spec_.lookahead) - here).normalized();
     const Eigen::Vector3d y = z.cross(section.col(0)).normalized();
     Eigen::Matrix3d look;

@@ -51,6 +51,11 @@ enum Stream : uint64_t {
     STREAM_DROP = 24,
     STREAM_SLIP_EVENT = 25,
     STREAM_PATTERN = 26,
+    STREAM_JOINT = 30,
+    STREAM_GRAIN = 31,
+    STREAM_CRACK = 32,
+    STREAM_ROOT = 33,
+    STREAM_RIPPLE = 34,
     STREAM_WINDOW = 40, // and 41
     STREAM_ROUNDING = 42,
     STREAM_SURFACE = 1000, // and up: one a layer of the surface

@@ -26,6 +26,20 @@ int texels_around(const Lens &lens)
     return around;
 }
 
+// Wheels dip into the joints' gaps, as deep as their roundness lets them. Steps and angles are the tube's ride().
+MotionSpec over_joints(MotionSpec motion, const std::vector<JointSpec> &joints)
+{
+    constexpr double WHEEL = 0.03; // metres, radius
+    for (const JointSpec &joint : joints) {
+        const double half = 0.5 * joint.gap;
+        if (half > 0.0) {
+            const double dip = half < WHEEL ? WHEEL - std::sqrt(WHEEL * WHEEL - half * half) : WHEEL;
+            motion.bumps.push_back({joint.s + half, joint.gap, -std::min(dip, joint.depth), 0.0});
+        }
+    }
+    return motion;
+}
+
 } // namespace
 
 // Ahead as far as the lamps light the wall to a tenth of a grey level: the light falls with (radius / distance)^3.
@@ -41,9 +55,9 @@ Scene::Reach Scene::lit_reach(const SceneSpec &spec)
 }
 
 Scene::Scene(const SceneSpec &spec)
-    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals), lens_(spec.lens),
-      trajectory_(tube_, spec.motion), frames_(trajectory_.frames()), readings_(measure(frames_, spec.telemetry)),
-      reach_(lit_reach(spec))
+    : spec_(spec), tube_(0.5 * spec.diameter, spec.pieces, spec.ovals, spec.features), lens_(spec.lens),
+      trajectory_(tube_, over_joints(spec.motion, tube_.joints())), frames_(trajectory_.frames()),
+      readings_(measure(frames_, spec.telemetry)), reach_(lit_reach(spec))
 {
     spec_.lens.theta_max = lens_.theta_max();
     spec_.lens.circle_radius = lens_.circle_radius();
@@ -164,22 +178,62 @@ CameraState Scene::camera(int frame, double v) const
     return frames_[static_cast<size_t>(frame)];
 }
 
-bool Scene::cast(int frame, const double px[2], double world[3]) const
+Gaze Scene::gaze(double time) const
 {
-    return cast_from(camera(frame, px[1]), px, world);
+    const CameraState camera = trajectory_.at(time);
+    return {camera, Tube::View(tube_, camera.world_from_cam, camera.centre, time)};
 }
 
-bool Scene::cast_from(const CameraState &camera, const double px[2], double world[3]) const
+const Gaze &FrameView::at(double v)
+{
+    const double time = scene_.row_time(frame_, v);
+    if (!gaze_ || time != time_) {
+        gaze_.emplace(scene_.gaze(time));
+        time_ = time;
+    }
+    return *gaze_;
+}
+
+bool Scene::see(FrameView &from, const double px[2], Seen &seen) const
+{
+    return see_from(from.at(px[1]), px, seen);
+}
+
+bool Scene::see_from(const Gaze &from, const double px[2], Seen &seen) const
 {
     PixelRay r{};
-    Hit hit{};
-    const Tube::View view(tube_, camera.world_from_cam, camera.centre);
-    if (!ray(px, r) || !view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
+    if (!ray(px, r)) {
         return false;
     }
-    const Eigen::Vector3d local(hit.t * r.dx, hit.t * r.dy, r.pupil + hit.t * r.dz);
-    Eigen::Map<Eigen::Vector3d>(world, 3) = camera.centre + camera.world_from_cam * local;
+    const Eigen::Vector3d origin(0.0, 0.0, r.pupil), direction(r.dx, r.dy, r.dz);
+    Sight &sight = seen.sight;
+    if (!from.view.see(origin, direction, sight)) {
+        return false;
+    }
+    const CameraState &camera = from.camera;
+    seen.point = camera.centre + camera.world_from_cam * (origin + sight.first.t * direction);
+    seen.normal = camera.world_from_cam * sight.first.normal;
+    if (sight.mirrors) {
+        seen.mirrored = camera.centre + camera.world_from_cam * (sight.origin + sight.second.t * sight.direction);
+    }
     return true;
+}
+
+bool Scene::visible(FrameView &from, const double world[3], double px[2]) const
+{
+    Seen seen{};
+    if (!project(from.frame(), world, px) || !see(from, px, seen)) {
+        return false;
+    }
+    const Eigen::Vector3d &centre = from.at(px[1]).camera.centre;
+    const double distance = (Eigen::Map<const Eigen::Vector3d>(world) - centre).norm();
+    return (seen.point - centre).norm() > distance - 1e-6 * tube_.radius();
+}
+
+bool Scene::flow(FrameView &a, FrameView &b, const double px[2], double out[2]) const
+{
+    Seen seen{};
+    return see(a, px, seen) && seen.sight.first.material != Material::WATER && visible(b, seen.point.data(), out);
 }
 
 bool Scene::project(int frame, const double world[3], double px[2]) const

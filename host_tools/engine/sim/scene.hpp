@@ -25,6 +25,7 @@ struct SceneSpec {
     std::vector<Piece> pieces;
     std::vector<OvalStretch> ovals;
     std::vector<Marker> markers;
+    FeatureSpec features;
     TextureSpec texture;
     LensSpec lens;
     LampSpec lamp;
@@ -37,7 +38,36 @@ struct SceneSpec {
     TelemetrySpec telemetry;
 };
 
-struct RowHits;
+struct Seen {
+    Sight sight;                             // in the camera's frame
+    Eigen::Vector3d point, normal, mirrored; // world; `mirrored` if sight.mirrors
+};
+
+struct Gaze { // a camera at a moment, and the tube as it sees it
+    CameraState camera;
+    Tube::View view;
+};
+
+class Scene;
+
+// The camera during a frame: one Gaze, or with a rolling shutter one a row, of which the last one is kept. Borrows the
+// scene.
+class FrameView
+{
+public:
+    FrameView(const Scene &scene, int frame) : scene_(scene), frame_(frame) {}
+    int frame() const { return frame_; }
+    const Gaze &at(double v); // in the middle of the exposure of row v (pixels, any real number)
+
+private:
+    const Scene &scene_;
+    int frame_;
+    double time_ = 0.0;
+    std::optional<Gaze> gaze_{};
+};
+
+struct RowPoints;
+struct Met;
 
 class Scene
 {
@@ -64,10 +94,15 @@ public:
     // Factor of a frame's light: lamps' flicker (in its middle row) times the exposure's gain.
     double light_level(int frame);
 
-    // Where the ray of a pixel meets the wall, world. False outside the circle and the sensor.
-    bool cast(int frame, const double px[2], double world[3]) const;
+    Gaze gaze(double time) const; // seconds since frame 0
+    // What the ray of a pixel meets first, and what that mirrors. False outside the circle and the sensor.
+    bool see(FrameView &from, const double px[2], Seen &seen) const;
     // The pixel of a world point, not asking what stands between. False outside the field, the circle and the sensor.
     bool project(int frame, const double world[3], double px[2]) const;
+    // Does nothing stand between the camera and the point? It must project.
+    bool visible(FrameView &from, const double world[3], double px[2]) const;
+    // Where the point seen by a pixel of frame `a` is in frame `b`; false where it is hidden or outside, and on water.
+    bool flow(FrameView &a, FrameView &b, const double px[2], double out[2]) const;
 
 private:
     struct PixelRay {
@@ -86,20 +121,31 @@ private:
     void make_spread();
     void make_patterns();
     int exposures(int frame) const; // how many sharp pictures make up a blurred one
-    bool cast_from(const CameraState &camera, const double px[2], double world[3]) const;
+    bool see_from(const Gaze &from, const double px[2], Seen &seen) const;
     bool project_from(const CameraState &camera, const double world[3], double px[2]) const;
-    RowHits cast_row(const Tube::View &view, int row, Buffers &buffers) const;
     struct Shading;
+    struct Place {
+        float row, column; // of the surface, texels
+    };
     struct Footprint {
         float along, across; // texels
     };
+    Place place(const Hit &hit) const;
+    void cast_row(const Tube::View &view, int row, Buffers &buffers) const;
     void make_shading();
+    void set_looks();
     void make_veil();
     double flicker(int frame, double row) const;
     std::vector<float> meter(int frame) const;
     void prepare_shading(const CameraState &camera);
     Footprint footprint(int row, int x, size_t own, const Buffers &buffers) const;
-    void shade_row(int frame, int row, Buffers &buffers) const;
+    void put(const Tube::View &view, const Met &met, const Texel &wall, size_t slot, RowPoints &out) const;
+    void put_sight(const Tube::View &view, const PixelRay &r, const Sight &sight, const Footprint *size, float weight,
+                   uint32_t pixel, RowPoints &out) const;
+    void divide(const Tube::View &view, int x, int row, const Footprint &size, RowPoints &out) const;
+    RowPoints gather_row(const Tube::View &view, int row, Buffers &buffers) const;
+    void find_shadows(const Tube::View &view, RowPoints &points) const;
+    void shade_row(int frame, const Tube::View &view, int row, Buffers &buffers) const;
     void blur_along_row(int row, Buffers &buffers) const;
     void blur_across_row(int row, Buffers &buffers) const;
     void spread_across_row(int row, Buffers &buffers) const;

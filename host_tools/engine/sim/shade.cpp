@@ -5,6 +5,7 @@
 #include "sim/buffers.hpp"
 #include "sim/parallel.hpp"
 #include "sim/scene.hpp"
+#include "sim/wide.hpp"
 
 #include <Eigen/Geometry>
 
@@ -26,11 +27,13 @@ struct Block {
     float matt[BLOCK], shine[BLOCK];
 };
 
-// Light of one lamp: E (1 - R) onto `matt`, E pi D V F onto `shine`, with E the irradiance. FOGGY dims it on its way.
-template <bool FOGGY, typename Power>
-void add_lamp(const Samples &p, size_t from, size_t n, const Lamp lamp, const Lighting &light, const Power &power,
-              Block &block)
+// Light of one lamp: E (1 - R) onto `matt`, E pi D V F onto `shine`, with E the irradiance. FOGGY dims it on its way,
+// SHADED by p.lit.
+template <bool FOGGY, bool SHADED, typename Power>
+[[gnu::always_inline]] inline void add_lamp(const Samples &p, size_t from, size_t n, size_t which,
+                                            const Lighting &light, const Power &power, Block &block)
 {
+    const Lamp lamp = light.lamps[which];
     const float *__restrict const x = p.x.data() + from, *__restrict const y = p.y.data() + from,
                                   *__restrict const z = p.z.data() + from;
     const float *__restrict const nx = p.nx.data() + from, *__restrict const ny = p.ny.data() + from,
@@ -39,6 +42,7 @@ void add_lamp(const Samples &p, size_t from, size_t n, const Lamp lamp, const Li
                                   *__restrict const vz = p.vz.data() + from;
     const float *__restrict const nv = p.nv.data() + from, *__restrict const alpha2 = p.alpha2.data() + from;
     const float *__restrict const alpha = block.alpha, *__restrict const rise = block.rise;
+    const float *__restrict const lit = SHADED ? p.lit.data() + which * p.size() + from : nullptr;
     float *__restrict const matt = block.matt, *__restrict const shine = block.shine;
     const float gloss = light.gloss, widen = light.widen, density = light.density;
     for (size_t i = 0; i < n; i++) {
@@ -51,20 +55,25 @@ void add_lamp(const Samples &p, size_t from, size_t n, const Lamp lamp, const Li
         if constexpr (FOGGY) {
             light_on *= std::exp(-density * d2 * inverse);
         }
+        if constexpr (SHADED) {
+            light_on *= lit[i];
+        }
         matt[i] += light_on * (1.0f - gloss * (F0 + rise[i] * power5(1.0f - nl)));
         shine[i] += light_on * mirrored(nl, nv[i], lv, alpha2[i] + widen * fall, alpha[i]);
     }
 }
 
-template <bool FOGGY> void add_lamps(const Samples &p, size_t from, size_t n, const Lighting &light, Block &block)
+template <bool FOGGY, bool SHADED>
+[[gnu::always_inline]] inline void add_lamps(const Samples &p, size_t from, size_t n, const Lighting &light,
+                                             Block &block)
 {
-    for (const Lamp &lamp : light.lamps) {
+    for (size_t lamp = 0; lamp < light.lamps.size(); lamp++) {
         if (light.exponent == 2) {
-            add_lamp<FOGGY>(
+            add_lamp<FOGGY, SHADED>(
                 p, from, n, lamp, light, [](float c) { return c * c; }, block);
         } else {
             const int exponent = light.exponent;
-            add_lamp<FOGGY>(
+            add_lamp<FOGGY, SHADED>(
                 p, from, n, lamp, light,
                 [exponent](float c) {
                     float power = 1.0f;
@@ -101,12 +110,12 @@ float level(const Samples &p, size_t i, const Lighting &light, float matt, float
     const float taken = F0 + rise * power5(1.0f - p.nv[i]);
     float seen = 0.0f;
     if (light.bounce > 0.0f) {
-        matt += light.bounce * light.ambient.bounced(p.along[i]);
+        matt += p.sky[i] * light.bounce * light.ambient.bounced(p.along[i]);
         // A ray through the axis meets the wall again as far on as the tangent of its angle of incidence says.
         const float tangent = std::sqrt(std::max(1.0f - p.nv[i] * p.nv[i], 0.0f)) / p.nv[i];
         const float there = p.along[i] + std::copysign(2.0f * light.radius * tangent, p.along[i]);
-        seen =
-            light.bounce * light.albedo * (light.ambient.direct(there) + light.bounce * light.ambient.bounced(there));
+        seen = p.sky[i] * light.bounce * light.albedo *
+               (light.ambient.direct(there) + light.bounce * light.ambient.bounced(there));
     }
     const float sum = p.albedo[i] * (1.0f - light.gloss * taken) * matt + light.gloss * (shine + taken * seen);
     return light.density > 0.0f
@@ -116,7 +125,7 @@ float level(const Samples &p, size_t i, const Lighting &light, float matt, float
 
 } // namespace
 
-void shade(const Samples &p, const Lighting &light, float *out)
+PIPEFISH_WIDE void shade(const Samples &p, const Lighting &light, float *out)
 {
     for (size_t from = 0; from < p.size(); from += BLOCK) {
         const size_t n = std::min(BLOCK, p.size() - from);
@@ -126,28 +135,17 @@ void shade(const Samples &p, const Lighting &light, float *out)
             block.rise[i] = rise_of(block.alpha[i]);
         }
         if (light.density > 0.0f) {
-            add_lamps<true>(p, from, n, light, block);
+            p.lit.empty() ? add_lamps<true, false>(p, from, n, light, block)
+                          : add_lamps<true, true>(p, from, n, light, block);
         } else {
-            add_lamps<false>(p, from, n, light, block);
+            p.lit.empty() ? add_lamps<false, false>(p, from, n, light, block)
+                          : add_lamps<false, true>(p, from, n, light, block);
         }
         for (size_t i = 0; i < n; i++) {
             out[from + i] = light.scale * level(p, from + i, light, block.matt[i], block.shine[i], block.rise[i]);
         }
     }
 }
-
-namespace
-{
-
-// A wall's normal tilted by its relief: t_s along the pipe, t_c clockwise.
-void tilt(const Texel &texel, const Eigen::Vector3f &normal, const Eigen::Vector3f &axis, Samples &out, size_t i)
-{
-    const Eigen::Vector3f clockwise = normal.cross(axis).normalized(), along = clockwise.cross(normal);
-    const Eigen::Vector3f n = (normal - texel.slope_s * along - texel.slope_clock * clockwise).normalized();
-    out.set_normal(i, n);
-}
-
-} // namespace
 
 void Scene::make_shading()
 {
@@ -159,6 +157,7 @@ void Scene::make_shading()
     Window window(spec_.window, spec_.lens.width, spec_.lens.height, spec_.lens.c_u, spec_.lens.c_v,
                   lens_.circle_radius());
     shading_ = std::make_unique<Shading>(Shading{std::move(lighting), std::move(window)});
+    set_looks();
     if (spec_.fog.density > 0.0) {
         make_veil();
     }
@@ -191,34 +190,24 @@ std::vector<float> Scene::meter(int frame) const
 {
     constexpr int ACROSS = 20;
     const FrameState &f = frames_[static_cast<size_t>(frame)];
-    const Tube::View view(tube_, f.world_from_cam, f.centre);
-    const WallLook look = wall_look(spec_.texture);
+    const Gaze from = gaze(f.time);
     const double step = 2.0 * lens_.circle_radius() / ACROSS;
-    Samples samples(ACROSS * ACROSS);
-    size_t n = 0;
+    RowPoints points(0, f.s);
+    uint32_t n = 0;
     for (int k = 0; k < ACROSS * ACROSS; k++) {
         const double px[2] = {spec_.lens.c_u - lens_.circle_radius() + (k % ACROSS + 0.5) * step,
                               spec_.lens.c_v - lens_.circle_radius() + (k / ACROSS + 0.5) * step};
         PixelRay r{};
-        Hit hit{};
-        if (!ray(px, r) || !view.cast({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, hit)) {
-            continue;
+        Sight sight{};
+        if (ray(px, r) && from.view.see({0.0, 0.0, r.pupil}, {r.dx, r.dy, r.dz}, sight)) {
+            put_sight(from.view, r, sight, nullptr, 1.0f, n++, points);
         }
-        samples.x[n] = static_cast<float>(hit.t * r.dx);
-        samples.y[n] = static_cast<float>(hit.t * r.dy);
-        samples.z[n] = static_cast<float>(r.pupil + hit.t * r.dz);
-        samples.vx[n] = static_cast<float>(-r.dx);
-        samples.vy[n] = static_cast<float>(-r.dy);
-        samples.vz[n] = static_cast<float>(-r.dz);
-        samples.set_normal(n, hit.normal.cast<float>());
-        samples.albedo[n] = look.albedo;
-        samples.alpha2[n] = look.alpha * look.alpha;
-        samples.along[n] = static_cast<float>(hit.s - f.s);
-        n++;
     }
-    std::vector<float> out(samples.size());
-    shade(samples, shading_->lighting, out.data());
-    out.resize(n);
+    std::vector<float> levels(points.samples.size()), out(n, 0.0f);
+    shade(points.samples, shading_->lighting, levels.data());
+    for (size_t i = 0; i < levels.size(); i++) {
+        out[points.pixel[i]] += points.weight[i] * levels[i];
+    }
     const float level = static_cast<float>(flicker(frame, 0.5 * (spec_.lens.height - 1)));
     for (float &place : out) {
         place *= level;
@@ -284,88 +273,27 @@ void Scene::prepare_shading(const CameraState &f)
     }
 }
 
-// How many texels a pixel covers along and around, from its neighbours' places. Where one neighbour lies far away (an
-// edge stands between), the other one counts.
-Scene::Footprint Scene::footprint(int row, int x, size_t own, const Buffers &buffers) const
-{
-    const int height = spec_.lens.height;
-    const float around = static_cast<float>(surface_->around());
-    const auto step = [&](int at_x, int at_y, float &along, float &across) {
-        const size_t at = static_cast<size_t>(at_y);
-        if (at_y < 0 || at_y >= height || at_x < row_from_[at] || at_x >= row_to_[at]) {
-            return -1.0f;
-        }
-        const size_t other = row_offset_[at] + static_cast<size_t>(at_x - row_from_[at]);
-        along = buffers.texel_row[other] - buffers.texel_row[own];
-        across = buffers.texel_column[other] - buffers.texel_column[own];
-        across -= around * std::nearbyint(across / around);
-        return along * along + across * across;
-    };
-    Footprint sum{0.0f, 0.0f};
-    const auto direction = [&](int dx, int dy) {
-        float along_a = 0.0f, across_a = 0.0f, along_b = 0.0f, across_b = 0.0f;
-        const float a = step(x + dx, row + dy, along_a, across_a), b = step(x - dx, row - dy, along_b, across_b);
-        if (a < 0.0f && b < 0.0f) {
-            return;
-        }
-        constexpr float FAR = 16.0f; // four times the other's distance, squared
-        float along, across;
-        if (b < 0.0f || (a >= 0.0f && b > FAR * a)) {
-            along = along_a, across = across_a;
-        } else if (a < 0.0f || a > FAR * b) {
-            along = along_b, across = across_b;
-        } else {
-            along = 0.5f * (along_a - along_b), across = 0.5f * (across_a - across_b);
-        }
-        sum.along += along * along;
-        sum.across += across * across;
-    };
-    direction(1, 0);
-    direction(0, 1);
-    return {std::sqrt(sum.along), std::sqrt(sum.across)};
-}
-
-void Scene::shade_row(int frame, int row, Buffers &buffers) const
+void Scene::shade_row(int frame, const Tube::View &view, int row, Buffers &buffers) const
 {
     const size_t at = static_cast<size_t>(row), width = static_cast<size_t>(spec_.lens.width);
     const size_t from = static_cast<size_t>(row_from_[at]), n = static_cast<size_t>(row_to_[at]) - from;
-    const RowHits &hits = buffers.hits[at];
     const Shading &now = *shading_;
     const float gain = static_cast<float>(now.gain[static_cast<size_t>(frame)] * flicker(frame, row)) * buffers.share;
-    Samples samples(n);
-    samples.x = hits.x;
-    samples.y = hits.y;
-    samples.z = hits.z;
-    const double texel = surface_->texel(), base = surface_->base();
-    for (size_t i = 0; i < n; i++) {
-        const size_t own = row_offset_[at] + i;
-        const PixelRay &ray = rays_[own];
-        samples.vx[i] = static_cast<float>(-ray.dx);
-        samples.vy[i] = static_cast<float>(-ray.dy);
-        samples.vz[i] = static_cast<float>(-ray.dz);
-        const Eigen::Vector3f normal(hits.nx[i], hits.ny[i], hits.nz[i]);
-        if (normal.isZero()) {
-            continue;
-        }
-        const Footprint size = footprint(row, static_cast<int>(from + i), own, buffers);
-        const Texel wall = surface_->sample(buffers.texel_row[own], buffers.texel_column[own], size.along, size.across);
-        const double s = base + static_cast<double>(buffers.texel_row[own]) * texel;
-        const double node = std::clamp((s - now.start) * now.per_metre, 0.0, static_cast<double>(now.axis.size() - 1));
-        tilt(wall, normal, now.axis[static_cast<size_t>(node)], samples, i);
-        samples.albedo[i] = wall.albedo;
-        samples.alpha2[i] = wall.alpha2;
-        samples.along[i] = static_cast<float>(s - now.camera_s);
+    RowPoints points = gather_row(view, row, buffers);
+    find_shadows(view, points);
+    std::vector<float> levels(points.samples.size()), sum(n, 0.0f);
+    shade(points.samples, now.lighting, levels.data());
+    for (size_t i = 0; i < levels.size(); i++) {
+        sum[points.pixel[i]] += points.weight[i] * levels[i];
     }
+    const RowHits &hits = buffers.hits[at];
     float *const line = buffers.image.data() + at * width + from;
-    std::vector<float> levels(n);
-    shade(samples, now.lighting, levels.data());
     for (size_t i = 0; i < n; i++) {
-        float level = levels[i];
         if (!now.veil.nodes.empty()) {
             const float depth = std::sqrt(hits.x[i] * hits.x[i] + hits.y[i] * hits.y[i] + hits.z[i] * hits.z[i]);
-            level += now.veil.at(static_cast<float>(from + i), static_cast<float>(row), depth);
+            sum[i] += now.veil.at(static_cast<float>(from + i), static_cast<float>(row), depth);
         }
-        line[i] += level * vignette_[row_offset_[at] + i] * gain;
+        line[i] += sum[i] * vignette_[row_offset_[at] + i] * gain;
     }
 }
 

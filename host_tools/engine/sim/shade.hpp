@@ -20,12 +20,24 @@ struct Samples {
     std::vector<float> nv;             // n.v, at least 0.02
     std::vector<float> albedo, alpha2; // alpha2: squared roughness
     std::vector<float> along;          // arc length ahead of the camera, metres
+    std::vector<float> sky;            // share of the pipe's own light that reaches the point
+    std::vector<float> lit;            // lamp by lamp, factors of its light on every point; empty: all 1
 
     explicit Samples(size_t n)
-        : x(n), y(n), z(n), nx(n), ny(n), nz(n), vx(n), vy(n), vz(n), nv(n, 1.0f), albedo(n), alpha2(n, 1.0f), along(n)
+        : x(n), y(n), z(n), nx(n), ny(n), nz(n), vx(n), vy(n), vz(n), nv(n, 1.0f), albedo(n), alpha2(n, 1.0f), along(n),
+          sky(n, 1.0f)
     {
     }
     size_t size() const { return x.size(); }
+    void resize(size_t n)
+    {
+        for (std::vector<float> *part : {&x, &y, &z, &nx, &ny, &nz, &vx, &vy, &vz, &albedo, &along}) {
+            part->resize(n);
+        }
+        nv.resize(n, 1.0f);
+        alpha2.resize(n, 1.0f);
+        sky.resize(n, 1.0f);
+    }
     // Unit normal of point i; its view must be set.
     void set_normal(size_t i, const Eigen::Vector3f &n)
     {

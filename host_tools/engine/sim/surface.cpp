@@ -1,5 +1,7 @@
 #include "sim/surface.hpp"
 
+#include "sim/wide.hpp"
+
 #include "sim/parallel.hpp"
 
 #include <array>
@@ -141,7 +143,7 @@ void Surface::reduce(int64_t chunk)
     }
 }
 
-Texel Surface::sample(float row, float column, float width_row, float width_column) const
+PIPEFISH_WIDE Texel Surface::sample(float row, float column, float width_row, float width_column) const
 {
     const float rows = static_cast<float>((last_chunk_ - first_chunk_ + 1) * CHUNK);
     if (!(row >= 0.0f && row < rows)) {

@@ -30,6 +30,11 @@ double smooth_step(double x, double &slope)
     return x * x * x * (x * (6.0 * x - 15.0) + 10.0);
 }
 
+double length_of(const Piece &piece)
+{
+    return piece.angle != 0.0 ? piece.angle * piece.radius : piece.length;
+}
+
 double wrap_clock(double clock)
 {
     const double c = std::fmod(clock, TWO_PI);
@@ -38,8 +43,10 @@ double wrap_clock(double clock)
 
 } // namespace
 
-Tube::Tube(double radius, const std::vector<Piece> &pieces, const std::vector<OvalStretch> &ovals)
-    : radius_(radius), length_(0.0), ovals_(ovals)
+Tube::Tube(double radius, const std::vector<Piece> &pieces, const std::vector<OvalStretch> &ovals,
+           const FeatureSpec &features)
+    : radius_(radius), length_(0.0), largest_radius_(radius), ovals_(ovals), water_(features.water),
+      roots_(features.roots)
 {
     double ovality = 0.0;
     for (const OvalStretch &o : ovals_) {
@@ -47,64 +54,148 @@ Tube::Tube(double radius, const std::vector<Piece> &pieces, const std::vector<Ov
         const double e = 0.5 * o.ovality * radius_;
         largest_.emplace_back(e * std::cos(2.0 * o.clock), e * std::sin(2.0 * o.clock));
         if (!(o.ramp > 0.0) || !(o.start + 2.0 * o.ramp <= o.end)) {
-            throw std::invalid_argument("an oval stretch must be at least two ramps long");
+            throw SpecError("ovals: a stretch must be at least two ramps long");
         }
     }
     if (ovality > 0.5) {
-        throw std::invalid_argument("the ovality of all stretches together must be at most 0.5");
+        throw SpecError("ovals: the ovality of all stretches together must be at most 0.5");
+    }
+    for (const Piece &piece : pieces) {
+        length_ += length_of(piece);
+    }
+    reliefs_ = make_reliefs(features, radius_);
+    joints_ = all_joints(features, radius_, length_);
+    for (const Crack &crack : features.cracks) {
+        cracks_.emplace_back(crack, radius_);
+    }
+    largest_radius_ *= 1.0 + 0.5 * ovality;
+    for (const auto &relief : reliefs_) {
+        largest_radius_ += relief->bounds(relief->from, relief->to).most;
     }
     // Straight segments before the start and after the end; their outer ends are never reached.
-    Frame3 frame{Eigen::Matrix3d::Identity(), {0.0, 0.0, -END_RUN}};
-    double s = -END_RUN;
-    add_segments(Piece{END_RUN, 0.0, 0.0, 0.0}, s, frame);
+    Growth growth{-END_RUN, {Eigen::Matrix3d::Identity(), {0.0, 0.0, -END_RUN}}, Eigen::Vector3d::UnitZ(), false, 0};
+    add_segments(Piece{END_RUN, 0.0, 0.0, 0.0}, growth);
     for (const Piece &piece : pieces) {
-        if (piece.angle != 0.0 && !(piece.radius > 1.25 * radius_ * (1.0 + 0.5 * ovality))) {
-            throw std::invalid_argument("a bend's radius must be above 1.25 times the pipe's largest radius");
+        if (piece.angle != 0.0 && !(piece.radius > 1.25 * largest_radius_)) {
+            throw SpecError("pieces: a bend's radius must be above 1.25 times the pipe's largest radius");
         }
-        add_segments(piece, s, frame);
+        add_segments(piece, growth);
     }
-    length_ = s;
-    add_segments(Piece{END_RUN, 0.0, 0.0, 0.0}, s, frame);
+    add_segments(Piece{END_RUN, 0.0, 0.0, 0.0}, growth);
+    add_openings(features);
 }
 
-void Tube::add_segments(const Piece &piece, double &s, Frame3 &frame)
+void Tube::add_segments(const Piece &piece, Growth &growth)
 {
     // Cuts where the section starts or stops changing, so that most segments have a constant one; bends into at most 60
     // degrees, so that a segment's end planes meet only far outside the wall.
-    const double length = piece.angle != 0.0 ? piece.angle * piece.radius : piece.length;
-    std::vector<double> cuts{s, s + length};
+    const double length = length_of(piece), s = growth.s, s_end = s + length;
+    std::vector<double> cuts{s, s_end};
+    const auto cut = [&](double c) {
+        if (c > s + 1e-9 && c < s_end - 1e-9) {
+            cuts.push_back(c);
+        }
+    };
     for (const OvalStretch &o : ovals_) {
         for (const double c : {o.start, o.start + o.ramp, o.end - o.ramp, o.end}) {
-            if (c > s + 1e-9 && c < s + length - 1e-9) {
-                cuts.push_back(c);
-            }
+            cut(c);
         }
+    }
+    for (const auto &relief : reliefs_) {
+        std::ranges::for_each(relief->cuts(), cut);
+    }
+    for (const Water &w : water_) {
+        cut(w.start);
+        cut(w.end);
     }
     const int parts = std::max(1, static_cast<int>(std::ceil(piece.angle / MAX_SEGMENT_ANGLE)));
     for (int i = 1; i < parts; i++) {
         cuts.push_back(s + length * i / parts);
     }
-    std::sort(cuts.begin(), cuts.end());
-    for (size_t i = 0; i + 1 < cuts.size(); i++) {
-        Segment segment{};
-        segment.s0 = cuts[i];
-        segment.length = cuts[i + 1] - cuts[i];
-        if (segment.length < 1e-9) {
+    // A joint begins where the pipe before it ends; nothing else cuts so near to it that planes tilted by its angle
+    // could meet inside the pipe.
+    for (const JointSpec &joint : joints_) {
+        const double from = joint.s, to = from + joint.gap;
+        const double tilt = 1.2 * largest_radius_ * std::tan(std::hypot(joint.yaw, joint.pitch));
+        if (to <= s || from >= s_end) {
             continue;
         }
-        segment.bend_radius = piece.angle != 0.0 ? piece.radius : 0.0;
-        segment.bend_angle = piece.angle != 0.0 ? segment.length / piece.radius : 0.0;
-        segment.nx = std::sin(piece.clock);
-        segment.ny = -std::cos(piece.clock);
-        segment.frame = frame;
-        set_section_bounds(segment);
-        segments_.push_back(segment);
-        frame = advance(frame, segment, segment.length);
+        if (piece.angle != 0.0 || from - tilt < s || to + tilt > s_end) {
+            throw SpecError("joints at " + std::to_string(from) + " m: must lie in a straight run");
+        }
+        std::erase_if(cuts,
+                      [&](double c) { return c > s && c < s_end && c > from - 1e-9 - tilt && c < to + tilt + 1e-9; });
+        cuts.push_back(from);
+        if (to > from) {
+            cuts.push_back(to);
+        }
     }
-    s += length;
+    std::sort(cuts.begin(), cuts.end());
+    for (size_t i = 0; i + 1 < cuts.size(); i++) {
+        if (cuts[i + 1] - cuts[i] > 1e-9) {
+            add_segment(piece, cuts[i], cuts[i + 1], growth);
+        }
+    }
+    growth.s = s_end;
 }
 
-void Tube::set_section_bounds(Segment &segment) const
+void Tube::add_segment(const Piece &piece, double from, double to, Growth &growth)
+{
+    Segment segment{};
+    segment.s0 = from;
+    segment.length = to - from;
+    segment.bend_radius = piece.angle != 0.0 ? piece.radius : 0.0;
+    segment.bend_angle = piece.angle != 0.0 ? segment.length / piece.radius : 0.0;
+    segment.nx = std::sin(piece.clock);
+    segment.ny = -std::cos(piece.clock);
+    segment.frame = growth.frame;
+    segment.start_normal = growth.start_normal;
+    segment.face = growth.face;
+    segment.pipe = growth.pipe;
+    segment.joint = -1;
+    const double c = std::cos(segment.bend_angle), si = std::sin(segment.bend_angle);
+    segment.end_normal = {si * segment.nx, si * segment.ny, c};
+    segment.end_offset = segment.bend_radius > 0.0 ? segment.bend_radius * si : segment.length;
+    growth.frame = advance(growth.frame, segment, segment.length);
+    growth.start_normal = Eigen::Vector3d::UnitZ();
+    growth.face = false;
+    for (size_t j = 0; j < joints_.size(); j++) {
+        const JointSpec &joint = joints_[j];
+        const double end = joint.s + joint.gap;
+        if (from > joint.s - 1e-9 && to < end + 1e-9) {
+            segment.joint = static_cast<int>(j);
+            segment.groove = joint.depth;
+        }
+        if (std::abs(to - end) < 1e-9) { // the next pipe begins
+            before_.push_back(growth.frame);
+            before_.back().origin -= joint.gap * growth.frame.world_from_frame.col(2);
+            const double angle = std::hypot(joint.yaw, joint.pitch);
+            const Eigen::Vector3d z = Eigen::Vector3d::UnitZ(), step(joint.step_right, joint.step_down, 0.0);
+            Eigen::Matrix3d turn = Eigen::Matrix3d::Identity();
+            if (angle > 0.0) {
+                const Eigen::Vector3d towards(joint.yaw / angle, joint.pitch / angle, 0.0);
+                turn = Eigen::AngleAxisd(angle, z.cross(towards)).toRotationMatrix();
+            }
+            growth.frame.origin += growth.frame.world_from_frame * step;
+            growth.frame.world_from_frame = growth.frame.world_from_frame * turn;
+            if (joint.gap > 0.0) { // the groove ends at the next pipe's face, else the pipes meet at this one's
+                segment.end_normal = turn * z;
+                segment.end_offset = segment.end_normal.dot(segment.length * z + step);
+            } else {
+                growth.start_normal = turn.transpose() * z;
+            }
+            after_.push_back(growth.frame);
+            growth.face = true;
+            growth.pipe = static_cast<int>(j) + 1;
+        } else if (std::abs(to - joint.s) < 1e-9) {
+            growth.face = true;
+        }
+    }
+    set_bounds(segment);
+    segments_.push_back(segment);
+}
+
+void Tube::set_bounds(Segment &segment) const
 {
     double largest = 0.0;
     for (const OvalStretch &o : ovals_) {
@@ -120,11 +211,118 @@ void Tube::set_section_bounds(Segment &segment) const
             segment.curvature += amplitude * 10.0 / std::sqrt(3.0) / (o.ramp * o.ramp);
         }
     }
-    segment.inverse_axis = 1.0 / (radius_ - largest);
+    segment.inverse_axis = 1.0 / (radius_ + segment.groove - largest);
     segment.constant = section(segment.s0 + 0.5 * segment.length);
-    segment.cos_end = std::cos(segment.bend_angle);
-    segment.sin_end = std::sin(segment.bend_angle);
-    segment.curvature_radius = segment.bend_radius - (radius_ + largest);
+    segment.constant.rho += segment.groove;
+    // Planes that are tilted let the segment's points lie a little before and behind it.
+    const double tilt = std::max(segment.start_normal.head<2>().norm(),
+                                 segment.bend_radius > 0.0 ? 0.0 : segment.end_normal.head<2>().norm());
+    const double slack = 1e-9 + 1.3 * tilt * (largest_radius_ + segment.groove);
+    const double from = segment.s0 - slack, to = segment.s0 + segment.length + slack;
+    for (const auto &relief : reliefs_) {
+        if (relief->from < to - 2e-9 && relief->to > from + 2e-9) {
+            segment.reliefs.push_back(relief.get());
+        }
+    }
+    set_radius_bounds(segment, radius_ + largest, from, to);
+    segment.curvature_radius =
+        segment.bend_radius - (radius_ + largest + segment.groove + std::max(0.0, segment.bounds.most));
+    segment.water = -1;
+    for (size_t i = 0; i < water_.size(); i++) {
+        const double mid = segment.s0 + 0.5 * segment.length;
+        if (mid > water_[i].start && mid < water_[i].end) {
+            segment.water = static_cast<int>(i);
+        }
+    }
+}
+
+// Bounds of the ellipse's radius r = f^(-1/2), f = |A^-1 u|^2 = m + k cos(2 clock), from |A^-1| <= l, r <= a and, along
+// the pipe, |A'| <= slope and |A''| <= curvature; and of the reliefs on it.
+void Tube::set_radius_bounds(Segment &segment, double largest, double from, double to) const
+{
+    const double l = segment.inverse_axis, a = largest + segment.groove;
+    const double k = 0.5 * (l * l - 1.0 / (a * a)), f_s = 2.0 * l * l * l * segment.slope;
+    const double f_ss = 2.0 * std::pow(l * l * segment.slope, 2) +
+                        2.0 * l * (2.0 * l * l * l * segment.slope * segment.slope + l * l * segment.curvature);
+    HeightBounds &b = segment.bounds;
+    b.by_s = 0.5 * a * a * a * f_s;
+    b.by_phi = a * a * a * k;
+    b.by_ss = 0.75 * std::pow(a, 5) * f_s * f_s + 0.5 * a * a * a * f_ss;
+    b.by_phiphi = 3.0 * std::pow(a, 5) * k * k + 2.0 * a * a * a * k;
+    b.by_sphi = 0.75 * std::pow(a, 5) * f_s * 2.0 * k + 0.5 * a * a * a * 4.0 * l * l * l * segment.slope;
+    segment.calm = b;
+    for (const Relief *relief : segment.reliefs) {
+        const HeightBounds more = relief->bounds(from, to);
+        b.add(more);
+        if (relief->deposit < 0) {
+            segment.calm.add(more);
+        }
+    }
+    segment.inner = 1.0 / l + b.least;
+    if (!(segment.inner > 0.25 * radius_)) {
+        throw SpecError("wall: deposits, corrugations and the like leave less than a quarter of the radius at " +
+                        std::to_string(segment.s0) + " m");
+    }
+}
+
+void Tube::add_openings(const FeatureSpec &features)
+{
+    const auto cylinder = [&](double s, double clock, double angle, double diameter, Material material, size_t part) {
+        const Frame3 f = frame(s);
+        const Eigen::Vector3d out(std::sin(clock), -std::cos(clock), 0.0), along = Eigen::Vector3d::UnitZ();
+        const Eigen::Vector3d axis = std::sin(angle) * out + std::cos(angle) * along;
+        const Eigen::Vector3d across = std::sin(angle) * along - std::cos(angle) * out;
+        branches_.push_back({f.origin, f.world_from_frame * axis, f.world_from_frame * across, 0.5 * diameter, 0.0,
+                             material, static_cast<int>(part)});
+        // The mouth is where the cylinder leaves the pipe: between axis and largest radius.
+        const double far = largest_radius_ / std::tan(angle), side = diameter / std::sin(angle);
+        for (Segment &segment : segments_) {
+            if (segment.s0 < s + std::max(0.0, far) + side &&
+                segment.s0 + segment.length > s + std::min(0.0, far) - side) {
+                segment.branches.push_back(static_cast<int>(branches_.size()) - 1);
+            }
+        }
+    };
+    for (size_t i = 0; i < features.laterals.size(); i++) {
+        const Lateral &b = features.laterals[i];
+        if (b.diameter > 1.9 * radius_) {
+            throw SpecError("laterals[" + std::to_string(i) + "].diameter: must be at most 0.95 of the pipe's");
+        }
+        cylinder(b.s, b.clock, b.angle, b.diameter, Material::LATERAL, i);
+        branches_.back().length = b.length;
+    }
+    for (size_t i = 0; i < features.holes.size(); i++) {
+        const Hole &h = features.holes[i];
+        if (h.diameter > radius_) {
+            throw SpecError("holes[" + std::to_string(i) + "].diameter: must be at most half of the pipe's");
+        }
+        cylinder(h.s, h.clock, 0.5 * std::numbers::pi, h.diameter, Material::HOLE, i);
+        branches_.back().length = wall_radius(h.s, h.clock) + h.depth;
+    }
+    for (size_t i = 0; i < cracks_.size(); i++) {
+        for (Segment &segment : segments_) {
+            if (segment.s0 < cracks_[i].to() + radius_ && segment.s0 + segment.length > cracks_[i].from() - radius_) {
+                segment.cracks.push_back(static_cast<int>(i));
+            }
+        }
+    }
+    for (const Root &root : features.roots) {
+        const Frame3 f = frame(root.s);
+        const Eigen::Vector3d base = wall(root.s, root.clock);
+        bundles_.push_back(grow_roots(root, base, (f.origin - base).normalized(), Eigen::Vector3d::UnitY()));
+    }
+    for (const Water &w : water_) {
+        const Frame3 f = frame(w.s);
+        const Eigen::Vector3d floor = wall(w.s, std::numbers::pi);
+        WaterPlane plane;
+        plane.normal = w.sloped != 0 ? Eigen::Vector3d(-f.world_from_frame.col(1)) : Eigen::Vector3d(0.0, -1.0, 0.0);
+        plane.level = plane.normal.dot(floor) + w.depth;
+        plane.right = f.world_from_frame.col(0);
+        plane.right = (plane.right - plane.normal * plane.normal.dot(plane.right)).normalized();
+        plane.along = plane.right.cross(-plane.normal);
+        plane.right_0 = plane.along_0 = 0.0;
+        planes_.push_back(plane);
+    }
 }
 
 Section Tube::section(double s) const
@@ -150,11 +348,9 @@ Section Tube::section(double s) const
 
 int Tube::segment_at(double s) const
 {
-    int i = 0;
-    while (i + 1 < static_cast<int>(segments_.size()) && s >= segments_[static_cast<size_t>(i) + 1].s0) {
-        i++;
-    }
-    return i;
+    const auto after = std::upper_bound(segments_.begin() + 1, segments_.end(), s,
+                                        [](double at, const Segment &segment) { return at < segment.s0; });
+    return static_cast<int>(after - segments_.begin()) - 1;
 }
 
 Frame3 Tube::advance(const Frame3 &frame, const Segment &segment, double along)
@@ -176,16 +372,78 @@ Frame3 Tube::frame(double s) const
     return advance(segment.frame, segment, s - segment.s0);
 }
 
+Frame3 Tube::ride(double s) const
+{
+    for (size_t j = 0; j < joints_.size(); j++) {
+        const double from = joints_[j].s, to = from + joints_[j].gap, middle = 0.5 * (from + to);
+        const double to_last = j > 0 ? from - joints_[j - 1].s - joints_[j - 1].gap : INFINITE;
+        const double to_next = j + 1 < joints_.size() ? joints_[j + 1].s - to : INFINITE;
+        const double reach = 0.5 * joints_[j].gap + std::min({radius_, 0.45 * to_last, 0.45 * to_next});
+        if (std::abs(s - middle) >= reach) {
+            continue;
+        }
+        const auto along = [](const Frame3 &f, double way) {
+            return Frame3{f.world_from_frame, f.origin + way * f.world_from_frame.col(2)};
+        };
+        const Frame3 first = s < from ? frame(s) : along(before_[j], s - from);
+        const Frame3 second = s >= to ? frame(s) : along(after_[j], s - to);
+        double slope = 0.0;
+        const double share = smooth_step(0.5 + 0.5 * (s - middle) / reach, slope);
+        const Eigen::AngleAxisd turn(first.world_from_frame.transpose() * second.world_from_frame);
+        return {first.world_from_frame * Eigen::AngleAxisd(share * turn.angle(), turn.axis()).toRotationMatrix(),
+                (1.0 - share) * first.origin + share * second.origin};
+    }
+    return frame(s);
+}
+
+double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const
+{
+    Section sec = segment.constant;
+    if (segment.varying) {
+        sec = section(s);
+        sec.rho += segment.groove;
+    }
+    if (!segment.varying && sec.e_c == 0.0 && sec.e_s == 0.0) {
+        sum = {sec.rho, 0.0, 0.0};
+    } else {
+        const double inv_det = 1.0 / (sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s);
+        const auto inverse = [&](double px, double py) {
+            return Eigen::Vector2d(((sec.rho + sec.e_c) * px + sec.e_s * py) * inv_det,
+                                   (sec.e_s * px + (sec.rho - sec.e_c) * py) * inv_det);
+        };
+        const Eigen::Vector2d w = inverse(ux, uy);
+        sum.h = 1.0 / w.norm();
+        const double cube = sum.h * sum.h * sum.h;
+        sum.by_phi = -cube * w.dot(inverse(-uy, ux));
+        sum.by_s = cube * w.dot(inverse(-sec.d_c * w.x() - sec.d_s * w.y(), -sec.d_s * w.x() + sec.d_c * w.y()));
+    }
+    for (const Relief *relief : segment.reliefs) {
+        if (s > relief->from && s < relief->to) {
+            relief->add(s, clock, sum);
+        }
+    }
+    return sum.h;
+}
+
+double Tube::wall_radius(double s, double clock) const
+{
+    const Segment &segment = segments_[static_cast<size_t>(segment_at(s))];
+    double deepest = 0.0;
+    for (const int i : segment.cracks) {
+        const CrackPath &crack = cracks_[static_cast<size_t>(i)];
+        if (crack.distance(s, wrap_clock(clock), crack.half_width()) < crack.half_width()) {
+            deepest = std::max(deepest, crack.depth());
+        }
+    }
+    Height wall;
+    return radius_at(segment, s, wrap_clock(clock), std::sin(clock), -std::cos(clock), wall) + deepest;
+}
+
 Eigen::Vector3d Tube::wall(double s, double clock) const
 {
-    const Section sec = section(s);
-    const double ux = std::sin(clock), uy = -std::cos(clock);
-    const double det = sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s;
-    const double wx = ((sec.rho + sec.e_c) * ux + sec.e_s * uy) / det;
-    const double wy = (sec.e_s * ux + (sec.rho - sec.e_c) * uy) / det;
-    const double r = 1.0 / std::hypot(wx, wy);
+    const double r = wall_radius(s, clock);
     const Frame3 f = frame(s);
-    return f.origin + f.world_from_frame * Eigen::Vector3d(r * ux, r * uy, 0.0);
+    return f.origin + f.world_from_frame * Eigen::Vector3d(r * std::sin(clock), -r * std::cos(clock), 0.0);
 }
 
 WallPoint Tube::to_section(const Segment &segment, const Eigen::Vector3d &p)
@@ -200,191 +458,31 @@ WallPoint Tube::to_section(const Segment &segment, const Eigen::Vector3d &p)
     return {segment.s0 + segment.bend_radius * std::atan2(p.z(), u), wrap_clock(std::atan2(x, -y)), std::hypot(x, y)};
 }
 
-bool Tube::locate(const Eigen::Vector3d &world, WallPoint &out) const
+int Tube::find(const Eigen::Vector3d &world, WallPoint &out) const
 {
-    double best = 1.5 * radius_;
-    bool found = false;
+    double best = std::max(1.5 * radius_, 1.2 * largest_radius_);
+    int found = -1;
     for (size_t i = 0; i < segments_.size(); i++) {
         const Segment &segment = segments_[i];
         const Eigen::Vector3d p = segment.frame.world_from_frame.transpose() * (world - segment.frame.origin);
+        const bool started = i == 0 || segment.start_normal.dot(p) >= -1e-9;
+        const bool ended = i + 1 < segments_.size() && segment.end_normal.dot(p) > segment.end_offset + 1e-9;
+        if (!started || ended) {
+            continue;
+        }
         const WallPoint q = to_section(segment, p);
-        const double lo = i == 0 ? -INFINITE : segment.s0 - 1e-9;
-        const double hi = i + 1 == segments_.size() ? INFINITE : segment.s0 + segment.length + 1e-9;
-        if (q.s >= lo && q.s <= hi && q.distance < best) {
+        if (q.distance < best) {
             best = q.distance;
             out = q;
-            found = true;
+            found = static_cast<int>(i);
         }
     }
     return found;
 }
 
-Tube::View::View(const Tube &tube, const Eigen::Matrix3d &world_from_cam, const Eigen::Vector3d &centre)
-    : tube_(tube), start_(-1)
+bool Tube::locate(const Eigen::Vector3d &world, WallPoint &out) const
 {
-    WallPoint at{};
-    if (tube.locate(centre, at)) {
-        start_ = tube.segment_at(at.s);
-    }
-    for (const Segment &segment : tube.segments_) {
-        const Eigen::Matrix3d segment_from_world = segment.frame.world_from_frame.transpose();
-        local_.push_back({segment_from_world * world_from_cam, segment_from_world * (centre - segment.frame.origin)});
-    }
-}
-
-// A ray in a segment's frame. In a bend, the plane of the centreline and the direction across it: u points from the
-// bend's centre to the segment's start, z along the start's tangent, w across.
-struct Tube::SegmentRay {
-    struct State {
-        double x, y, u, z, q;      // (right, down) in the section; in a bend u, z and q = hypot(u, z)
-        double g, rate;            // the wall's function and its derivative along the ray
-        Eigen::Vector2d g_section; // gradient of g by (right, down)
-        double g_s;                // and by the arc length
-    };
-
-    const Tube &tube;
-    const Segment &segment;
-    Eigen::Vector3d o, d;
-    double ou, du, ow, dw;
-
-    SegmentRay(const Tube &the_tube, const Segment &the_segment, const Eigen::Vector3d &origin,
-               const Eigen::Vector3d &direction)
-        : tube(the_tube), segment(the_segment), o(origin), d(direction),
-          ou(segment.bend_radius - (o.x() * segment.nx + o.y() * segment.ny)),
-          du(-(d.x() * segment.nx + d.y() * segment.ny)), ow(o.y() * segment.nx - o.x() * segment.ny),
-          dw(d.y() * segment.nx - d.x() * segment.ny)
-    {
-    }
-
-    bool bend() const { return segment.bend_radius > 0.0; }
-
-    // Where the ray passes the segment's end (step +1) or its start (step -1).
-    double exit(bool has_next, bool has_previous, int &step) const
-    {
-        double t_exit = INFINITE;
-        if (has_next) {
-            const double offset = bend() ? o.z() * segment.cos_end - ou * segment.sin_end : o.z() - segment.length;
-            const double rate = bend() ? d.z() * segment.cos_end - du * segment.sin_end : d.z();
-            if (rate > 0.0) {
-                t_exit = -offset / rate;
-                step = 1;
-            }
-        }
-        if (has_previous && d.z() < 0.0 && -o.z() / d.z() < t_exit) {
-            t_exit = -o.z() / d.z();
-            step = -1;
-        }
-        return t_exit;
-    }
-
-    // A bound of g'' = 2 |w'|^2 + 2 w.w'' along the ray inside the segment, from w = A^-1 p, |w| <= 1, |A'| <= slope,
-    // |A''| <= curvature and |A^-1| <= l.
-    double bound() const
-    {
-        const double l = segment.inverse_axis, slope = segment.slope, curvature = segment.curvature;
-        if (!bend()) {
-            const double across = std::sqrt(d.x() * d.x() + d.y() * d.y()), grow = l * (across + slope);
-            return 2.0 * grow * grow + 2.0 * l * (2.0 * l * slope * (across + slope) + curvature);
-        }
-        const double q = segment.curvature_radius, ds = segment.bend_radius / q, dds = 2.0 * ds / q;
-        const double grow = l * (1.0 + slope * ds);
-        return 2.0 * grow * grow +
-               2.0 * l * (1.0 / q + 2.0 * l * slope * ds * (1.0 + slope * ds) + curvature * ds * ds + slope * dds);
-    }
-
-    State at(double t) const
-    {
-        State st{};
-        st.z = o.z() + t * d.z();
-        double vx = d.x(), vy = d.y(), vs = d.z();
-        if (!bend()) {
-            st.x = o.x() + t * d.x();
-            st.y = o.y() + t * d.y();
-        } else {
-            st.u = ou + t * du;
-            st.q = std::sqrt(st.u * st.u + st.z * st.z);
-            const double w = ow + t * dw, n = segment.bend_radius - st.q, vn = -(st.u * du + st.z * d.z()) / st.q;
-            st.x = n * segment.nx - w * segment.ny;
-            st.y = n * segment.ny + w * segment.nx;
-            vx = vn * segment.nx - dw * segment.ny;
-            vy = vn * segment.ny + dw * segment.nx;
-            vs = segment.bend_radius * (st.u * d.z() - st.z * du) / (st.q * st.q);
-        }
-        const Section sec = segment.varying ? tube.section(arc(st)) : segment.constant;
-        const double inv_det = 1.0 / (sec.rho * sec.rho - sec.e_c * sec.e_c - sec.e_s * sec.e_s);
-        const auto inverse = [&](double px, double py) {
-            return Eigen::Vector2d(((sec.rho + sec.e_c) * px + sec.e_s * py) * inv_det,
-                                   (sec.e_s * px + (sec.rho - sec.e_c) * py) * inv_det);
-        };
-        const Eigen::Vector2d w = inverse(st.x, st.y);
-        st.g = w.squaredNorm() - 1.0;
-        st.g_section = 2.0 * inverse(w.x(), w.y());
-        if (segment.varying) { // d(A^-1 p)/ds = -A^-1 A' w with A' = [-d_c, -d_s; -d_s, d_c]
-            st.g_s = -2.0 * w.dot(inverse(-sec.d_c * w.x() - sec.d_s * w.y(), -sec.d_s * w.x() + sec.d_c * w.y()));
-        }
-        st.rate = st.g_section.x() * vx + st.g_section.y() * vy + st.g_s * vs;
-        return st;
-    }
-
-    double arc(const State &st) const
-    {
-        return segment.s0 + (bend() ? segment.bend_radius * std::atan2(st.z, st.u) : st.z);
-    }
-
-    // Outward gradient of g in the segment's frame. In a bend the section at the angle a has the axes cos a n - sin a z
-    // (to the bend's centre) and sin a n + cos a z (tangent), and an arc length of bend_radius / q per metre.
-    Eigen::Vector3d gradient(const State &st) const
-    {
-        if (!bend()) {
-            return {st.g_section.x(), st.g_section.y(), st.g_s};
-        }
-        const double gn = st.g_section.x() * segment.nx + st.g_section.y() * segment.ny;
-        const double gw = st.g_section.y() * segment.nx - st.g_section.x() * segment.ny;
-        const double gt = st.g_s * segment.bend_radius / st.q, c = st.u / st.q, s = st.z / st.q;
-        const double n = gn * c + gt * s;
-        return {n * segment.nx - gw * segment.ny, n * segment.ny + gw * segment.nx, gt * c - gn * s};
-    }
-};
-
-// The ray is marched on g(p) = |A(s)^-1 p|^2 - 1, negative inside. Along the ray g(t + h) <= g + g' h + K h^2 / 2 with
-// K a bound of g'' over the segment, so the root h of the right side never passes the first hit and converges to it
-// like Newton's method. On a straight segment of constant section K is exact and the first step lands on the wall.
-bool Tube::View::cast(const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, Hit &hit) const
-{
-    constexpr int MAX_STEPS = 2000;
-    constexpr double NEAR = 1e-12; // of g: half a picometre per metre of radius
-    if (start_ < 0) {
-        return false;
-    }
-    const double far = 1000.0 * tube_.radius_;
-    const int last = static_cast<int>(tube_.segments_.size()) - 1;
-    int index = start_, steps = 0;
-    double t = 0.0;
-    while (true) {
-        const Local &local = local_[static_cast<size_t>(index)];
-        const SegmentRay ray(tube_, tube_.segments_[static_cast<size_t>(index)], local.rotation * origin + local.offset,
-                             local.rotation * direction);
-        int hop = 0;
-        const double t_exit = ray.exit(index<last, index> 0, hop), bound = ray.bound();
-        while (true) {
-            const SegmentRay::State st = ray.at(t);
-            if ((steps == 0 && st.g >= 0.0) || steps++ >= MAX_STEPS || t >= far) {
-                return false;
-            }
-            if (st.g > -NEAR) {
-                hit = {t, ray.arc(st), wrap_clock(std::atan2(st.x, -st.y)),
-                       -(local.rotation.transpose() * ray.gradient(st)).normalized()};
-                return true;
-            }
-            const double h = -2.0 * st.g / (st.rate + std::sqrt(st.rate * st.rate - 2.0 * bound * st.g));
-            if (t + h >= t_exit) {
-                t = std::max(t, t_exit);
-                index += hop;
-                break;
-            }
-            t += h;
-        }
-    }
+    return find(world, out) >= 0;
 }
 
 } // namespace pipefish::sim
