@@ -9,7 +9,7 @@
 #define RENEW         (65536 / 5)
 #define PULL_MAX      (3 << 15) /* the template may move a track by 1.5 px from where the previous frame put it */
 #define DRIFT_SLACK   3277      /* the template may look 0.1 less similar than the previous patch */
-#define CERTAIN       (2 << 16) /* a result this near its guess is checked backwards from half resolution on */
+#define CERTAIN       (2 << 16) /* a track found this near its guess is next sought from half resolution on */
 #define GUESS_MARGIN  (64 << 16)
 #define RETRY_APART   32768 /* a second guess closer than 1/2 px to the first is the same guess */
 #define NEIGHBOURS    3
@@ -17,6 +17,7 @@
 
 typedef struct pf_slot { /* the hidden part of a live track */
     pf_point_q16 move;   /* its last displacement */
+    bool sure;           /* which its guess met within CERTAIN */
     pf_anchor anchor;
 } pf_slot;
 
@@ -107,7 +108,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     (void)carve(base, &used, sizeof *t);
     if (!t)
         t = &count;
-    t->patch_bytes = (c->window + 2u) * (c->window + 2u);
+    t->patch_bytes = pf_anchor_bytes(c->window);
     t->grid_w = (c->width + c->cell - 1u) / c->cell;
     t->grid_h = (c->height + c->cell - 1u) / c->cell;
     t->table = carve(base, &used, 2u * c->max_tracks * sizeof *t->table);
@@ -144,11 +145,7 @@ pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config,
     memset(t, 0, sizeof *t);
     lay_out(&c, workspace, t);
     t->config = c;
-    t->klt.window = (int32_t)c.window;
-    t->klt.half = (int32_t)c.window / 2;
-    t->klt.cols = ((int32_t)c.window + 7) / 8 * 8;
-    t->klt.iterations = (int32_t)c.iterations;
-    t->klt.min_eigen = (int32_t)(c.min_eigen / FLAT_FRACTION);
+    pf_klt_init(&t->klt, c.window, c.iterations, c.min_eigen / FLAT_FRACTION);
     t->klt.circle = c.circle;
     t->klt.radius_q16 = (int32_t)c.circle_radius_q16;
     pf_tracker_reset(t);
@@ -256,30 +253,35 @@ static int32_t clamp_guess(int64_t v, uint32_t size)
 }
 
 /* One attempt at one track from one guess; on success `track` and its slot are up to date. */
-static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move)
+static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move, uint32_t top)
 {
     const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
-    const uint32_t top = t->config.levels - 1u;
     const pf_point_q16 old = track->pos;
     const pf_point_q16 guess = {clamp_guess((int64_t)old.x + move.x, t->config.width),
                                 clamp_guess((int64_t)old.y + move.y, t->config.height)};
     pf_point_q16 at = guess;
-    pf_fit fit = pf_klt_track(&t->klt, from, to, old, &at, top);
-    if (fit.reason != PF_TRACK_OK)
-        return fit.reason;
-    if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
-        return PF_TRACK_RESIDUAL;
-    const uint32_t back_top = farther(at, guess, CERTAIN) || top == 0 ? top : 1u;
-    pf_point_q16 back = {old.x + at.x - guess.x, old.y + at.y - guess.y};
-    if (pf_klt_track(&t->klt, to, from, at, &back, back_top).reason != PF_TRACK_OK ||
-        farther(back, old, t->config.fb_q16))
-        return PF_TRACK_BACKWARD;
+    const pf_fit coarse = pf_klt_track(&t->klt, from, to, old, &at, top, top ? 1 : 0);
+    if (top == 0 && coarse.reason != PF_TRACK_OK)
+        return coarse.reason;
+    if (!pf_klt_inside(&t->klt, &to->level[0], at))
+        return PF_TRACK_LEFT;
     pf_slot *s = &t->slots[slot];
     const pf_anchor saved = s->anchor;
     uint8_t *pixels = t->pixels + (size_t)slot * t->patch_bytes;
     pf_point_q16 fine = at;
     const pf_fit anchored = pf_anchor_fit(&t->klt, &to->level[0], &s->anchor, pixels, &fine);
     pf_track_reason reason = anchored.reason;
+    pf_point_q16 back = old;
+    pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
+    if (reason == PF_TRACK_OK) {
+        fit = pf_klt_track(&t->klt, to, from, fine, &back, 0, 0);
+        if (fit.reason != PF_TRACK_OK)
+            reason = fit.reason;
+        else if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
+            reason = PF_TRACK_RESIDUAL;
+        else if (farther(back, old, t->config.fb_q16))
+            reason = PF_TRACK_BACKWARD;
+    }
     if (reason == PF_TRACK_OK &&
         (anchored.zncc_q15 < (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK || farther(fine, at, PULL_MAX)))
         reason = PF_TRACK_DRIFT;
@@ -292,6 +294,7 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
         return reason;
     }
     s->move = (pf_point_q16){fine.x - old.x, fine.y - old.y};
+    s->sure = !farther(fine, guess, CERTAIN);
     track->pos = fine;
     track->quality = (uint16_t)fit.zncc_q15;
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored.gain_q14, track);
@@ -330,9 +333,10 @@ static void track_all(pf_tracker *t)
         const bool have_near = neighbours_move(t, track->pos, &near);
         if (young && have_near)
             first = near;
-        pf_track_reason reason = attempt(t, track, slot, first);
-        if (reason != PF_TRACK_OK && have_near && farther(first, near, RETRY_APART))
-            reason = attempt(t, track, slot, near);
+        const uint32_t top = t->config.levels - 1u, low = t->slots[slot].sure && top > 1u ? 1u : top;
+        pf_track_reason reason = attempt(t, track, slot, first, low);
+        if (reason != PF_TRACK_OK && (low != top || (have_near && farther(first, near, RETRY_APART))))
+            reason = attempt(t, track, slot, have_near ? near : first, top);
         track->age++;
         track->reason = (uint8_t)reason;
         if (reason == PF_TRACK_OK) {
@@ -403,6 +407,7 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
     const uint32_t row = t->n++;
     pf_slot *s = &t->slots[slot];
     s->move = (pf_point_q16){0, 0};
+    s->sure = false;
     t->slot_of[row] = slot;
     t->table[row] = (pf_track){.id = ++t->last_id,
                                .pos = {corner->x * 65536, corner->y * 65536},

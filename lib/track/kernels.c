@@ -1,0 +1,115 @@
+/* The portable kernels: what each result is. */
+#include "kernels.h"
+
+static int16_t mul_q15(int32_t a, int16_t b)
+{
+    return (int16_t)((a * b + (1 << 14)) >> 15);
+}
+
+/* Between four pixels, Q4 less PIXEL_MID; the steps along x and y round separately, in Q6. */
+static int16_t between(int32_t p00, int32_t p01, int32_t p10, int32_t p11, int16_t fx, int16_t fy)
+{
+    const int32_t top = p00 * 64 + mul_q15((p01 - p00) * 64, fx), bottom = p10 * 64 + mul_q15((p11 - p10) * 64, fx);
+    return (int16_t)((top + mul_q15(bottom - top, fy) + 2 - 4 * PIXEL_MID) >> 2);
+}
+
+static int16_t sample_at(const pf_spot *s, int32_t r, int32_t i)
+{
+    const uint8_t *p = s->p + (size_t)r * s->stride + (size_t)i, *q = p + s->stride;
+    return between(p[0], p[1], q[0], q[1], s->fx, s->fy);
+}
+
+void pf_c_sample(const pf_spot *spot, int32_t rows, int32_t groups, int16_t *out)
+{
+    for (int32_t r = 0; r < rows; r++)
+        for (int32_t i = 0; i < 8 * groups; i++)
+            out[r * PATCH_ROW + i] = sample_at(spot, r, i);
+}
+
+void pf_c_template(const int16_t *raw, const int16_t *mask, int32_t rows, int32_t groups, int16_t *t, int16_t *gx,
+                   int16_t *gy, pf_template_sums *sums)
+{
+    pf_template_sums s = {0};
+    for (int32_t r = 0; r < rows; r++) {
+        const int16_t *row = raw + (r + 1) * PATCH_ROW + 1;
+        int32_t st = 0, tt = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0, xt = 0, yt = 0;
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i;
+            t[k] = (int16_t)(row[i] & mask[k]);
+            gx[k] = (int16_t)((row[i + 1] - row[i - 1]) & mask[k]);
+            gy[k] = (int16_t)((row[i + PATCH_ROW] - row[i - PATCH_ROW]) & mask[k]);
+            st += t[k], tt += t[k] * t[k], x += gx[k], y += gy[k], xx += gx[k] * gx[k], xy += gx[k] * gy[k];
+            yy += gy[k] * gy[k], xt += gx[k] * t[k], yt += gy[k] * t[k];
+        }
+        s.t += st, s.tt += tt, s.x += x, s.y += y, s.xx += xx, s.xy += xy, s.yy += yy, s.xt += xt, s.yt += yt;
+    }
+    *sums = s;
+}
+
+void pf_c_step(const pf_spot *spot, const int16_t *mask, int32_t rows, int32_t groups, const int16_t *t,
+               const int16_t *gx, const int16_t *gy, pf_step_sums *sums)
+{
+    pf_step_sums s = {0};
+    for (int32_t r = 0; r < rows; r++) {
+        int32_t sc = 0, cc = 0, ct = 0, cx = 0, cy = 0;
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, c = sample_at(spot, r, i) & mask[k];
+            sc += c, cc += c * c, ct += c * t[k], cx += c * gx[k], cy += c * gy[k];
+        }
+        s.c += sc, s.cc += cc, s.ct += ct, s.cx += cx, s.cy += cy;
+    }
+    *sums = s;
+}
+
+void pf_c_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int32_t groups, const pf_gradients *out)
+{
+    const int32_t w = window + 2;
+    for (int32_t r = 0; r < window; r++) {
+        const uint8_t *a = pixels + r * w, *b = a + w, *c = b + w;
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, x = i - window / 2;
+            const int32_t along = 3 * (a[i + 2] - a[i]) + 10 * (b[i + 2] - b[i]) + 3 * (c[i + 2] - c[i]);
+            const int32_t down = 3 * (c[i] - a[i]) + 10 * (c[i + 1] - a[i + 1]) + 3 * (c[i + 2] - a[i + 2]);
+            out->t[k] = (int16_t)((b[i + 1] * PIXEL_ONE - PIXEL_MID) & mask[k]);
+            out->gx[k] = (int16_t)(((along + 2) >> 2) & mask[k]);
+            out->gy[k] = (int16_t)(((down + 2) >> 2) & mask[k]);
+            out->xgx[k] = (int16_t)(out->gx[k] * x);
+            out->xgy[k] = (int16_t)(out->gy[k] * x);
+        }
+    }
+}
+
+void pf_c_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out)
+{
+    const int32_t half = window / 2, *a = warp->a;
+    for (int32_t r = 0; r < window; r++)
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, first = i & ~7, step = i & 7;
+            out[k] = 0;
+            if (!mask[k])
+                continue;
+            /* Q12 from where a group of 8 begins: 16 bits hold a group's coordinates */
+            const int32_t x = ((warp->x + (first - half) * a[0] + (r - half) * a[1]) >> 4) + ((step * a[0]) >> 4);
+            const int32_t y = ((warp->y + (first - half) * a[2] + (r - half) * a[3]) >> 4) + ((step * a[2]) >> 4);
+            const uint8_t *p = warp->data + (size_t)(y >> 12) * warp->stride + (size_t)(x >> 12), *q = p + warp->stride;
+            out[k] = between(p[0], p[1], q[0], q[1], (int16_t)((x & 4095) << 3), (int16_t)((y & 4095) << 3));
+        }
+}
+
+void pf_c_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums)
+{
+    pf_affine_sums s = {{0}, 0, 0, {0}};
+    for (int32_t r = 0; r < window; r++) {
+        const int32_t y = r - window / 2;
+        int32_t sc = 0, sx = 0, cc = 0, ct = 0, b[4] = {0};
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, v = c[k];
+            sc += v, sx += v * (i - window / 2), cc += v * v, ct += v * g->t[k];
+            b[0] += v * g->gx[k], b[1] += v * g->gy[k], b[2] += v * g->xgx[k], b[3] += v * g->xgy[k];
+        }
+        s.c[0] += sc, s.c[1] += sx, s.c[2] += sc * y, s.cc += cc, s.ct += ct;
+        s.b[0] += b[0], s.b[1] += b[1], s.b[2] += b[2], s.b[3] += (int64_t)b[0] * y;
+        s.b[4] += b[3], s.b[5] += (int64_t)b[1] * y;
+    }
+    *sums = s;
+}

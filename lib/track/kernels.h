@@ -1,0 +1,81 @@
+/* The inner loops of the aligners, each twice: portable C (pf_c_*, the reference, and what runs where there are no
+ * vectors) and vectors (pf_neon_*). Both give the same bits: every sum is exact. tests/unit/test_kernels compares them.
+ *
+ * Patches are rows of PATCH_ROW 16-bit numbers, of which `groups` groups of 8 are filled. Pixels are Q4 less 2040,
+ * gradients and bounds as said. The largest sums of 31 columns in 4 groups decide where 32 bits suffice.
+ */
+#ifndef PIPEFISH_TRACK_KERNELS_H
+#define PIPEFISH_TRACK_KERNELS_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define WINDOW_MAX 31
+#define PATCH_ROW  40 /* row stride of a patch: window + 2 border columns, padded to whole groups of 8 */
+#define PATCH_MAX  ((WINDOW_MAX + 2) * PATCH_ROW)
+#define PIXEL_ONE  16   /* a grey level in a patch */
+#define PIXEL_MID  2040 /* what a patch is less than 16 times the grey level */
+
+/* A bilinear patch of `rows` rows whose top-left sample lies (fx, fy) (Q15) right of and below the pixel p. Reads
+ * rows + 1 rows of 8 groups + 1 pixels. */
+typedef struct pf_spot {
+    const uint8_t *p;
+    size_t stride;
+    int16_t fx, fy;
+} pf_spot;
+
+/* Sums over a template: of itself, of its squares, of its doubled gradients (Q4, |.| <= 4080), and of products. */
+typedef struct pf_template_sums {
+    int64_t t, tt, x, y, xx, xy, yy, xt, yt;
+} pf_template_sums;
+
+/* Sums over a sampled patch c, its squares, and its products with the template and the template's gradients. */
+typedef struct pf_step_sums {
+    int64_t c, cc, ct, cx, cy;
+} pf_step_sums;
+
+/* Sums over a warped patch c: times 1, x, y (from the centre); its squares, its products with the template and with the
+ * steepest-descent images gx, gy, x gx, y gx, x gy, y gy. */
+typedef struct pf_affine_sums {
+    int64_t c[3], cc, ct, b[6];
+} pf_affine_sums;
+
+/* An affine window: sample (x, y) of the window, from its centre, lies at centre + a (x, y); Q16.16. */
+typedef struct pf_warp {
+    const uint8_t *data;
+    size_t stride;
+    uint32_t width, height;
+    int32_t x, y, a[4];
+} pf_warp;
+
+/* Gradients of a template kept as pixels: Q3, |.| <= 1020, Scharr; and x times them. */
+typedef struct pf_gradients {
+    int16_t *t, *gx, *gy, *xgx, *xgy;
+} pf_gradients;
+
+#define PF_DECLARE_KERNELS(set)                                                                                        \
+    /* The patch at `spot`, unmasked. */                                                                               \
+    void set##_sample(const pf_spot *spot, int32_t rows, int32_t groups, int16_t *out);                                \
+    /* Template and doubled gradients, masked, of a raw patch with a border of one sample all around. */               \
+    void set##_template(const int16_t *raw, const int16_t *mask, int32_t rows, int32_t groups, int16_t *t,             \
+                        int16_t *gx, int16_t *gy, pf_template_sums *sums);                                             \
+    /* Samples at `spot`, masked, and sums against the template. */                                                    \
+    void set##_step(const pf_spot *spot, const int16_t *mask, int32_t rows, int32_t groups, const int16_t *t,          \
+                    const int16_t *gx, const int16_t *gy, pf_step_sums *sums);                                         \
+    /* A template's pixels, (window + 2)^2 bytes and 8 readable ones behind, to patch and gradients. */                \
+    void set##_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int32_t groups,                      \
+                      const pf_gradients *out);                                                                        \
+    /* Samples the warped window, which lies inside the image with a pixel to spare. */                                \
+    void set##_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out);           \
+    void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);
+
+PF_DECLARE_KERNELS(pf_c)
+PF_DECLARE_KERNELS(pf_neon)
+
+#if PF_SIMD
+#define PF_KERNEL(name) pf_neon_##name
+#else
+#define PF_KERNEL(name) pf_c_##name
+#endif
+
+#endif
