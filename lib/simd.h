@@ -39,6 +39,28 @@ static inline void pf_store8(uint8_t *p, uint16x8_t v)
 #endif
 }
 
+/* Lanes 0 2 4 6 of a, then of b; and 1 3 5 7. */
+static inline uint16x8_t pf_even(uint16x8_t a, uint16x8_t b)
+{
+#if defined(__aarch64__)
+    return vuzp1q_u16(a, b);
+#else
+    const simde__m128i low = simde_mm_set1_epi32(0xFFFF);
+    return PF_FROM(uint16x8, simde_mm_packus_epi32(simde_mm_and_si128(PF_M(uint16x8, a), low),
+                                                   simde_mm_and_si128(PF_M(uint16x8, b), low)));
+#endif
+}
+
+static inline uint16x8_t pf_odd(uint16x8_t a, uint16x8_t b)
+{
+#if defined(__aarch64__)
+    return vuzp2q_u16(a, b);
+#else
+    return PF_FROM(uint16x8, simde_mm_packus_epi32(simde_mm_srli_epi32(PF_M(uint16x8, a), 16),
+                                                   simde_mm_srli_epi32(PF_M(uint16x8, b), 16)));
+#endif
+}
+
 /* sum + the products of all lanes of a and b, gathered in four lanes, two products a lane. */
 static inline int32x4_t pf_dot(int32x4_t sum, int16x8_t a, int16x8_t b)
 {
@@ -46,6 +68,28 @@ static inline int32x4_t pf_dot(int32x4_t sum, int16x8_t a, int16x8_t b)
     return vmlal_high_s16(vmlal_s16(sum, vget_low_s16(a), vget_low_s16(b)), a, b);
 #else
     return vaddq_s32(sum, PF_FROM(int32x4, simde_mm_madd_epi16(PF_M(int16x8, a), PF_M(int16x8, b))));
+#endif
+}
+
+/* v[0] = x x + y y, v[1] = x x - y y, v[2] = 2 x y, lanes 0..3 and 4..7. Below 2^14. */
+static inline void pf_squares(int16x8_t x, int16x8_t y, int32x4_t v[3][2])
+{
+#if defined(__aarch64__)
+    const int16x4_t lx = vget_low_s16(x), ly = vget_low_s16(y);
+    const int32x4_t xx = vmull_s16(lx, lx), hh = vmull_high_s16(x, x);
+    v[0][0] = vmlal_s16(xx, ly, ly), v[0][1] = vmlal_high_s16(hh, y, y);
+    v[1][0] = vmlsl_s16(xx, ly, ly), v[1][1] = vmlsl_high_s16(hh, y, y);
+    const int16x8_t two = vaddq_s16(x, x);
+    v[2][0] = vmull_s16(vget_low_s16(two), ly), v[2][1] = vmull_high_s16(two, y);
+#else
+    const simde__m128i a = PF_M(int16x8, x), b = PF_M(int16x8, y), c = PF_M(int16x8, vnegq_s16(y));
+    const simde__m128i low = simde_mm_unpacklo_epi16(a, b), high = simde_mm_unpackhi_epi16(a, b);
+    v[0][0] = PF_FROM(int32x4, simde_mm_madd_epi16(low, low));
+    v[0][1] = PF_FROM(int32x4, simde_mm_madd_epi16(high, high));
+    v[1][0] = PF_FROM(int32x4, simde_mm_madd_epi16(low, simde_mm_unpacklo_epi16(a, c)));
+    v[1][1] = PF_FROM(int32x4, simde_mm_madd_epi16(high, simde_mm_unpackhi_epi16(a, c)));
+    v[2][0] = PF_FROM(int32x4, simde_mm_madd_epi16(low, simde_mm_unpacklo_epi16(b, a)));
+    v[2][1] = PF_FROM(int32x4, simde_mm_madd_epi16(high, simde_mm_unpackhi_epi16(b, a)));
 #endif
 }
 

@@ -113,3 +113,34 @@ void pf_c_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_
     }
     *sums = s;
 }
+
+void pf_c_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
+{
+    const uint8_t *above = p - stride, *below = p + stride;
+    for (int32_t i = 0; i < (n + 7) / 8 * 8; i++) {
+        const int32_t gx = p[i + 1] - p[i - 1], gy = below[i] - above[i];
+        out->k[0][i] = gx * gx + gy * gy;
+        out->k[1][i] = gx * gx - gy * gy;
+        out->k[2][i] = 2 * gx * gy;
+    }
+}
+
+int32_t pf_c_corners(const pf_tensor_row *const row[3], int32_t n, pf_tensor_row *sum)
+{
+    int32_t most = 0;
+    for (int32_t i = 0; i < (n + 7) / 8 * 8; i++) {
+        int32_t size[3];
+        for (int32_t k = 0; k < 3; k++) {
+            const int32_t *a = row[0]->k[k] + i, *b = row[1]->k[k] + i, *c = row[2]->k[k] + i;
+            const int32_t v = a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + c[0] + c[1] + c[2];
+            sum->k[k][i] = v;
+            size[k] = v < 0 ? -v : v;
+        }
+        /* the root of d^2 + e^2 is at least |d|, |e| and (|d| + |e|) / sqrt 2 */
+        const int32_t both = size[1] + size[2], larger = size[1] > size[2] ? size[1] : size[2];
+        const int32_t slant = (both >> 1) + (both >> 3) + (both >> 4);
+        const int32_t bound = size[0] - (slant > larger ? slant : larger);
+        most = bound > most ? bound : most;
+    }
+    return most;
+}

@@ -53,6 +53,14 @@ typedef struct pf_gradients {
     int16_t *t, *gx, *gy, *xgx, *xgy;
 } pf_gradients;
 
+#define CELL_MAX   256
+#define CORNER_ROW (CELL_MAX + 24) /* a cell, a border column on either side, and whole groups of 8 */
+
+/* A row of structure tensors: trace, difference of the diagonal, twice the other term. */
+typedef struct pf_tensor_row {
+    int32_t k[3][CORNER_ROW];
+} pf_tensor_row;
+
 #define PF_DECLARE_KERNELS(set)                                                                                        \
     /* The patch at `spot`, unmasked. */                                                                               \
     void set##_sample(const pf_spot *spot, int32_t rows, int32_t groups, int16_t *out);                                \
@@ -67,7 +75,12 @@ typedef struct pf_gradients {
                       const pf_gradients *out);                                                                        \
     /* Samples the warped window, which lies inside the image with a pixel to spare. */                                \
     void set##_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out);           \
-    void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);
+    void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);  \
+    /* Of the doubled gradients at p[0..n), n rounded up to whole groups of 8. */                                      \
+    void set##_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out);                                 \
+    /* Sums over 3 x 3 of three rows of such: sum[k][i] over row[j][k][i .. i + 2], i < n. Returns a bound of twice    \
+     * the smaller eigenvalue of all of them, at most 9 % of the trace above the largest. */                           \
+    int32_t set##_corners(const pf_tensor_row *const row[3], int32_t n, pf_tensor_row *sum);
 
 PF_DECLARE_KERNELS(pf_c)
 PF_DECLARE_KERNELS(pf_neon)

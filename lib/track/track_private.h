@@ -99,27 +99,29 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
 
 /* Detection. */
-#define CORNER_HALF 5 /* the structure tensor is a mean over 11 x 11 */
-#define CELL_MAX    256
-#define CORNER_ROW  (CELL_MAX + 2 * CORNER_HALF + 6)
+#define CORNER_REACH 6 /* from the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients   \
+                        */
 
 typedef struct pf_corner {
     int32_t x, y;
-    int32_t strength; /* smaller eigenvalue of the summed tensor of doubled gradients */
+    int32_t strength; /* twice the smaller eigenvalue of the summed tensor of doubled gradients */
 } pf_corner;
 
 typedef struct pf_corner_scratch {
-    int16_t gx[2 * CORNER_HALF + 1][CORNER_ROW], gy[2 * CORNER_HALF + 1][CORNER_ROW];
-    int32_t xx[CORNER_ROW], xy[CORNER_ROW], yy[CORNER_ROW];
+    pf_tensor_row row[3], sum;
 } pf_corner_scratch;
 
 /* Says whether a corner may be put at (x, y). */
 typedef bool (*pf_corner_allowed)(const void *context, int32_t x, int32_t y);
 
-/* The strongest corner with x0 <= x < x1, y0 <= y < y1 and strength > `least`. The rectangle keeps CORNER_HALF + 1
- * pixels from the border. False if there is none. */
-bool pf_corner_best(pf_corner_scratch *scratch, const pf_image *image, const int32_t box[4], int32_t least,
-                    pf_corner_allowed allowed, const void *context, pf_corner *best);
+/* The strongest corner of each quarter of the rectangle x0 <= x < x1, y0 <= y < y1 (at most CELL_MAX a side) with
+ * strength > `least`, at even coordinates where there is a half resolution. The rectangle keeps CORNER_REACH pixels
+ * from the border. Returns how many of the four there are. */
+uint32_t pf_corner_scan(pf_corner_scratch *scratch, const pf_pyramid *pyramid, const int32_t box[4], int32_t least,
+                        pf_corner_allowed allowed, const void *context, pf_corner best[4]);
+
+/* The place of a corner at full resolution, to a fraction of a pixel, at most 2.5 px from where it was found. */
+pf_point_q16 pf_corner_place(const pf_image *image, const pf_corner *corner);
 
 /* `min_eigen` of the configuration in the unit of pf_corner.strength. */
 int32_t pf_corner_least(uint32_t min_eigen);

@@ -13,7 +13,8 @@
 #define GUESS_MARGIN  (64 << 16)
 #define RETRY_APART   32768 /* a second guess closer than 1/2 px to the first is the same guess */
 #define NEIGHBOURS    3
-#define FLAT_FRACTION 8 /* a corner on bare ground fills 121 of the window's 441 pixels: its mean is so much less */
+#define FLAT_FRACTION 8 /* a corner on bare ground fills a part of the window: its mean is so much less */
+#define CANDIDATES    4 /* so many times the tracks there may be: most stand too near a stronger one */
 
 typedef struct pf_slot { /* the hidden part of a live track */
     pf_point_q16 move;   /* its last displacement */
@@ -118,7 +119,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     t->spare = carve(base, &used, c->max_tracks * sizeof *t->spare);
     t->head = carve(base, &used, (size_t)t->grid_w * t->grid_h * sizeof *t->head);
     t->next = carve(base, &used, 2u * c->max_tracks * sizeof *t->next);
-    t->found = carve(base, &used, c->max_tracks * sizeof *t->found);
+    t->found = carve(base, &used, CANDIDATES * c->max_tracks * sizeof *t->found);
     const size_t bytes = pf_pyramid_workspace_size(c->width, c->height, c->levels);
     for (uint32_t i = 0; i < 2u; i++) {
         void *block = carve(base, &used, bytes);
@@ -379,10 +380,10 @@ static void sift_down(pf_corner *heap, uint32_t i, uint32_t n)
     }
 }
 
-/* Keeps the strongest candidates, as many as there is room for tracks. */
+/* Keeps the strongest candidates, CANDIDATES times as many as there is room for tracks. */
 static void remember(pf_tracker *t, const pf_corner *corner)
 {
-    if (t->found_n < t->spare_n) {
+    if (t->found_n < CANDIDATES * t->spare_n) {
         uint32_t i = t->found_n++;
         for (; i > 0 && weaker(corner, &t->found[(i - 1u) / 2u]); i = (i - 1u) / 2u)
             t->found[i] = t->found[(i - 1u) / 2u];
@@ -393,14 +394,18 @@ static void remember(pf_tracker *t, const pf_corner *corner)
     }
 }
 
-static bool corner_allowed(const void *context, int32_t x, int32_t y)
+/* Corners keep 3/4 of a cell apart: greedy by strength, so spread leaves about one a cell. */
+static bool place_allowed(const pf_tracker *t, pf_point_q16 at)
 {
-    const pf_tracker *t = context;
-    const pf_point_q16 at = {x * 65536, y * 65536};
     return pf_klt_inside(&t->klt, &t->pyramid[t->now].level[0], at) && !grid_near(t, at, (int64_t)t->config.cell << 15);
 }
 
-static void add_track(pf_tracker *t, const pf_corner *corner)
+static bool corner_allowed(const void *context, int32_t x, int32_t y)
+{
+    return place_allowed(context, (pf_point_q16){x * 65536, y * 65536});
+}
+
+static void add_track(pf_tracker *t, pf_point_q16 at)
 {
     const pf_image *image = &t->pyramid[t->now].level[0];
     const uint16_t slot = t->spare[--t->spare_n];
@@ -409,10 +414,7 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
     s->move = (pf_point_q16){0, 0};
     s->sure = false;
     t->slot_of[row] = slot;
-    t->table[row] = (pf_track){.id = ++t->last_id,
-                               .pos = {corner->x * 65536, corner->y * 65536},
-                               .status = PF_TRACK_NEW,
-                               .reason = PF_TRACK_OK};
+    t->table[row] = (pf_track){.id = ++t->last_id, .pos = at, .status = PF_TRACK_NEW, .reason = PF_TRACK_OK};
     pf_anchor_take(&t->klt, image, t->table[row].pos, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, GAIN_ONE, &t->table[row]);
     grid_insert(t, row);
@@ -424,7 +426,7 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
 static bool cell_box(const pf_tracker *t, int32_t cx, int32_t cy, int32_t box[4])
 {
     const int32_t cell = (int32_t)t->config.cell;
-    const int32_t margin = t->klt.half + 2 > CORNER_HALF + 1 ? t->klt.half + 2 : CORNER_HALF + 1;
+    const int32_t margin = t->klt.half + 2 > CORNER_REACH ? t->klt.half + 2 : CORNER_REACH;
     const int32_t right = (int32_t)t->config.width - margin - 1, bottom = (int32_t)t->config.height - margin - 1;
     box[0] = cx * cell < margin ? margin : cx * cell;
     box[1] = cy * cell < margin ? margin : cy * cell;
@@ -450,10 +452,12 @@ static void detect_all(pf_tracker *t)
     for (uint32_t cy = 0; cy < t->grid_h; cy++)
         for (uint32_t cx = 0; cx < t->grid_w; cx++) {
             int32_t box[4];
-            pf_corner best;
-            if (t->head[(size_t)cy * t->grid_w + cx] < 0 && cell_box(t, (int32_t)cx, (int32_t)cy, box) &&
-                pf_corner_best(&t->corners, image, box, least, corner_allowed, t, &best))
-                remember(t, &best);
+            pf_corner best[4];
+            if (t->head[(size_t)cy * t->grid_w + cx] >= 0 || !cell_box(t, (int32_t)cx, (int32_t)cy, box))
+                continue;
+            const uint32_t n = pf_corner_scan(&t->corners, &t->pyramid[t->now], box, least, corner_allowed, t, best);
+            for (uint32_t i = 0; i < n; i++)
+                remember(t, &best[i]);
         }
     /* heap sort: weakest to the back, so the strongest gets its place first */
     for (uint32_t n = t->found_n; n > 1u; n--) {
@@ -462,9 +466,13 @@ static void detect_all(pf_tracker *t)
         t->found[n - 1u] = swap;
         sift_down(t->found, 0, n - 1u);
     }
-    for (uint32_t i = 0; i < t->found_n; i++)
-        if (corner_allowed(t, t->found[i].x, t->found[i].y))
-            add_track(t, &t->found[i]);
+    for (uint32_t i = 0; i < t->found_n && t->spare_n > 0; i++) {
+        if (!corner_allowed(t, t->found[i].x, t->found[i].y))
+            continue;
+        const pf_point_q16 at = pf_corner_place(image, &t->found[i]);
+        if (place_allowed(t, at))
+            add_track(t, at);
+    }
 }
 
 /* --- a frame ----------------------------------------------------------------------------------------------------- */

@@ -256,3 +256,48 @@ void pf_neon_affine(const int16_t *c, const pf_gradients *g, int32_t window, int
     }
     *sums = s;
 }
+
+void pf_neon_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
+{
+    const uint8_t *above = p - stride, *below = p + stride;
+    for (int32_t i = 0; i < n; i += 8) {
+        const int16x8_t gx = vsubq_s16(pf_load8(p + i + 1), pf_load8(p + i - 1));
+        const int16x8_t gy = vsubq_s16(pf_load8(below + i), pf_load8(above + i));
+        int32x4_t v[3][2];
+        pf_squares(gx, gy, v);
+        for (int32_t k = 0; k < 3; k++) {
+            vst1q_s32(out->k[k] + i, v[k][0]);
+            vst1q_s32(out->k[k] + i + 4, v[k][1]);
+        }
+    }
+}
+
+/* Sums of three neighbours in each of four places, given the places' and the next four numbers. */
+static inline int32x4_t three(int32x4_t a, int32x4_t b)
+{
+    return vaddq_s32(vaddq_s32(a, vextq_s32(a, b, 1)), vextq_s32(a, b, 2));
+}
+
+int32_t pf_neon_corners(const pf_tensor_row *const row[3], int32_t n, pf_tensor_row *sum)
+{
+    int32x4_t most = vdupq_n_s32(0), column[3];
+    for (int32_t k = 0; k < 3; k++)
+        column[k] = vaddq_s32(vaddq_s32(vld1q_s32(row[0]->k[k]), vld1q_s32(row[1]->k[k])), vld1q_s32(row[2]->k[k]));
+    for (int32_t i = 0; i < (n + 7) / 8 * 8; i += 4) {
+        int32x4_t v[3];
+        for (int32_t k = 0; k < 3; k++) {
+            const int32_t *a = row[0]->k[k] + i + 4, *b = row[1]->k[k] + i + 4, *c = row[2]->k[k] + i + 4;
+            const int32x4_t next = vaddq_s32(vaddq_s32(vld1q_s32(a), vld1q_s32(b)), vld1q_s32(c));
+            v[k] = three(column[k], next);
+            vst1q_s32(sum->k[k] + i, v[k]);
+            column[k] = next;
+        }
+        const int32x4_t d = vabsq_s32(v[1]), e = vabsq_s32(v[2]), both = vaddq_s32(d, e);
+        const int32x4_t slant = vaddq_s32(vaddq_s32(vshrq_n_s32(both, 1), vshrq_n_s32(both, 3)), vshrq_n_s32(both, 4));
+        most = vmaxq_s32(most, vsubq_s32(v[0], vmaxq_s32(slant, vmaxq_s32(d, e))));
+    }
+    int32_t lane[4];
+    vst1q_s32(lane, most);
+    const int32_t a = lane[0] > lane[1] ? lane[0] : lane[1], b = lane[2] > lane[3] ? lane[2] : lane[3];
+    return a > b ? a : b;
+}
