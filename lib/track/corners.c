@@ -6,19 +6,19 @@
 
 #define REACH  2 /* the place at full resolution lies so near */
 #define AROUND (2 * REACH + 1)
+#define SPAN   (AROUND + 2 * REACH)
 
 uint32_t pf_isqrt64(uint64_t n)
 {
-    uint64_t root = 0, bit = (uint64_t)1 << 62;
-    while (bit > n)
-        bit >>= 2;
-    for (; bit; bit >>= 2) {
-        if (n >= root + bit) {
-            n -= root + bit;
-            root = (root >> 1) + bit;
-        } else {
-            root >>= 1;
-        }
+    if (n < 2)
+        return (uint32_t)n;
+    /* Newton from above: 2^k >= sqrt n > 2^(k - 1), so the error falls from a factor of 2 at most to 1.25, 1.025, ...
+     */
+    const int32_t k = (65 - __builtin_clzll(n)) / 2;
+    uint64_t root = k < 32 ? (uint64_t)1 << k : UINT32_MAX, next = (root + n / root) / 2;
+    while (next < root) {
+        root = next;
+        next = (root + n / root) / 2;
     }
     return (uint32_t)root;
 }
@@ -79,34 +79,53 @@ static int32_t top_of(int32_t before, int32_t at, int32_t after)
     return bend > 0 ? pf_clamp_i64(((int64_t)after - before) * 32768 / bend, 32768) : 0;
 }
 
-pf_point_q16 pf_corner_place(const pf_image *image, const pf_corner *corner)
+/* Structure tensors of Sobel gradients around (x, y), summed over columns of AROUND. */
+static void column_tensors(const pf_image *image, int32_t x, int32_t y, int32_t column[AROUND][SPAN][3])
 {
-    enum { SPAN = AROUND + 2 * REACH };
-    int32_t tensor[SPAN][SPAN][3], strength[AROUND + 2][AROUND + 2] = {{0}};
-    for (int32_t j = 0; j < SPAN; j++)
-        for (int32_t i = 0; i < SPAN; i++) {
-            const uint8_t *b =
-                image->data + (size_t)(corner->y + j - 2 * REACH) * image->stride + (size_t)(corner->x + i - 2 * REACH);
+    for (int32_t i = 0; i < SPAN; i++) {
+        int32_t sum[3] = {0}, row[SPAN][3];
+        for (int32_t j = 0; j < SPAN; j++) {
+            const uint8_t *b = image->data + (size_t)(y + j - 2 * REACH) * image->stride + (size_t)(x + i - 2 * REACH);
             const uint8_t *a = b - image->stride, *c = b + image->stride;
             const int32_t gx = a[1] - a[-1] + 2 * (b[1] - b[-1]) + c[1] - c[-1];
             const int32_t gy = c[-1] - a[-1] + 2 * (c[0] - a[0]) + c[1] - a[1];
-            tensor[j][i][0] = gx * gx + gy * gy;
-            tensor[j][i][1] = gx * gx - gy * gy;
-            tensor[j][i][2] = 2 * gx * gy;
+            row[j][0] = gx * gx + gy * gy;
+            row[j][1] = gx * gx - gy * gy;
+            row[j][2] = 2 * gx * gy;
+            for (int32_t k = 0; k < 3; k++) {
+                sum[k] += row[j][k] - (j >= AROUND ? row[j - AROUND][k] : 0);
+                if (j >= AROUND - 1)
+                    column[j - AROUND + 1][i][k] = sum[k];
+            }
         }
-    int32_t x = REACH + 1, y = REACH + 1;
+    }
+}
+
+/* The strength, if above `least`, of the tensor over AROUND x AROUND that begins at column i of a row of such. */
+static int32_t square_strength(int32_t least, int32_t column[SPAN][3], int32_t i)
+{
+    int32_t s[3] = {0};
+    for (int32_t k = 0; k < AROUND; k++)
+        for (int32_t c = 0; c < 3; c++)
+            s[c] += column[i + k][c];
+    return strength_above(least, s[0], s[1], s[2]);
+}
+
+pf_point_q16 pf_corner_place(const pf_image *image, const pf_corner *corner)
+{
+    int32_t column[AROUND][SPAN][3], most = 0, x = REACH, y = REACH;
+    column_tensors(image, corner->x, corner->y, column);
     for (int32_t j = 0; j < AROUND; j++)
         for (int32_t i = 0; i < AROUND; i++) {
-            int32_t s[3] = {0};
-            for (int32_t k = 0; k < AROUND * AROUND * 3; k++)
-                s[k % 3] += tensor[j + k / (3 * AROUND)][i + k / 3 % AROUND][k % 3];
-            strength[j + 1][i + 1] = strength_above(0, s[0], s[1], s[2]);
-            if (strength[j + 1][i + 1] > strength[y][x])
-                x = i + 1, y = j + 1;
+            const int32_t s = square_strength(most, column[j], i);
+            if (s > most)
+                most = s, x = i, y = j;
         }
+    pf_point_q16 at = {(corner->x + x - REACH) * 65536, (corner->y + y - REACH) * 65536};
     /* a top at the rim of what was searched has no neighbour there: it stays on its pixel */
-    const bool inside_x = x > 1 && x<AROUND, inside_y = y> 1 && y < AROUND;
-    const int32_t dx = inside_x ? top_of(strength[y][x - 1], strength[y][x], strength[y][x + 1]) : 0;
-    const int32_t dy = inside_y ? top_of(strength[y - 1][x], strength[y][x], strength[y + 1][x]) : 0;
-    return (pf_point_q16){(corner->x + x - REACH - 1) * 65536 + dx, (corner->y + y - REACH - 1) * 65536 + dy};
+    if (x > 0 && x < AROUND - 1)
+        at.x += top_of(square_strength(0, column[y], x - 1), most, square_strength(0, column[y], x + 1));
+    if (y > 0 && y < AROUND - 1)
+        at.y += top_of(square_strength(0, column[y - 1], x), most, square_strength(0, column[y + 1], x));
+    return at;
 }
