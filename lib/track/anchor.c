@@ -91,42 +91,26 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
         memcpy(pixels + r * w, image->data + (size_t)(iy - half - 1 + r) * image->stride + (ix - half - 1), (size_t)w);
     const pf_gradients images = gradients(klt);
     PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
-    int64_t h[6][6] = {{0}}, tt = 0;
-    memset(anchor->sum_j, 0, sizeof anchor->sum_j);
-    memset(anchor->dot_jt, 0, sizeof anchor->dot_jt);
-    memset(anchor->sum_t, 0, sizeof anchor->sum_t);
-    for (int32_t y = -half; y <= half; y++)
-        for (int32_t x = -half; x <= half; x++) {
-            const int32_t k = (y + half) * PATCH_ROW + x + half;
-            const int32_t gx = klt->gx[k], gy = klt->gy[k], t = klt->t[k], plane[3] = {1, x, y};
-            const int32_t j[6] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
-            for (int32_t a = 0; a < 6; a++) {
-                for (int32_t b = a; b < 6; b++)
-                    h[a][b] += (int64_t)j[a] * j[b];
-                for (int32_t b = 0; b < 3; b++)
-                    anchor->sum_j[a][b] += j[a] * plane[b];
-                anchor->dot_jt[a] += (int64_t)j[a] * t;
-            }
-            for (int32_t b = 0; b < 3; b++)
-                anchor->sum_t[b] += t * plane[b];
-            tt += (int64_t)t * t;
-        }
-    anchor->var_t = tt - plane_part(klt, anchor->sum_t, anchor->sum_t);
+    pf_normal_sums s;
+    PF_KERNEL(normal)(&images, klt->window, klt->groups, &s);
+    memcpy(anchor->sum_j, s.j, sizeof anchor->sum_j);
+    memcpy(anchor->sum_t, s.t, sizeof anchor->sum_t);
+    anchor->var_t = s.tt - plane_part(klt, anchor->sum_t, anchor->sum_t);
     if (anchor->var_t < 1)
         anchor->var_t = 1;
     for (int32_t a = 0; a < 6; a++)
-        anchor->dot_jt[a] -= plane_part(klt, anchor->sum_j[a], anchor->sum_t);
+        anchor->dot_jt[a] = s.jt[a] - plane_part(klt, anchor->sum_j[a], anchor->sum_t);
     for (int32_t a = 0; a < 6; a++)
         for (int32_t b = a; b < 6; b++) {
             /* Q8 of the ratio: it times dot_jt stays below 2^62 */
             const int64_t ratio = anchor->dot_jt[b] * 256 / anchor->var_t;
-            h[a][b] -= plane_part(klt, anchor->sum_j[a], anchor->sum_j[b]) + ((anchor->dot_jt[a] * ratio) >> 8);
-            h[b][a] = h[a][b];
+            s.h[a][b] -= plane_part(klt, anchor->sum_j[a], anchor->sum_j[b]) + ((anchor->dot_jt[a] * ratio) >> 8);
+            s.h[b][a] = s.h[a][b];
         }
     for (int32_t a = 0; a < 6; a++)
-        if (h[a][a] < 0)
-            h[a][a] = 0;
-    factor(anchor, h);
+        if (s.h[a][a] < 0)
+            s.h[a][a] = 0;
+    factor(anchor, s.h);
 }
 
 /* Samples `image` on the warped window around `centre` into klt->c. False if it would come within a pixel of the

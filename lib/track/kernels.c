@@ -114,6 +114,24 @@ void pf_c_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_
     *sums = s;
 }
 
+void pf_c_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_normal_sums *sums)
+{
+    *sums = (pf_normal_sums){0};
+    for (int32_t r = 0; r < window; r++) {
+        int64_t v[ROW_SUMS] = {0};
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, x = i - window / 2;
+            const int32_t t = g->t[k], gx = g->gx[k], gy = g->gy[k], px = g->xgx[k], py = g->xgy[k];
+            const int32_t product[ROW_SUMS] = {t,       x * t,   t * t,   gx,      gy,      px,      py,      x * px,
+                                               x * py,  gx * t,  gy * t,  px * t,  py * t,  gx * gx, gx * gy, gy * gy,
+                                               gx * px, gx * py, gy * py, px * px, px * py, py * py};
+            for (int32_t q = 0; q < ROW_SUMS; q++)
+                v[q] += product[q];
+        }
+        pf_normal_add(sums, v, r - window / 2);
+    }
+}
+
 void pf_c_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
 {
     const uint8_t *above = p - stride, *below = p + stride;

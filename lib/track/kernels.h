@@ -53,6 +53,65 @@ typedef struct pf_gradients {
     int16_t *t, *gx, *gy, *xgx, *xgy;
 } pf_gradients;
 
+/* Sums over a template for the normal equations, j the six steepest-descent images: j j', j times 1, x, y; the template
+ * times these; j times the template; the template's square. Of h the upper triangle. */
+typedef struct pf_normal_sums {
+    int64_t h[6][6], j[6][3], t[3], jt[6], tt;
+} pf_normal_sums;
+
+/* What a row adds to them: products of t, gx, gy, px = x gx, py = x gy. */
+enum pf_row_sum {
+    ROW_T,
+    ROW_XT,
+    ROW_TT,
+    ROW_GX,
+    ROW_GY,
+    ROW_PX,
+    ROW_PY,
+    ROW_XPX,
+    ROW_XPY,
+    ROW_GX_T,
+    ROW_GY_T,
+    ROW_PX_T,
+    ROW_PY_T,
+    ROW_GX_GX,
+    ROW_GX_GY,
+    ROW_GY_GY,
+    ROW_GX_PX,
+    ROW_GX_PY,
+    ROW_GY_PY,
+    ROW_PX_PX,
+    ROW_PX_PY,
+    ROW_PY_PY,
+    ROW_SUMS
+};
+
+/* Adds the row at height y: the images are gx, gy, px, y gx, py, y gy. */
+static inline void pf_normal_add(pf_normal_sums *s, const int64_t v[ROW_SUMS], int64_t y)
+{
+    const int64_t h[21] = {v[ROW_GX_GX],        v[ROW_GX_GY],         v[ROW_GX_PX],     y * v[ROW_GX_GX],
+                           v[ROW_GX_PY],        y * v[ROW_GX_GY],     v[ROW_GY_GY],     v[ROW_GX_PY],
+                           y * v[ROW_GX_GY],    v[ROW_GY_PY],         y * v[ROW_GY_GY], v[ROW_PX_PX],
+                           y * v[ROW_GX_PX],    v[ROW_PX_PY],         y * v[ROW_GX_PY], y * y * v[ROW_GX_GX],
+                           y * v[ROW_GX_PY],    y * y * v[ROW_GX_GY], v[ROW_PY_PY],     y * v[ROW_GY_PY],
+                           y * y * v[ROW_GY_GY]};
+    const int64_t j[6][3] = {{v[ROW_GX], v[ROW_PX], y * v[ROW_GX]},  {v[ROW_GY], v[ROW_PY], y * v[ROW_GY]},
+                             {v[ROW_PX], v[ROW_XPX], y * v[ROW_PX]}, {y * v[ROW_GX], y * v[ROW_PX], y * y * v[ROW_GX]},
+                             {v[ROW_PY], v[ROW_XPY], y * v[ROW_PY]}, {y * v[ROW_GY], y * v[ROW_PY], y * y * v[ROW_GY]}};
+    const int64_t jt[6] = {v[ROW_GX_T], v[ROW_GY_T], v[ROW_PX_T], y * v[ROW_GX_T], v[ROW_PY_T], y * v[ROW_GY_T]};
+    const int64_t t[3] = {v[ROW_T], v[ROW_XT], y * v[ROW_T]};
+    for (int32_t a = 0, k = 0; a < 6; a++) {
+        for (int32_t b = a; b < 6; b++)
+            s->h[a][b] += h[k++];
+        for (int32_t b = 0; b < 3; b++)
+            s->j[a][b] += j[a][b];
+        s->jt[a] += jt[a];
+    }
+    for (int32_t b = 0; b < 3; b++)
+        s->t[b] += t[b];
+    s->tt += v[ROW_TT];
+}
+
 #define CELL_MAX   256
 #define CORNER_ROW (CELL_MAX + 24) /* a cell, a border column on either side, and whole groups of 8 */
 
@@ -76,6 +135,7 @@ typedef struct pf_tensor_row {
     /* Samples the warped window, which lies inside the image with a pixel to spare. */                                \
     void set##_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out);           \
     void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);  \
+    void set##_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_normal_sums *sums);                    \
     /* Of the doubled gradients at p[0..n), n rounded up to whole groups of 8. */                                      \
     void set##_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out);                                 \
     /* Sums over 3 x 3 of three rows of such: sum[k][i] over row[j][k][i .. i + 2], i < n. Returns a bound of twice    \

@@ -99,8 +99,9 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
 
 /* Detection. */
-#define CORNER_REACH 6 /* from the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients   \
-                        */
+#define CORNER_REACH                                                                                                   \
+    6 /* from the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients                    \
+       */
 
 typedef struct pf_corner {
     int32_t x, y;

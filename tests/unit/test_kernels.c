@@ -16,6 +16,7 @@ typedef struct results {
     pf_template_sums template;
     pf_step_sums step;
     pf_affine_sums affine;
+    pf_normal_sums normal;
 } results;
 
 static uint8_t image[SIDE * SIDE];
@@ -68,6 +69,7 @@ static void compare(const char *what, uint32_t arrays)
         TEST_ASSERT_EQUAL_INT16_ARRAY_MESSAGE(got[0].out[k], got[1].out[k], PATCH_MAX, what);
     TEST_ASSERT_EQUAL_MEMORY_MESSAGE(&got[0].template, &got[1].template, sizeof got[0].template, what);
     TEST_ASSERT_EQUAL_MEMORY_MESSAGE(&got[0].step, &got[1].step, sizeof got[0].step, what);
+    TEST_ASSERT_EQUAL_MEMORY_MESSAGE(&got[0].normal, &got[1].normal, sizeof got[0].normal, what);
     TEST_ASSERT_EQUAL_MEMORY_MESSAGE(&got[0].affine, &got[1].affine, sizeof got[0].affine, what);
 }
 
@@ -159,6 +161,7 @@ static void test_affine_kernels_are_the_same_bits(void)
             const pf_gradients g = {in[0], in[1], in[2], in[3], in[4]};
             memcpy(got[1].out[0], in[0], sizeof in[0]);
             BOTH(affine, kind % 3u ? in[0] : in[1], &g, window, groups, &r->affine);
+            BOTH(normal, &g, window, groups, &r->normal);
             compare("affine", 0);
         }
 }

@@ -257,6 +257,34 @@ void pf_neon_affine(const int16_t *c, const pf_gradients *g, int32_t window, int
     *sums = s;
 }
 
+/* A row's sums stay below 2^31 in each lane: squares of x gx, 1020^2 (15^2 + 14^2 + 7^2 + ...). */
+void pf_neon_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_normal_sums *sums)
+{
+    const int16x8_t one = vdupq_n_s16(1), first = vaddq_s16(lanes(), vdupq_n_s16((int16_t)(-window / 2)));
+    *sums = (pf_normal_sums){0};
+    for (int32_t r = 0; r < window; r++) {
+        int32x4_t s[ROW_SUMS];
+        int64_t v[ROW_SUMS];
+        for (int32_t q = 0; q < ROW_SUMS; q++)
+            s[q] = vdupq_n_s32(0);
+        for (int32_t i = 0; i < groups; i++) {
+            const int32_t k = r * PATCH_ROW + 8 * i;
+            const int16x8_t x = vaddq_s16(first, vdupq_n_s16((int16_t)(8 * i))), t = vld1q_s16(g->t + k);
+            const int16x8_t gx = vld1q_s16(g->gx + k), gy = vld1q_s16(g->gy + k);
+            const int16x8_t px = vld1q_s16(g->xgx + k), py = vld1q_s16(g->xgy + k);
+            const int16x8_t a[ROW_SUMS] = {t,  t,  t,  gx, gy, px, py, px, py, gx, gy,
+                                           px, py, gx, gx, gy, gx, gx, gy, px, px, py};
+            const int16x8_t b[ROW_SUMS] = {one, x, t,  one, one, one, one, x,  x,  t,  t,
+                                           t,   t, gx, gy,  gy,  px,  py,  py, px, py, py};
+            for (int32_t q = 0; q < ROW_SUMS; q++)
+                s[q] = pf_dot(s[q], a[q], b[q]);
+        }
+        for (int32_t q = 0; q < ROW_SUMS; q++)
+            v[q] = pf_total(s[q]);
+        pf_normal_add(sums, v, r - window / 2);
+    }
+}
+
 void pf_neon_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
 {
     const uint8_t *above = p - stride, *below = p + stride;
