@@ -29,7 +29,7 @@ static int32_t row_bytes(const pf_klt *klt)
 
 static pf_gradients gradients(pf_klt *klt)
 {
-    return (pf_gradients){klt->t, klt->gx, klt->gy, klt->xgx, klt->xgy};
+    return (pf_gradients){klt->t, klt->gx, klt->gy, klt->xgx, klt->xgy, {0, 0}};
 }
 
 /* Inverts the symmetric positive matrix m (Q20, diagonal about 1) in place: Gauss-Jordan without pivoting. With the
@@ -52,6 +52,17 @@ static void invert6(int64_t m[6][6])
     }
 }
 
+/* Where the inverse's (i, j) is kept, j <= i. */
+static int32_t *entry(pf_anchor *anchor, int32_t i, int32_t j)
+{
+    return &anchor->inverse[i * (i + 1) / 2 + j];
+}
+
+static int32_t inverse_at(const pf_anchor *anchor, int32_t i, int32_t j)
+{
+    return anchor->inverse[i > j ? i * (i + 1) / 2 + j : j * (j + 1) / 2 + i];
+}
+
 /* Scales the normal matrix to a diagonal in [1/4, 1) and stores its inverse and the scales. */
 static void factor(pf_anchor *anchor, int64_t h[6][6])
 {
@@ -68,8 +79,8 @@ static void factor(pf_anchor *anchor, int64_t h[6][6])
         m[i][i] += i < 2 ? RIDGE : RIDGE_WARP;
     invert6(m);
     for (int32_t i = 0; i < 6; i++)
-        for (int32_t j = 0; j < 6; j++)
-            anchor->inverse[6 * i + j] = pf_clamp_i64(m[i][j], 1 << 30);
+        for (int32_t j = 0; j <= i; j++)
+            *entry(anchor, i, j) = pf_clamp_i64(m[i][j], 1 << 30);
 }
 
 /* Product of the parts of two images that lie in the space of planes, given their sums times 1, x, y: over the
@@ -93,18 +104,19 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
     pf_normal_sums s;
     PF_KERNEL(normal)(&images, klt->window, klt->groups, &s);
-    memcpy(anchor->sum_j, s.j, sizeof anchor->sum_j);
-    memcpy(anchor->sum_t, s.t, sizeof anchor->sum_t);
-    anchor->var_t = s.tt - plane_part(klt, anchor->sum_t, anchor->sum_t);
-    if (anchor->var_t < 1)
-        anchor->var_t = 1;
+    int64_t var_t = s.tt - plane_part(klt, s.t, s.t);
+    if (var_t < 1)
+        var_t = 1;
     for (int32_t a = 0; a < 6; a++)
-        anchor->dot_jt[a] = s.jt[a] - plane_part(klt, anchor->sum_j[a], anchor->sum_t);
+        for (int32_t b = 0; b < 3; b++)
+            anchor->sum_j[a][b] = (int32_t)s.j[a][b];
+    for (int32_t a = 0; a < 6; a++)
+        s.jt[a] -= plane_part(klt, s.j[a], s.t);
     for (int32_t a = 0; a < 6; a++)
         for (int32_t b = a; b < 6; b++) {
             /* Q8 of the ratio: it times dot_jt stays below 2^62 */
-            const int64_t ratio = anchor->dot_jt[b] * 256 / anchor->var_t;
-            s.h[a][b] -= plane_part(klt, anchor->sum_j[a], anchor->sum_j[b]) + ((anchor->dot_jt[a] * ratio) >> 8);
+            const int64_t ratio = s.jt[b] * 256 / var_t;
+            s.h[a][b] -= plane_part(klt, s.j[a], s.j[b]) + ((s.jt[a] * ratio) >> 8);
             s.h[b][a] = s.h[a][b];
         }
     for (int32_t a = 0; a < 6; a++)
@@ -129,24 +141,74 @@ static bool sample_warped(pf_klt *klt, const pf_image *image, pf_point_q16 centr
     return true;
 }
 
-/* Right-hand side: the steepest-descent images against the sampled patch. */
+/* Sums of a patch with the steepest-descent images, all less their best plane. */
 typedef struct pf_rhs {
     int64_t b[6], gain_q14;
-    int64_t cov, var; /* with the template, and of the patch, both less their best plane */
+    int64_t cov, var; /* with the template, and of the patch */
 } pf_rhs;
 
-static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, pf_rhs *out)
+/* What of the template changes with the smoothing. */
+typedef struct pf_reference {
+    int64_t sum[3], var, b[6];
+} pf_reference;
+
+/* Sums of the patch c and their parts off the plane. */
+static void off_plane(const pf_klt *klt, const pf_anchor *anchor, const pf_affine_sums *s, pf_rhs *out)
+{
+    out->var = s->cc - plane_part(klt, s->c, s->c);
+    for (int32_t i = 0; i < 6; i++) {
+        const int64_t j[3] = {anchor->sum_j[i][0], anchor->sum_j[i][1], anchor->sum_j[i][2]};
+        out->b[i] = s->b[i] - plane_part(klt, j, s->c);
+    }
+}
+
+/* A half f (1 - f) at a coordinate, Q15. */
+static int32_t smoothing_at(int64_t v)
+{
+    const int32_t f = (int32_t)(v & 0xFFFF) >> 1;
+    return (f * (32768 - f)) >> 16;
+}
+
+/* Unpacks the template, smoothed as sampling will smooth the image: by the mean over the window's centre and corners,
+ * for where the warp turns or scales, the fraction differs from pixel to pixel. Unsmoothed, fine texture would pull by
+ * a hundredth of a pixel. */
+static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 centre,
+                           pf_reference *out)
+{
+    pf_gradients images = gradients(klt);
+    const int32_t *a = anchor->a;
+    int32_t x = 0, y = 0;
+    for (int32_t v = -1; v <= 1; v++)
+        for (int32_t u = -1; u <= 1; u++) {
+            const int32_t reach = klt->half / 2 + 1;
+            x += smoothing_at((int64_t)centre.x + (int64_t)reach * (u * (int64_t)a[0] + v * (int64_t)a[1]));
+            y += smoothing_at((int64_t)centre.y + (int64_t)reach * (u * (int64_t)a[2] + v * (int64_t)a[3]));
+        }
+    images.smooth[0] = (int16_t)(x / 9);
+    images.smooth[1] = (int16_t)(y / 9);
+    PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
+    pf_affine_sums s;
+    pf_rhs rhs;
+    PF_KERNEL(affine)(klt->t, &images, klt->window, klt->groups, &s);
+    off_plane(klt, anchor, &s, &rhs);
+    out->var = rhs.var < 1 ? 1 : rhs.var;
+    for (int32_t i = 0; i < 6; i++)
+        out->b[i] = rhs.b[i];
+    for (int32_t i = 0; i < 3; i++)
+        out->sum[i] = s.c[i];
+}
+
+static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, const pf_reference *t, pf_rhs *out)
 {
     const pf_gradients g = gradients(klt);
     pf_affine_sums s;
     PF_KERNEL(affine)(klt->c, &g, klt->window, klt->groups, &s);
-    const int64_t cov = s.ct - plane_part(klt, anchor->sum_t, s.c), var = s.cc - plane_part(klt, s.c, s.c);
-    out->gain_q14 = cov * GAIN_ONE / anchor->var_t;
-    out->cov = cov;
-    out->var = var;
-    const int64_t gain_q16 = cov * 65536 / anchor->var_t;
+    off_plane(klt, anchor, &s, out);
+    out->cov = s.ct - plane_part(klt, t->sum, s.c);
+    out->gain_q14 = out->cov * GAIN_ONE / t->var;
+    const int64_t gain_q16 = out->cov * 65536 / t->var;
     for (int32_t i = 0; i < 6; i++)
-        out->b[i] = s.b[i] - plane_part(klt, anchor->sum_j[i], s.c) - ((anchor->dot_jt[i] * gain_q16) >> 16);
+        out->b[i] -= (t->b[i] * gain_q16) >> 16;
 }
 
 /* The step d: Q16 pixels, Q16 warp. */
@@ -158,7 +220,7 @@ static void solve(const pf_anchor *anchor, const pf_rhs *rhs, int32_t d[6])
     for (int32_t i = 0; i < 6; i++) {
         int64_t v = 0;
         for (int32_t j = 0; j < 6; j++)
-            v += anchor->inverse[6 * i + j] * scaled[j];
+            v += (int64_t)inverse_at(anchor, i, j) * scaled[j];
         /* v is Q32 in Q7 over Q6: to Q16 pixels */
         v >>= 17 + anchor->scale[i];
         d[i] = pf_clamp_i64((int64_t)pf_clamp_i64(v, 1 << 26) * GAIN_ONE / rhs->gain_q14,
@@ -193,14 +255,14 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     const pf_point_q16 before = warped_offset(anchor);
     pf_point_q16 centre = {at->x - before.x, at->y - before.y};
     pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
-    const pf_gradients images = gradients(klt);
-    PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
+    pf_reference reference;
+    take_reference(klt, anchor, pixels, centre, &reference);
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
             return fit;
         }
-        right_hand_side(klt, anchor, &rhs);
+        right_hand_side(klt, anchor, &reference, &rhs);
         if (rhs.gain_q14 < GAIN_MIN || rhs.gain_q14 > GAIN_MAX) {
             fit.reason = PF_TRACK_DRIFT;
             return fit;
@@ -220,7 +282,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = pf_zncc(rhs.cov, anchor->var_t, rhs.var);
+    fit.zncc_q15 = pf_zncc(rhs.cov, reference.var, rhs.var);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
     return fit;
 }
@@ -232,7 +294,7 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
     const int64_t factor_q8 = 256 + ((int64_t)256 << 14) / gain2;
     int64_t cov[3];
     for (int32_t i = 0; i < 3; i++) {
-        const int64_t m = anchor->inverse[6 * row[i] + col[i]];
+        const int64_t m = inverse_at(anchor, row[i], col[i]);
         const int32_t shift = 10 + anchor->scale[row[i]] + anchor->scale[col[i]];
         const int64_t v = (m * ((int64_t)noise_q8 * noise_q8)) >> shift;
         cov[i] = v > (int64_t)1 << 40 ? (int64_t)1 << 40 : v < -((int64_t)1 << 40) ? -((int64_t)1 << 40) : v;

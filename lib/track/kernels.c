@@ -68,11 +68,14 @@ void pf_c_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int
         const uint8_t *a = pixels + r * w, *b = a + w, *c = b + w;
         for (int32_t i = 0; i < 8 * groups; i++) {
             const int32_t k = r * PATCH_ROW + i, x = i - window / 2;
-            const int32_t along = 3 * (a[i + 2] - a[i]) + 10 * (b[i + 2] - b[i]) + 3 * (c[i + 2] - c[i]);
-            const int32_t down = 3 * (c[i] - a[i]) + 10 * (c[i + 1] - a[i + 1]) + 3 * (c[i + 2] - a[i + 2]);
-            out->t[k] = (int16_t)((b[i + 1] * PIXEL_ONE - PIXEL_MID) & mask[k]);
-            out->gx[k] = (int16_t)(((along + 2) >> 2) & mask[k]);
-            out->gy[k] = (int16_t)(((down + 2) >> 2) & mask[k]);
+            const int32_t along = a[i + 2] - a[i] + 2 * (b[i + 2] - b[i]) + c[i + 2] - c[i];
+            const int32_t down = c[i] - a[i] + 2 * (c[i + 1] - a[i + 1]) + c[i + 2] - a[i + 2];
+            const int32_t bend_x = b[i] + b[i + 2] - 2 * b[i + 1], bend_y = a[i + 1] + c[i + 1] - 2 * b[i + 1];
+            const int32_t t = b[i + 1] * PIXEL_ONE - PIXEL_MID + mul_q15(bend_x * PIXEL_ONE, out->smooth[0]) +
+                              mul_q15(bend_y * PIXEL_ONE, out->smooth[1]);
+            out->t[k] = (int16_t)(t & mask[k]);
+            out->gx[k] = (int16_t)(along & mask[k]);
+            out->gy[k] = (int16_t)(down & mask[k]);
             out->xgx[k] = (int16_t)(out->gx[k] * x);
             out->xgy[k] = (int16_t)(out->gy[k] * x);
         }

@@ -48,9 +48,11 @@ typedef struct pf_warp {
     int32_t x, y, a[4];
 } pf_warp;
 
-/* Gradients of a template kept as pixels: Q3, |.| <= 1020, Scharr; and x times them. */
+/* Of a template kept as pixels: the patch, smoothed as sampling smooths (`smooth`: a half f (1 - f) along x and y, Q15,
+ * f the fraction of a pixel; at most 1/8); gradients, Q3, |.| <= 1020, Sobel; and x times them. */
 typedef struct pf_gradients {
     int16_t *t, *gx, *gy, *xgx, *xgy;
+    int16_t smooth[2];
 } pf_gradients;
 
 /* Sums over a template for the normal equations, j the six steepest-descent images: j j', j times 1, x, y; the template

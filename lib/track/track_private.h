@@ -46,12 +46,9 @@ typedef struct pf_fit {
 typedef struct pf_anchor {
     pf_point_q16 offset; /* of the track's point from the template's centre pixel, |.| <= 1/2 */
     int32_t a[4];        /* Q16.16, row-major */
-    int32_t inverse[36]; /* Q12.20, of the scaled 6x6 normal matrix; order dx dy, then the warp row by row */
+    int32_t inverse[21]; /* Q12.20, of the scaled 6x6 normal matrix, lower triangle; order dx dy, the warp by rows */
     int32_t scale[6];    /* log2 of each parameter's scale */
-    int64_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
-    int64_t sum_t[3];    /* the same of the template */
-    int64_t dot_jt[6];   /* steepest-descent images times the template, both less their best plane */
-    int64_t var_t;       /* sum of squares of the template less its best plane, >= 1 */
+    int32_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
 } pf_anchor;
 
 uint32_t pf_isqrt64(uint64_t n);

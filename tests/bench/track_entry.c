@@ -23,7 +23,7 @@ entry *entry_new(uint32_t width, uint32_t height, uint32_t max_tracks, uint32_t 
 void entry_free(entry *e);
 void entry_scene(uint8_t *out, int width, int height, double zoom, uint32_t seed);
 void entry_pyramid(entry *e, uint32_t which, const uint8_t *data);
-uint32_t entry_klt(entry *e, const float *from, uint32_t n, int affine, float *to, uint8_t *ok);
+uint32_t entry_klt(entry *e, const float *from, const float *guess, uint32_t n, int affine, float *to, uint8_t *ok);
 uint32_t entry_frame(entry *e, const uint8_t *data);
 uint32_t entry_tracks(const entry *e, uint64_t *id, float *xy, float *cov, uint8_t *status, uint32_t room);
 void entry_reset(entry *e);
@@ -72,14 +72,14 @@ void entry_pyramid(entry *e, uint32_t which, const uint8_t *data)
     (void)pf_pyramid_build(&e->pyramid[which], &(pf_image){data, e->width, e->height, e->width});
 }
 
-/* Every point from pyramid 0 to pyramid 1, from no guess: through all levels; with `affine` the template fit does the
+/* Every point from pyramid 0 to pyramid 1, from its guess, through all levels; with `affine` the template fit does the
  * finest, as in the tracker. Returns how many are ok. */
-uint32_t entry_klt(entry *e, const float *from, uint32_t n, int affine, float *to, uint8_t *ok)
+uint32_t entry_klt(entry *e, const float *from, const float *guess, uint32_t n, int affine, float *to, uint8_t *ok)
 {
     uint32_t good = 0;
     for (uint32_t i = 0; i < n; i++) {
         const pf_point_q16 p = {(int32_t)(from[2 * i] * 65536), (int32_t)(from[2 * i + 1] * 65536)};
-        pf_point_q16 at = p;
+        pf_point_q16 at = {(int32_t)(guess[2 * i] * 65536), (int32_t)(guess[2 * i + 1] * 65536)};
         pf_fit fit = pf_klt_track(&e->klt, &e->pyramid[0], &e->pyramid[1], p, &at, LEVELS - 1u, affine ? 1 : 0);
         if (affine) {
             pf_anchor_take(&e->klt, &e->pyramid[0].level[0], p, &e->anchor, e->pixels);

@@ -42,14 +42,17 @@ class Entry:
         """Builds pyramid 0 or 1; `image` must stay."""
         self.lib.entry_pyramid(self.handle, which, self._pixels(image))
 
-    def klt(self, points: np.ndarray, affine: bool) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 2) points of pyramid 0 -> where they are in pyramid 1, and (N,) whether they settled."""
+    def klt(self, points: np.ndarray, affine: bool, guess: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2) points of pyramid 0 -> where they are in pyramid 1, and (N,) whether they settled.
+
+        `guess` (N, 2) is where to begin; without one, where they were."""
         points = np.ascontiguousarray(points, np.float32)
+        guess = points if guess is None else np.ascontiguousarray(guess, np.float32)
         to, ok = np.empty_like(points), np.empty(len(points), np.uint8)
         void = ctypes.c_void_p
         self.lib.entry_klt(
-            self.handle, points.ctypes.data_as(void), len(points), int(affine), to.ctypes.data_as(void),
-            ok.ctypes.data_as(void),
+            self.handle, points.ctypes.data_as(void), guess.ctypes.data_as(void), len(points), int(affine),
+            to.ctypes.data_as(void), ok.ctypes.data_as(void),
         )  # fmt: skip
         return to, ok.astype(bool)
 

@@ -132,10 +132,11 @@ static void test_affine_kernels_are_the_same_bits(void)
             const int32_t groups = (window + 7) / 8;
             fill(kind);
             fill_mask(window, groups, kind % 2u);
+            const int16_t smooth[2] = {(int16_t)(next_random() % 4097u), (int16_t)(kind % 3u * 2048u)};
             for (uint32_t i = 0; i < 2; i++) {
                 clear();
                 BOTH(unpack, image + i, mask, window, groups,
-                     &(pf_gradients){r->out[0], r->out[1], r->out[2], r->out[3], r->out[4]});
+                     &(pf_gradients){r->out[0], r->out[1], r->out[2], r->out[3], r->out[4], {smooth[0], smooth[1]}});
                 compare("unpack", 5);
             }
             for (uint32_t k = 0; k < 5; k++)
@@ -158,7 +159,7 @@ static void test_affine_kernels_are_the_same_bits(void)
             BOTH(warp, &warp, mask, window, groups, r->out[0]);
             compare("warp", 1);
             clear();
-            const pf_gradients g = {in[0], in[1], in[2], in[3], in[4]};
+            const pf_gradients g = {in[0], in[1], in[2], in[3], in[4], {0, 0}};
             memcpy(got[1].out[0], in[0], sizeof in[0]);
             BOTH(affine, kind % 3u ? in[0] : in[1], &g, window, groups, &r->affine);
             BOTH(normal, &g, window, groups, &r->normal);

@@ -15,8 +15,8 @@ extern "C" {
 
 #define PF_TRACKS_MAX 2048u
 
-/* Added to both variances of a position: (1/64 px)^2, for what interpolation and rounding leave. */
-#define PF_TRACK_COV_FLOOR_Q20 256
+/* Added to both variances of a position: (1/256 px)^2, for what interpolation and rounding leave. */
+#define PF_TRACK_COV_FLOOR_Q20 16
 
 typedef enum pf_track_status {
     PF_TRACK_NEW = 1,     /* detected in this frame */

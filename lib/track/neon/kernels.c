@@ -109,16 +109,23 @@ static inline int16x8_t lanes(void)
     return vld1q_s16(index);
 }
 
-/* (3 a + 10 b + 3 c + 2) >> 2 */
-static inline int16x8_t scharr(int16x8_t a, int16x8_t b, int16x8_t c)
+/* a + 2 b + c */
+static inline int16x8_t sobel(int16x8_t a, int16x8_t b, int16x8_t c)
 {
-    const int16x8_t three = vmulq_n_s16(vaddq_s16(a, c), 3);
-    return vshrq_n_s16(vaddq_s16(vaddq_s16(three, vmulq_n_s16(b, 10)), vdupq_n_s16(2)), 2);
+    return vaddq_s16(vaddq_s16(a, c), vaddq_s16(b, b));
+}
+
+/* What smoothing adds, Q4. */
+static inline int16x8_t bend(int16x8_t before, int16x8_t at, int16x8_t after, int16x8_t smooth)
+{
+    const int16x8_t v = vsubq_s16(vaddq_s16(before, after), vaddq_s16(at, at));
+    return pf_mul_q15(vshlq_n_s16(v, 4), smooth);
 }
 
 void pf_neon_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int32_t groups, const pf_gradients *out)
 {
     const int32_t w = window + 2;
+    const int16x8_t along = vdupq_n_s16(out->smooth[0]), down = vdupq_n_s16(out->smooth[1]);
     for (int32_t g = 0; g < groups; g++) {
         const int16x8_t x = vaddq_s16(lanes(), vdupq_n_s16((int16_t)(8 * g - window / 2)));
         const uint8_t *p = pixels + 8 * g;
@@ -128,9 +135,10 @@ void pf_neon_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, 
             const int32_t k = r * PATCH_ROW + 8 * g;
             const uint8_t *q = p + (r + 2) * w;
             const int16x8_t c0 = pf_load8(q), c1 = pf_load8(q + 1), c2 = pf_load8(q + 2), m = vld1q_s16(mask + k);
-            const int16x8_t t = vsubq_s16(vshlq_n_s16(b1, 4), vdupq_n_s16(PIXEL_MID));
-            const int16x8_t gx = vandq_s16(scharr(vsubq_s16(a2, a0), vsubq_s16(b2, b0), vsubq_s16(c2, c0)), m);
-            const int16x8_t gy = vandq_s16(scharr(vsubq_s16(c0, a0), vsubq_s16(c1, a1), vsubq_s16(c2, a2)), m);
+            const int16x8_t smoothed = vaddq_s16(bend(b0, b1, b2, along), bend(a1, b1, c1, down));
+            const int16x8_t t = vaddq_s16(vsubq_s16(vshlq_n_s16(b1, 4), vdupq_n_s16(PIXEL_MID)), smoothed);
+            const int16x8_t gx = vandq_s16(sobel(vsubq_s16(a2, a0), vsubq_s16(b2, b0), vsubq_s16(c2, c0)), m);
+            const int16x8_t gy = vandq_s16(sobel(vsubq_s16(c0, a0), vsubq_s16(c1, a1), vsubq_s16(c2, a2)), m);
             vst1q_s16(out->t + k, vandq_s16(t, m));
             vst1q_s16(out->gx + k, gx);
             vst1q_s16(out->gy + k, gy);
