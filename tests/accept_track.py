@@ -5,16 +5,21 @@ reported is the tracker's own table after two frames. Bars (issue of the tracker
 Cramer-Rao bound; light; rotation with scale; shifts of 60 px with a start guess; covariances.
 
     python tests/accept_track.py          prints the table, then one JSON list of {name, value, bound, holds}
+
+With PIPEFISH_DATA (or ../shared/data) a folder that has homography/graf, wall and boat (the Oxford sequences: img1.png,
+H1to2p.xml ...) the repeatability of corners is compared too.
 """
 
 import json
+import os
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "bench"))
-from track_library import LOST, NEW, TRACKED, Entry  # noqa: E402
+from track_library import NEW, TRACKED, Entry
 
 try:
     import cv2
@@ -51,7 +56,7 @@ class Texture:
 class Motion:
     """x -> c + A (x - c) + d, and light: gain and bias."""
 
-    def __init__(self, shift=(0.0, 0.0), degrees=0.0, scale=1.0, gain=1.0, bias=0.0) -> None:  # noqa: ANN001
+    def __init__(self, shift=(0.0, 0.0), degrees=0.0, scale=1.0, gain=1.0, bias=0.0) -> None:
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         self.a, self.d = scale * np.array([[c, -s], [s, c]]), np.array(shift)
         self.centre, self.gain, self.bias = np.array([WIDTH / 2, HEIGHT / 2]), gain, bias
@@ -115,7 +120,38 @@ def expected_median(covariance: np.ndarray) -> float:
     """Median length of errors drawn from all these covariances."""
     random = np.random.default_rng(0)
     root = np.linalg.cholesky(covariance)
-    return float(np.median(np.linalg.norm(np.einsum("nij,knj->kni", root, random.standard_normal((200, len(root), 2))), axis=2)))
+    return float(
+        np.median(np.linalg.norm(np.einsum("nij,knj->kni", root, random.standard_normal((200, len(root), 2))), axis=2))
+    )
+
+
+def found_again(one: np.ndarray, two: np.ndarray, h: np.ndarray, shape: tuple[int, int]) -> float:
+    """Share of the corners (N, 2) of one view, of those that lie in the other, that have one there within 2 px."""
+    q = np.c_[one, np.ones(len(one))] @ h.T
+    q = q[:, :2] / q[:, 2:]
+    inside = np.all((q > MARGIN) & (q < [shape[1] - MARGIN, shape[0] - MARGIN]), axis=1)
+    return float((np.linalg.norm(q[inside][:, None] - two[None], axis=2).min(axis=1) <= 2).mean())
+
+
+def repeatability(folder: Path, count: int = 400, distance: int = 10) -> tuple[float, float]:
+    """Mean over the sequences and views 2 to 4, ours and goodFeaturesToTrack's, of as many corners as far apart."""
+    shares: list[tuple[float, float]] = []
+    for name in ("graf", "wall", "boat"):
+        views = [cv2.imread(str(folder / name / f"img{k}.png"), cv2.IMREAD_GRAYSCALE) for k in range(1, 5)]
+        own, rival = [], []
+        for view in views:
+            tracker = Entry(view.shape[1], view.shape[0], count, 2 * distance)
+            tracker.frame(view)
+            own.append(tracker.tracks()[1])
+            inner = np.zeros_like(view)
+            inner[MARGIN:-MARGIN, MARGIN:-MARGIN] = 255
+            rival.append(cv2.goodFeaturesToTrack(view, len(own[-1]), 0.001, distance, mask=inner, blockSize=3)[:, 0])
+        for k in range(1, 4):
+            text = re.search(r"<data>(.*?)</data>", (folder / name / f"H1to{k + 1}p.xml").read_text(), re.S).group(1)
+            h = np.array([float(v) for v in text.split()]).reshape(3, 3)
+            shares.append(tuple(found_again(c[0], c[k], h, views[k].shape) for c in (own, rival)))
+            print(f"  {name} 1-{k + 1}: ours {shares[-1][0]:.3f}, OpenCV {shares[-1][1]:.3f}", file=sys.stderr)
+    return tuple(np.mean(shares, axis=0))
 
 
 def main() -> None:
@@ -136,7 +172,10 @@ def main() -> None:
     def row(name: str, value: float, text: str, holds: bool) -> None:
         rows.append({"name": f"track.{name}", "value": float(value), "bound": text, "holds": bool(holds)})
 
-    print(f"{'case':16} {'points':>6}  {'ours: median':>12} {'bad':>4} {'kept':>6}    OpenCV: median  bad   kept", file=sys.stderr)
+    print(
+        f"{'case':16} {'points':>6}  {'ours: median':>12} {'bad':>4} {'kept':>6}    OpenCV: median  bad   kept",
+        file=sys.stderr,
+    )
     squares: list[np.ndarray] = []
     for name, motion, noise in cases:
         error, kept, count, rival, rival_kept, bounds = [], 0, 0, [], 0, []
@@ -190,7 +229,7 @@ def main() -> None:
     fit = trackable(motion.forward(start))
     tracker.pyramid(0, one)
     tracker.pyramid(1, two)
-    to, ok = tracker.klt(start[fit], True, guess=motion.forward(start[fit]) + [3.0, -2.0])
+    to, ok = tracker.klt(start[fit], True, guess=motion.forward(start[fit]) + np.array([3.0, -2.0]))
     error = np.linalg.norm(to - motion.forward(start[fit]), axis=1)
     share = float((ok & (error < 0.2)).mean())
     row("shift_60px_recovered", share, ">= 0.95", share >= 0.95)
@@ -198,6 +237,12 @@ def main() -> None:
     for width, height, most in ((1280, 800, 6 << 20), (320, 240, 512 << 10)):
         size = tracker.workspace(width, height)
         row(f"workspace_{width}x{height}", size, f"<= {most}", size <= most)
+
+    data = os.environ.get("PIPEFISH_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(data) / "homography"
+    if cv2 and (folder / "graf").is_dir():
+        own, rival = repeatability(folder)
+        row("repeatability", own, f">= {rival:.3f}, goodFeaturesToTrack's", own >= rival)
     print(json.dumps(rows))
 
 

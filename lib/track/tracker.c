@@ -195,9 +195,10 @@ static void grid_insert(pf_tracker *t, uint32_t row)
 /* Whether a track in the grid lies within `reach` (Q16.16 px, at most a cell) of `at`. */
 static bool grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach)
 {
-    const int32_t cell = (int32_t)t->config.cell, cx = (at.x >> 16) / cell, cy = (at.y >> 16) / cell;
-    for (int32_t y = cy > 0 ? cy - 1 : 0; y <= cy + 1 && y < (int32_t)t->grid_h; y++)
-        for (int32_t x = cx > 0 ? cx - 1 : 0; x <= cx + 1 && x < (int32_t)t->grid_w; x++)
+    const int64_t cell = (int64_t)t->config.cell << 16, left = at.x - reach, top = at.y - reach;
+    const int64_t right = (at.x + reach) / cell, bottom = (at.y + reach) / cell;
+    for (int64_t y = top > 0 ? top / cell : 0; y <= bottom && y < (int64_t)t->grid_h; y++)
+        for (int64_t x = left > 0 ? left / cell : 0; x <= right && x < (int64_t)t->grid_w; x++)
             for (int32_t i = t->head[(size_t)y * t->grid_w + (size_t)x]; i >= 0; i = t->next[i]) {
                 const int64_t dx = (int64_t)t->table[i].pos.x - at.x, dy = (int64_t)t->table[i].pos.y - at.y;
                 if (dx * dx + dy * dy < reach * reach)

@@ -14,6 +14,8 @@ import sys
 import time
 from pathlib import Path
 
+import room_track
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ROOT / "build" / "release" / "tests" / "bench"
 
@@ -39,7 +41,7 @@ def bench_sim() -> list[dict]:
     return [{"name": "sim.fps", "value": count / (time.perf_counter() - start), "unit": "frames/s"}]
 
 
-PYTHON_ROOMS = {"sim": bench_sim}
+PYTHON_ROOMS = {"sim": bench_sim, "track": room_track.measure}
 
 
 def cpu_name() -> str:

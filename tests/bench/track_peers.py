@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -94,7 +95,7 @@ def main() -> None:
         ours.frame(one)
         there = corners(one, TRACKS)
         times: list[tuple[float, float]] = []
-        for before, now in zip(frames[:-1], frames[1:], strict=True):
+        for before, now in pairwise(frames):
             a = time.thread_time_ns()
             ours.frame(now)
             b = time.thread_time_ns()

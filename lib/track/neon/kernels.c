@@ -280,12 +280,28 @@ void pf_neon_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_no
             const int16x8_t x = vaddq_s16(first, vdupq_n_s16((int16_t)(8 * i))), t = vld1q_s16(g->t + k);
             const int16x8_t gx = vld1q_s16(g->gx + k), gy = vld1q_s16(g->gy + k);
             const int16x8_t px = vld1q_s16(g->xgx + k), py = vld1q_s16(g->xgy + k);
-            const int16x8_t a[ROW_SUMS] = {t,  t,  t,  gx, gy, px, py, px, py, gx, gy,
-                                           px, py, gx, gx, gy, gx, gx, gy, px, px, py};
-            const int16x8_t b[ROW_SUMS] = {one, x, t,  one, one, one, one, x,  x,  t,  t,
-                                           t,   t, gx, gy,  gy,  px,  py,  py, px, py, py};
-            for (int32_t q = 0; q < ROW_SUMS; q++)
-                s[q] = pf_dot(s[q], a[q], b[q]);
+            s[ROW_T] = pf_dot(s[ROW_T], t, one);
+            s[ROW_XT] = pf_dot(s[ROW_XT], t, x);
+            s[ROW_TT] = pf_dot(s[ROW_TT], t, t);
+            s[ROW_GX] = pf_dot(s[ROW_GX], gx, one);
+            s[ROW_GY] = pf_dot(s[ROW_GY], gy, one);
+            s[ROW_PX] = pf_dot(s[ROW_PX], px, one);
+            s[ROW_PY] = pf_dot(s[ROW_PY], py, one);
+            s[ROW_XPX] = pf_dot(s[ROW_XPX], px, x);
+            s[ROW_XPY] = pf_dot(s[ROW_XPY], py, x);
+            s[ROW_GX_T] = pf_dot(s[ROW_GX_T], gx, t);
+            s[ROW_GY_T] = pf_dot(s[ROW_GY_T], gy, t);
+            s[ROW_PX_T] = pf_dot(s[ROW_PX_T], px, t);
+            s[ROW_PY_T] = pf_dot(s[ROW_PY_T], py, t);
+            s[ROW_GX_GX] = pf_dot(s[ROW_GX_GX], gx, gx);
+            s[ROW_GX_GY] = pf_dot(s[ROW_GX_GY], gx, gy);
+            s[ROW_GY_GY] = pf_dot(s[ROW_GY_GY], gy, gy);
+            s[ROW_GX_PX] = pf_dot(s[ROW_GX_PX], gx, px);
+            s[ROW_GX_PY] = pf_dot(s[ROW_GX_PY], gx, py);
+            s[ROW_GY_PY] = pf_dot(s[ROW_GY_PY], gy, py);
+            s[ROW_PX_PX] = pf_dot(s[ROW_PX_PX], px, px);
+            s[ROW_PX_PY] = pf_dot(s[ROW_PX_PY], px, py);
+            s[ROW_PY_PY] = pf_dot(s[ROW_PY_PY], py, py);
         }
         for (int32_t q = 0; q < ROW_SUMS; q++)
             v[q] = pf_total(s[q]);
