@@ -21,7 +21,7 @@ endfunction()
 
 # pipefish_vectors(NAME sources...): adds vector kernels to a room, where there are vectors (PF_SIMD). They are written in
 # NEON intrinsics; on x86 SIMDe's headers map these. x86-64-v2 (SSE4.2, every x86-64 since 2009) is all they use: v3
-# (AVX2) gains a tenth, by instructions with three operands, and would exclude machines.
+# (AVX2) gains 2 to 5 %, by instructions with three operands, and would exclude machines.
 function(pipefish_vectors name)
   if(PF_SIMD)
     target_sources(pf_${name} PRIVATE ${ARGN})
