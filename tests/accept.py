@@ -48,6 +48,16 @@ def check_link_goodput() -> list[dict]:
     ]
 
 
+def check_track() -> list[dict]:
+    """The tracker's accuracy on closed-form images; the benchmark's OpenCV beside it if `make bench` got one."""
+    peers = BUILD / "venv-peers/bin/python"
+    done = run(peers if peers.exists() else sys.executable, "tests/accept_track.py")
+    if done.returncode != 0:
+        raise SystemExit(f"accept_track.py failed: {done.stderr.strip()}")
+    print(done.stderr, file=sys.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -91,6 +101,7 @@ def check_demo() -> list[dict]:
 
 CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_goodput": check_link_goodput,
+    "track": check_track,
     "link_seeds": check_link_seeds,
     "daemon_kills": check_daemon_kills,
     "fuzz": check_fuzz,

@@ -9,14 +9,16 @@
 #define RENEW         (65536 / 5)
 #define PULL_MAX      (3 << 15) /* the template may move a track by 1.5 px from where the previous frame put it */
 #define DRIFT_SLACK   3277      /* the template may look 0.1 less similar than the previous patch */
-#define CERTAIN       (2 << 16) /* a result this near its guess is checked backwards from half resolution on */
+#define CERTAIN       (2 << 16) /* a track found this near its guess is next sought from half resolution on */
 #define GUESS_MARGIN  (64 << 16)
 #define RETRY_APART   32768 /* a second guess closer than 1/2 px to the first is the same guess */
 #define NEIGHBOURS    3
-#define FLAT_FRACTION 8 /* a corner on bare ground fills 121 of the window's 441 pixels: its mean is so much less */
+#define FLAT_FRACTION 8 /* a corner on bare ground fills a part of the window: its mean is so much less */
+#define CANDIDATES    4 /* so many times the tracks there may be: most stand too near a stronger one */
 
 typedef struct pf_slot { /* the hidden part of a live track */
     pf_point_q16 move;   /* its last displacement */
+    bool sure;           /* which its guess met within CERTAIN */
     pf_anchor anchor;
 } pf_slot;
 
@@ -107,7 +109,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     (void)carve(base, &used, sizeof *t);
     if (!t)
         t = &count;
-    t->patch_bytes = (c->window + 2u) * (c->window + 2u);
+    t->patch_bytes = pf_anchor_bytes(c->window);
     t->grid_w = (c->width + c->cell - 1u) / c->cell;
     t->grid_h = (c->height + c->cell - 1u) / c->cell;
     t->table = carve(base, &used, 2u * c->max_tracks * sizeof *t->table);
@@ -117,7 +119,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     t->spare = carve(base, &used, c->max_tracks * sizeof *t->spare);
     t->head = carve(base, &used, (size_t)t->grid_w * t->grid_h * sizeof *t->head);
     t->next = carve(base, &used, 2u * c->max_tracks * sizeof *t->next);
-    t->found = carve(base, &used, c->max_tracks * sizeof *t->found);
+    t->found = carve(base, &used, CANDIDATES * c->max_tracks * sizeof *t->found);
     const size_t bytes = pf_pyramid_workspace_size(c->width, c->height, c->levels);
     for (uint32_t i = 0; i < 2u; i++) {
         void *block = carve(base, &used, bytes);
@@ -144,11 +146,7 @@ pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config,
     memset(t, 0, sizeof *t);
     lay_out(&c, workspace, t);
     t->config = c;
-    t->klt.window = (int32_t)c.window;
-    t->klt.half = (int32_t)c.window / 2;
-    t->klt.cols = ((int32_t)c.window + 7) / 8 * 8;
-    t->klt.iterations = (int32_t)c.iterations;
-    t->klt.min_eigen = (int32_t)(c.min_eigen / FLAT_FRACTION);
+    pf_klt_init(&t->klt, c.window, c.iterations, c.min_eigen / FLAT_FRACTION);
     t->klt.circle = c.circle;
     t->klt.radius_q16 = (int32_t)c.circle_radius_q16;
     pf_tracker_reset(t);
@@ -197,9 +195,10 @@ static void grid_insert(pf_tracker *t, uint32_t row)
 /* Whether a track in the grid lies within `reach` (Q16.16 px, at most a cell) of `at`. */
 static bool grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach)
 {
-    const int32_t cell = (int32_t)t->config.cell, cx = (at.x >> 16) / cell, cy = (at.y >> 16) / cell;
-    for (int32_t y = cy > 0 ? cy - 1 : 0; y <= cy + 1 && y < (int32_t)t->grid_h; y++)
-        for (int32_t x = cx > 0 ? cx - 1 : 0; x <= cx + 1 && x < (int32_t)t->grid_w; x++)
+    const int64_t cell = (int64_t)t->config.cell << 16, left = at.x - reach, top = at.y - reach;
+    const int64_t right = (at.x + reach) / cell, bottom = (at.y + reach) / cell;
+    for (int64_t y = top > 0 ? top / cell : 0; y <= bottom && y < (int64_t)t->grid_h; y++)
+        for (int64_t x = left > 0 ? left / cell : 0; x <= right && x < (int64_t)t->grid_w; x++)
             for (int32_t i = t->head[(size_t)y * t->grid_w + (size_t)x]; i >= 0; i = t->next[i]) {
                 const int64_t dx = (int64_t)t->table[i].pos.x - at.x, dy = (int64_t)t->table[i].pos.y - at.y;
                 if (dx * dx + dy * dy < reach * reach)
@@ -256,30 +255,35 @@ static int32_t clamp_guess(int64_t v, uint32_t size)
 }
 
 /* One attempt at one track from one guess; on success `track` and its slot are up to date. */
-static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move)
+static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move, uint32_t top)
 {
     const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
-    const uint32_t top = t->config.levels - 1u;
     const pf_point_q16 old = track->pos;
     const pf_point_q16 guess = {clamp_guess((int64_t)old.x + move.x, t->config.width),
                                 clamp_guess((int64_t)old.y + move.y, t->config.height)};
     pf_point_q16 at = guess;
-    pf_fit fit = pf_klt_track(&t->klt, from, to, old, &at, top);
-    if (fit.reason != PF_TRACK_OK)
-        return fit.reason;
-    if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
-        return PF_TRACK_RESIDUAL;
-    const uint32_t back_top = farther(at, guess, CERTAIN) || top == 0 ? top : 1u;
-    pf_point_q16 back = {old.x + at.x - guess.x, old.y + at.y - guess.y};
-    if (pf_klt_track(&t->klt, to, from, at, &back, back_top).reason != PF_TRACK_OK ||
-        farther(back, old, t->config.fb_q16))
-        return PF_TRACK_BACKWARD;
+    const pf_fit coarse = pf_klt_track(&t->klt, from, to, old, &at, top, top ? 1 : 0);
+    if (top == 0 && coarse.reason != PF_TRACK_OK)
+        return coarse.reason;
+    if (!pf_klt_inside(&t->klt, &to->level[0], at))
+        return PF_TRACK_LEFT;
     pf_slot *s = &t->slots[slot];
     const pf_anchor saved = s->anchor;
     uint8_t *pixels = t->pixels + (size_t)slot * t->patch_bytes;
     pf_point_q16 fine = at;
     const pf_fit anchored = pf_anchor_fit(&t->klt, &to->level[0], &s->anchor, pixels, &fine);
     pf_track_reason reason = anchored.reason;
+    pf_point_q16 back = old;
+    pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
+    if (reason == PF_TRACK_OK) {
+        fit = pf_klt_track(&t->klt, to, from, fine, &back, 0, 0);
+        if (fit.reason != PF_TRACK_OK)
+            reason = fit.reason;
+        else if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
+            reason = PF_TRACK_RESIDUAL;
+        else if (farther(back, old, t->config.fb_q16))
+            reason = PF_TRACK_BACKWARD;
+    }
     if (reason == PF_TRACK_OK &&
         (anchored.zncc_q15 < (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK || farther(fine, at, PULL_MAX)))
         reason = PF_TRACK_DRIFT;
@@ -292,6 +296,7 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
         return reason;
     }
     s->move = (pf_point_q16){fine.x - old.x, fine.y - old.y};
+    s->sure = !farther(fine, guess, CERTAIN);
     track->pos = fine;
     track->quality = (uint16_t)fit.zncc_q15;
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored.gain_q14, track);
@@ -330,9 +335,10 @@ static void track_all(pf_tracker *t)
         const bool have_near = neighbours_move(t, track->pos, &near);
         if (young && have_near)
             first = near;
-        pf_track_reason reason = attempt(t, track, slot, first);
-        if (reason != PF_TRACK_OK && have_near && farther(first, near, RETRY_APART))
-            reason = attempt(t, track, slot, near);
+        const uint32_t top = t->config.levels - 1u, low = t->slots[slot].sure && top > 1u ? 1u : top;
+        pf_track_reason reason = attempt(t, track, slot, first, low);
+        if (reason != PF_TRACK_OK && (low != top || (have_near && farther(first, near, RETRY_APART))))
+            reason = attempt(t, track, slot, have_near ? near : first, top);
         track->age++;
         track->reason = (uint8_t)reason;
         if (reason == PF_TRACK_OK) {
@@ -375,10 +381,10 @@ static void sift_down(pf_corner *heap, uint32_t i, uint32_t n)
     }
 }
 
-/* Keeps the strongest candidates, as many as there is room for tracks. */
+/* Keeps the strongest candidates, CANDIDATES times as many as there is room for tracks. */
 static void remember(pf_tracker *t, const pf_corner *corner)
 {
-    if (t->found_n < t->spare_n) {
+    if (t->found_n < CANDIDATES * t->spare_n) {
         uint32_t i = t->found_n++;
         for (; i > 0 && weaker(corner, &t->found[(i - 1u) / 2u]); i = (i - 1u) / 2u)
             t->found[i] = t->found[(i - 1u) / 2u];
@@ -389,25 +395,27 @@ static void remember(pf_tracker *t, const pf_corner *corner)
     }
 }
 
-static bool corner_allowed(const void *context, int32_t x, int32_t y)
+/* Corners keep 3/4 of a cell apart: greedy by strength, so spread leaves about one a cell. */
+static bool place_allowed(const pf_tracker *t, pf_point_q16 at)
 {
-    const pf_tracker *t = context;
-    const pf_point_q16 at = {x * 65536, y * 65536};
     return pf_klt_inside(&t->klt, &t->pyramid[t->now].level[0], at) && !grid_near(t, at, (int64_t)t->config.cell << 15);
 }
 
-static void add_track(pf_tracker *t, const pf_corner *corner)
+static bool corner_allowed(const void *context, int32_t x, int32_t y)
+{
+    return place_allowed(context, (pf_point_q16){x * 65536, y * 65536});
+}
+
+static void add_track(pf_tracker *t, pf_point_q16 at)
 {
     const pf_image *image = &t->pyramid[t->now].level[0];
     const uint16_t slot = t->spare[--t->spare_n];
     const uint32_t row = t->n++;
     pf_slot *s = &t->slots[slot];
     s->move = (pf_point_q16){0, 0};
+    s->sure = false;
     t->slot_of[row] = slot;
-    t->table[row] = (pf_track){.id = ++t->last_id,
-                               .pos = {corner->x * 65536, corner->y * 65536},
-                               .status = PF_TRACK_NEW,
-                               .reason = PF_TRACK_OK};
+    t->table[row] = (pf_track){.id = ++t->last_id, .pos = at, .status = PF_TRACK_NEW, .reason = PF_TRACK_OK};
     pf_anchor_take(&t->klt, image, t->table[row].pos, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, GAIN_ONE, &t->table[row]);
     grid_insert(t, row);
@@ -419,7 +427,7 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
 static bool cell_box(const pf_tracker *t, int32_t cx, int32_t cy, int32_t box[4])
 {
     const int32_t cell = (int32_t)t->config.cell;
-    const int32_t margin = t->klt.half + 2 > CORNER_HALF + 1 ? t->klt.half + 2 : CORNER_HALF + 1;
+    const int32_t margin = t->klt.half + 2 > CORNER_REACH ? t->klt.half + 2 : CORNER_REACH;
     const int32_t right = (int32_t)t->config.width - margin - 1, bottom = (int32_t)t->config.height - margin - 1;
     box[0] = cx * cell < margin ? margin : cx * cell;
     box[1] = cy * cell < margin ? margin : cy * cell;
@@ -445,10 +453,12 @@ static void detect_all(pf_tracker *t)
     for (uint32_t cy = 0; cy < t->grid_h; cy++)
         for (uint32_t cx = 0; cx < t->grid_w; cx++) {
             int32_t box[4];
-            pf_corner best;
-            if (t->head[(size_t)cy * t->grid_w + cx] < 0 && cell_box(t, (int32_t)cx, (int32_t)cy, box) &&
-                pf_corner_best(&t->corners, image, box, least, corner_allowed, t, &best))
-                remember(t, &best);
+            pf_corner best[4];
+            if (t->head[(size_t)cy * t->grid_w + cx] >= 0 || !cell_box(t, (int32_t)cx, (int32_t)cy, box))
+                continue;
+            const uint32_t n = pf_corner_scan(&t->corners, &t->pyramid[t->now], box, least, corner_allowed, t, best);
+            for (uint32_t i = 0; i < n; i++)
+                remember(t, &best[i]);
         }
     /* heap sort: weakest to the back, so the strongest gets its place first */
     for (uint32_t n = t->found_n; n > 1u; n--) {
@@ -457,9 +467,13 @@ static void detect_all(pf_tracker *t)
         t->found[n - 1u] = swap;
         sift_down(t->found, 0, n - 1u);
     }
-    for (uint32_t i = 0; i < t->found_n; i++)
-        if (corner_allowed(t, t->found[i].x, t->found[i].y))
-            add_track(t, &t->found[i]);
+    for (uint32_t i = 0; i < t->found_n && t->spare_n > 0; i++) {
+        if (!corner_allowed(t, t->found[i].x, t->found[i].y))
+            continue;
+        const pf_point_q16 at = pf_corner_place(image, &t->found[i]);
+        if (place_allowed(t, at))
+            add_track(t, at);
+    }
 }
 
 /* --- a frame ----------------------------------------------------------------------------------------------------- */

@@ -8,7 +8,7 @@
 #define HEIGHT  240
 #define TEXTURE 512
 #define FRAMES  60
-#define GOLDEN  0x10AAB65Bu
+#define GOLDEN  0x9BDA1CBDu
 
 static uint8_t texture[TEXTURE * TEXTURE], frame[2][WIDTH * HEIGHT];
 static _Alignas(16) uint8_t workspace[400000];

@@ -15,8 +15,8 @@ extern "C" {
 
 #define PF_TRACKS_MAX 2048u
 
-/* Added to both variances of a position: (1/64 px)^2, for what interpolation and rounding leave. */
-#define PF_TRACK_COV_FLOOR_Q20 256
+/* Added to both variances of a position: (1/256 px)^2, for what interpolation and rounding leave. */
+#define PF_TRACK_COV_FLOOR_Q20 16
 
 typedef enum pf_track_status {
     PF_TRACK_NEW = 1,     /* detected in this frame */
@@ -63,8 +63,8 @@ typedef struct pf_tracker_config {
     uint32_t window;            /* KLT window side in pixels, odd, 7..31 [21] */
     uint32_t iterations;        /* most iterations a level, 1..30 [10] */
     uint32_t cell;              /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
-    uint32_t min_eigen;         /* detection: least smaller eigenvalue of the mean structure tensor (11 x 11), grey^2,
-                                 * up to 16384 [8; noise of sigma 2 alone gives 2] */
+    uint32_t min_eigen;         /* detection: least smaller eigenvalue of the mean structure tensor (3 x 3 at half
+                                 * resolution), grey^2, up to 16384 [8; noise of sigma 2 alone gives up to 1] */
     uint32_t fb_q16;            /* most forward-backward distance, Q16.16 px, up to 16 [0.5] */
     uint32_t min_zncc_q15;      /* least similarity to the previous patch, Q0.15, up to 32767 [0.8]; to the template
                                  * it is 0.1 less */
