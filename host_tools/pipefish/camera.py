@@ -1,6 +1,6 @@
 """The camera: Kannala and Brandt's generic model, evaluated by the C core, and its profile as JSON and as binary.
 
-docs/profile.md describes the parameters, the JSON form and the binary form.
+docs/profile.md describes the parameters and the JSON form, lib/profile/SPEC.md the binary form.
 """
 
 from __future__ import annotations
@@ -19,11 +19,27 @@ import numpy.typing as npt
 
 from . import _engine, profile_json
 from .errors import ArgumentError, ProfileError
-from .profile_json import ARRAYS, CIRCLE, INTEGERS, SCALARS, TEXTS, integer, number, number_list
+from .profile_json import (
+    ARRAYS,
+    CIRCLE,
+    INTEGERS,
+    PROVENANCE,
+    RESIDUALS,
+    SCALARS,
+    TEXTS,
+    integer,
+    number,
+    number_list,
+    text,
+)
 
 # In the order of pf_radial and pf_profile_source.
 _RADIAL = ("generic", "perspective", "stereographic", "equidistant", "equisolid", "orthographic", "unified")
 _SOURCE = ("unknown", "target", "selfcal", "imported", "simulated")
+
+
+#: What the core calls the keys of `provenance`.
+_PLACES = {place: f"provenance.{key}" for key, place in PROVENANCE.items()}
 
 
 def _indexed(name: str) -> list[str]:
@@ -49,16 +65,6 @@ def _choice(key: str, value: object, choices: Sequence[str]) -> int:
     return choices.index(value)
 
 
-def _text(key: str, value: object) -> str:
-    if not isinstance(value, str):
-        raise ProfileError(None, key, "not a text")
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        raise ProfileError(None, key, "not UTF-8 text") from None
-    return value
-
-
 def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float64]:
     """(N, columns) numbers as a contiguous float64 array, or ArgumentError."""
     try:
@@ -75,7 +81,19 @@ def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float
 def _split(error: ValueError) -> ProfileError:
     """The core says 'field: reason'."""
     key, _, reason = str(error).partition(": ")
-    return ProfileError(None, key, reason)
+    return ProfileError(None, _PLACES.get(key, key), reason)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a calibration comes from. Texts "" and counts 0: unknown."""
+
+    tool: str = ""  #: program that made it, at most 31 bytes
+    version: str = ""  #: of the tool, at most 31 bytes
+    model_choice: str = ""  #: how the model was chosen, at most 63 bytes
+    views: int = 0  #: images that were used
+    points: int = 0  #: measured points in them
+    held_out_views: int = 0  #: images that held_out_rms_px is of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -115,10 +133,13 @@ class Camera:
     circle_radius: float = 0.0
     name: str = ""
     serial: str = ""
+    lens: str = ""
     source: str = "unknown"
     created: datetime.datetime | None = None
     rms_px: float | None = None
+    held_out_rms_px: float | None = None
     theta_covered: float | None = None
+    provenance: Provenance = Provenance()
     covariance_parameters: tuple[str, ...] = ()
     covariance: npt.NDArray[np.float64] | None = None
 
@@ -137,16 +158,18 @@ class Camera:
             for key, count in ARRAYS.items():
                 put(key, number_list(key, getattr(self, key), count))
             for key in TEXTS:
-                put(key, _text(key, getattr(self, key)))
+                put(key, text(key, getattr(self, key)))
             profile.radial = _choice("radial", self.radial, _RADIAL)
             profile.source = _choice("source", self.source, _SOURCE)
             profile.created_unix_s = self._created_unix_s()
-            profile.rms_px = math.nan
-            if self.rms_px is not None:
-                put("rms_px", number("rms_px", self.rms_px))
+            for key in RESIDUALS:
+                setattr(profile, key, math.nan)
+                if getattr(self, key) is not None:
+                    put(key, number(key, getattr(self, key)))
             if self.theta_covered is not None:
                 put("theta_covered", number("theta_covered", self.theta_covered))
                 object.__setattr__(self, "theta_covered", self.theta_covered or None)
+            self._set_provenance(profile)
             self._set_covariance(profile)
             profile.encode()
         except ValueError as error:
@@ -163,6 +186,13 @@ class Camera:
         if seconds <= 0:
             raise ProfileError(None, "created", "not after 1970")
         return seconds
+
+    def _set_provenance(self, profile: Any) -> None:
+        if not isinstance(self.provenance, Provenance):
+            raise ProfileError(None, "provenance", "not a Provenance")
+        for key, place in PROVENANCE.items():
+            check = integer if place in ("views", "points", "held_out_views") else text
+            setattr(profile, place, check(f"provenance.{key}", getattr(self.provenance, key)))
 
     def _set_covariance(self, profile: Any) -> None:
         names = self.covariance_parameters
@@ -231,6 +261,7 @@ class Camera:
         except ValueError as error:
             raise _split(error) from None
         values = {key: getattr(profile, key) for key in (*INTEGERS, *SCALARS, *CIRCLE, *ARRAYS, *TEXTS)}
+        values |= {key: getattr(profile, key) for key in RESIDUALS if not math.isnan(getattr(profile, key))}
         names = tuple(PARAMETERS[i] for i in profile.free_param)
         if names:
             covariance = np.zeros((len(names), len(names)))
@@ -242,7 +273,7 @@ class Camera:
         return cls(
             radial=_RADIAL[profile.radial],
             source=_SOURCE[profile.source],
-            rms_px=None if math.isnan(profile.rms_px) else profile.rms_px,
+            provenance=Provenance(**{key: getattr(profile, place) for key, place in PROVENANCE.items()}),
             theta_covered=profile.theta_covered or None,
             **values,
         )
@@ -251,7 +282,8 @@ class Camera:
     def load(cls, path: str | os.PathLike[str]) -> Camera:
         """Reads a profile in JSON. Raises ProfileError with the file, the key and the reason."""
         try:
-            return cls(**profile_json.read(path))
+            values = profile_json.read(path)
+            return cls(**values | {"provenance": Provenance(**values.get("provenance", {}))})
         except ProfileError as error:
             key = "covariance.parameters" if error.key == "covariance_parameters" else error.key
             raise ProfileError(path, key, error.reason) from None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .camera import Camera
 
 _FORMAT = "pipefish-profile"
-_VERSION = 1
+_VERSION = 2  # of the files that are written; version 1 is read too
 _BYTES_MAX = 1 << 20  # a full profile is about 25 kB of JSON
 
 INTEGERS = ("width", "height")
@@ -36,11 +36,29 @@ ARRAYS = {
     "asym_tangential_phi": 4,
     "cpoly": 14,
 }
-TEXTS = ("name", "serial")
+TEXTS = ("name", "serial", "lens")
+RESIDUALS = ("rms_px", "held_out_rms_px")
+#: Keys of `provenance`, and what the binary form calls them.
+PROVENANCE = {
+    "tool": "tool",
+    "version": "tool_version",
+    "model_choice": "model_choice",
+    "views": "views",
+    "points": "points",
+    "held_out_views": "held_out_views",
+}
+#: Every file says what its numbers are in; there are no other units.
+UNITS = {
+    "image": "pixel",
+    "pixel_origin": "centre of the top-left pixel",
+    "angle": "radian",
+    "length": "metre",
+}
 _REQUIRED = ("width", "height", "f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "theta_max")
-_KNOWN = {"source", "created", "rms_px", "theta_covered", "radial", "covariance"}.union(
-    TEXTS, INTEGERS, SCALARS, CIRCLE, ARRAYS
+_KNOWN_1 = {"source", "created", "rms_px", "theta_covered", "radial", "covariance", "name", "serial"}.union(
+    INTEGERS, SCALARS, CIRCLE, ARRAYS
 )
+_KNOWN = {1: _KNOWN_1, 2: _KNOWN_1 | {"lens", "held_out_rms_px", "provenance", "units"}}
 
 
 def number(key: str, value: object) -> float:
@@ -72,24 +90,42 @@ def number_list(key: str, value: object, count: int) -> tuple[float, ...]:
     return tuple(number(f"{key}[{i}]", item) for i, item in enumerate(value))
 
 
+def text(key: str, value: object) -> str:
+    """A text that UTF-8 can write."""
+    if not isinstance(value, str):
+        raise ProfileError(None, key, "not a text")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise ProfileError(None, key, "not UTF-8 text") from None
+    return value
+
+
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The arguments of Camera out of a file. What they are worth is for Camera to check."""
     document = _parse(path)
     if document.get("format") != _FORMAT:
         raise ProfileError(None, "format", f"not {_FORMAT!r}: this is not a profile")
-    if document.get("version") is True or document.get("version") != _VERSION:
-        raise ProfileError(None, "version", f"this version reads {_VERSION}")
+    version = document.get("version")
+    if isinstance(version, bool) or version not in (1, _VERSION):
+        raise ProfileError(None, "version", f"this version reads 1 and {_VERSION}")
     values = {key: value for key, value in document.items() if key not in ("format", "version")}
     for key in values:
-        if key not in _KNOWN:
-            raise ProfileError(None, key, "no such key in a profile")
-    for key in _REQUIRED:
+        if key not in _KNOWN[int(version)]:
+            raise ProfileError(None, key, f"no such key in a profile of version {int(version)}")
+    for key in (*_REQUIRED, *(["units"] if version == _VERSION else [])):
         if key not in values:
             raise ProfileError(None, key, "missing")
     if values.get("created") is not None:
         values["created"] = _parse_time(values["created"])
+    if values.pop("units", UNITS) != UNITS:
+        raise ProfileError(None, "units", f"not {json.dumps(UNITS)}")
+    if "provenance" in values:
+        values["provenance"] = _parse_provenance(values["provenance"])
     if values.get("covariance") is not None:
         values |= _parse_covariance(values["covariance"])
+    for term in ("asym_radial", "asym_tangential"):
+        _fix_gauge(values, f"{term}_theta", f"{term}_phi")
     return values
 
 
@@ -99,7 +135,9 @@ def write(camera: Camera) -> str:
     for key in (*TEXTS, "source"):
         document[key] = getattr(camera, key)
     document["created"] = None if camera.created is None else camera.created.strftime("%Y-%m-%dT%H:%M:%SZ")
-    for key in ("rms_px", "theta_covered", *INTEGERS, "radial", *SCALARS, *CIRCLE, *ARRAYS):
+    document["provenance"] = {key: getattr(camera.provenance, key) for key in PROVENANCE}
+    document["units"] = UNITS
+    for key in (*RESIDUALS, "theta_covered", *INTEGERS, "radial", *SCALARS, *CIRCLE, *ARRAYS):
         document[key] = getattr(camera, key)
     document["covariance"] = None
     lines = [f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in document.items()]
@@ -157,3 +195,41 @@ def _parse_covariance(value: object) -> dict[str, Any]:
     for i, row in enumerate(lower):
         matrix[i, : i + 1] = matrix[: i + 1, i] = number_list(f"covariance.lower[{i}]", row, i + 1)
     return {"covariance_parameters": names, "covariance": matrix}
+
+
+def _parse_provenance(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ProfileError(None, "provenance", "not an object")
+    for key in value:
+        if key not in PROVENANCE:
+            raise ProfileError(None, f"provenance.{key}", "no such key in a profile")
+    return value
+
+
+def _fix_gauge(values: dict[str, Any], theta: str, phi: str) -> None:
+    """Moves the scale of an asymmetric term's Fourier vector into its polynomial: b of unit norm, the same product.
+
+    The covariance goes with it: a' = |b| a, b' = b / |b|."""
+    if phi not in values or theta not in values:
+        return
+    a, b = np.array(number_list(theta, values[theta], 3)), np.array(number_list(phi, values[phi], 4))
+    norm = float(np.linalg.norm(b))
+    if norm == 0 or abs(norm - 1) <= 1e-15:  # what was made unit stays as it is, bit for bit
+        return
+    values[theta], values[phi] = (norm * a).tolist(), (b / norm).tolist()
+    names = list(values.get("covariance_parameters", ()))
+    jacobian = np.eye(len(names))
+    a_at = [(names.index(n), i) for i in range(3) if (n := f"{theta}[{i}]") in names]
+    b_at = [(names.index(n), i) for i in range(4) if (n := f"{phi}[{i}]") in names]
+    if b_at and len(a_at) < 3:
+        raise ProfileError(None, "covariance", f"of {phi}, whose norm is not 1, without all of {theta}")
+    for row, i in a_at:
+        jacobian[row, row] = norm
+        for column, j in b_at:
+            jacobian[row, column] = a[i] * b[j] / norm
+    for row, i in b_at:
+        for column, j in b_at:
+            jacobian[row, column] = (i == j) / norm - b[i] * b[j] / norm**3
+    if names:
+        covariance = jacobian @ values["covariance"] @ jacobian.T
+        values["covariance"] = (covariance + covariance.T) / 2
