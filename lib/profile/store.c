@@ -91,7 +91,8 @@ static pf_status get_record(const uint8_t *p, pf_profile_store_state *state)
             return PF_ERR_FORMAT;
     }
     bool is_good = is_slot(state, state->active) && is_slot(state, state->trial) && is_slot(state, state->previous) &&
-                   state->sequence > 0 && (state->trial == NONE || state->trial != state->active);
+                   state->sequence > 0 && state->sequence <= INT32_MAX &&
+                   (state->trial == NONE || state->trial != state->active);
     return is_good ? PF_OK : PF_ERR_FORMAT;
 }
 
