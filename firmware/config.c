@@ -41,6 +41,10 @@ static const setting settings[] = {
      "of a recording without times; 0 = 10"},
     {"camera", "profile", TEXT, AT(camera.profile), "", "", 0, 0, NULL,
      "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
+    {"camera", "profile_store", TEXT, AT(camera.profile_store), "", "", 0, 0, NULL,
+     "instead of profile: file that keeps profiles which the host sends (pipefish flash); made at the first start"},
+    {"camera", "trial_starts", INTEGER, AT(camera.trial_starts), "", "1", 0, 255, NULL,
+     "starts with a new profile that nobody confirmed before the one before comes back"},
 
     {"tracker", "max_tracks", INTEGER, AT(tracker.max_tracks), "", "400", 8, 2048, NULL, "tracks alive at once"},
     {"tracker", "levels", INTEGER, AT(tracker.levels), "", "4", 1, 6, NULL, "pyramid levels; more = faster motion"},
@@ -326,6 +330,8 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
     const char *why = NULL;
     if (c->camera.path[0] == '\0')
         why = "camera.path: must be set: the recording to play";
+    else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')
+        why = "camera.profile_store: not together with camera.profile";
     else if (c->link.transport == PF_TRANSPORT_SERIAL && c->link.device[0] == '\0')
         why = "link.device: must be set for link.transport = serial";
     else if (c->link.transport == PF_TRANSPORT_TCP && c->link.address[0] == '\0')

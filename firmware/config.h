@@ -27,8 +27,8 @@ typedef struct pf_config {
     } survey;
     struct {
         uint32_t driver, speed;
-        pf_config_text path, csv, profile;
-        uint32_t loops;
+        pf_config_text path, csv, profile, profile_store;
+        uint32_t loops, trial_starts;
         double frame_rate;
     } camera;
     struct {

@@ -7,6 +7,7 @@ commit measures only what is missing. --fresh forgets them.
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -31,6 +32,11 @@ def figure(name: str, value: float, bound: str, holds: bool) -> dict:
 def at_least(name: str, value: float, bound: float) -> dict:
     """A row that holds from `bound` upwards."""
     return figure(name, value, f">= {bound}", value >= bound)
+
+
+def at_most(name: str, value: float, bound: float) -> dict:
+    """A row that holds up to `bound`."""
+    return figure(name, value, f"<= {bound}", value <= bound)
 
 
 def exactly(name: str, value: float, bound: float) -> dict:
@@ -63,6 +69,19 @@ def check_link_seeds() -> list[dict]:
     program = BUILD / "debug/tests/unit/test_link_channel"
     failures = sum(run(program, PIPEFISH_TEST_SEED=str(1000 * (i + 1))).returncode != 0 for i in range(20))
     return [exactly("link.seeds_failed_of_20", failures, 0)]
+
+
+def check_profile_store() -> list[dict]:
+    """The profile store under every pair of power cuts, and a million times with flipped bits."""
+    done = run(BUILD / "debug/tests/unit/test_profile_store", PIPEFISH_TEST_LONG="1")
+    cuts, seconds = re.search(r"^power cuts: (\d+) in ([\d.]+) s", done.stdout, re.MULTILINE).groups()
+    flips = re.search(r"^flipped bits: (\d+)", done.stdout, re.MULTILINE).group(1)
+    return [
+        exactly("profile_store.failed", done.returncode, 0),
+        at_least("profile_store.cuts", int(cuts), 100000),
+        at_most("profile_store.cuts_cpu_s", float(seconds), 60),
+        at_least("profile_store.flips", int(flips), 1000000),
+    ]
 
 
 def check_daemon_kills() -> list[dict]:
@@ -103,6 +122,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_goodput": check_link_goodput,
     "track": check_track,
     "link_seeds": check_link_seeds,
+    "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
     "fuzz": check_fuzz,
     "demo": check_demo,

@@ -15,6 +15,11 @@ from pipefish.errors import PipefishError
 DONE, FAILED, USAGE = 0, 1, 2
 DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
 
+
+class UsageError(PipefishError):
+    """Arguments that do not go together."""
+
+
 DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud) or tcp://host:port"
 
 
@@ -179,6 +184,7 @@ def run_status(args: argparse.Namespace) -> Result:
     rows = [
         ("device", info.software),
         ("source", info.source),
+        ("profile", stored_text(status.profile) if status.HasField("profile") else "none"),
         ("survey", info.survey_id.hex()),
         ("state", status.state),
         ("up for", seconds_text(status.uptime_ns / 1e9)),
@@ -277,6 +283,51 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
     data = camera.to_json().encode() if form == "json" else camera.to_binary()
     write_atomically(out, data)
     return {"file": str(out), "form": form, "bytes": len(data)}, f"{out}: {form}, {len(data)} bytes"
+
+
+def stored_text(profile: Any) -> str:
+    """A pb.Profile for people."""
+    trial = f", on trial, {profile.starts_left} more starts" if profile.trial else ""
+    serial = f", serial {profile.serial}" if profile.serial else ""
+    return f"{profile.name or 'unnamed'}{serial} ({profile.crc32c:08x}){trial}"
+
+
+def run_flash(args: argparse.Namespace) -> Result:
+    from google.protobuf.json_format import MessageToDict
+
+    from pipefish.flash import Flasher
+    from pipefish.transport import open_transport
+
+    if args.revert and (args.profile or args.confirm is not None):
+        raise UsageError("flash: --revert goes with neither a profile nor --confirm")
+    if not args.profile and not args.revert and not args.confirm:
+        raise UsageError("flash: give a profile, or --confirm or --revert")
+    data = load_profile(Path(args.profile)).to_binary() if args.profile else None
+    with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
+        if args.revert:
+            state = device.revert()
+        else:
+            state = device.send(data) if data else device.state()
+            if not state.HasField("stored"):
+                raise PipefishError("the device has no profile that could be confirmed")
+            if args.confirm is not False:
+                state = device.confirm(state.stored.sha256)
+    document = {
+        name: MessageToDict(profile, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        | {"sha256": profile.sha256.hex(), "crc32c": f"{profile.crc32c:08x}"}
+        if state.HasField(name)
+        else None
+        for name, profile in (("in_use", state.in_use), ("stored", state.stored))
+    }
+    document["slot_erases"] = [state.slot_erases_a, state.slot_erases_b]
+    stored = stored_text(state.stored) if state.HasField("stored") else "none"
+    in_use = stored_text(state.in_use) if state.HasField("in_use") else "none"
+    rows = [
+        ("in use", in_use),
+        ("stored", stored + ("" if in_use == stored else "; the next start of the device takes it")),
+        ("written", f"{state.slot_erases_a + state.slot_erases_b} times"),
+    ]
+    return document, table(rows)
 
 
 # ---- the parser
@@ -414,6 +465,27 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     add_profile(commands)
+
+    p = add_command(
+        commands,
+        "flash",
+        run_flash,
+        "Put a camera profile on a device. It is stored on trial, read back, tested and confirmed; the device's next "
+        "start takes it.",
+        "pipefish flash tcp://127.0.0.1:7447 camera.json",
+    )
+    add_device(p)
+    p.add_argument("profile", metavar="PROFILE", nargs="?", help="JSON or binary profile")
+    p.add_argument(
+        "--confirm",
+        action=argparse.BooleanOptionalAction,
+        help="without PROFILE: confirm the one on trial; --no-confirm with one: leave it on trial, and the device goes "
+        "back to the one before unless it is confirmed in time",
+    )
+    p.add_argument("--revert", action="store_true", help="drop the profile on trial, or go back to the one before")
+    p.add_argument(
+        "--timeout", type=not_negative, default=10.0, metavar="S", help="give up after S silent seconds [10]; 0: never"
+    )
     return parser
 
 
@@ -464,7 +536,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.debug:
             raise
         print(f"pipefish: {message_of(error)}", file=sys.stderr)
-        return FAILED
+        return USAGE if isinstance(error, UsageError) else FAILED
 
 
 def message_of(error: BaseException) -> str:

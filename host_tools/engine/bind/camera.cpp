@@ -53,13 +53,21 @@ std::pair<Numbers, Mask> run_batch(const pf_profile &profile, const Rows<In> &in
 }
 
 // pf_profile's texts end at a zero, so a zero inside would cut them silently.
-void set_text(char (&field)[PF_PROFILE_NAME_MAX], const std::string &text, const char *name)
+template <size_t Size> void set_text(char (&field)[Size], const std::string &text, const char *name)
 {
-    if (text.size() >= PF_PROFILE_NAME_MAX || text.find('\0') != std::string::npos)
-        throw nb::value_error(
-            (std::string(name) + ": not UTF-8 text of at most 63 bytes without control characters").c_str());
+    if (text.size() >= Size || text.find('\0') != std::string::npos)
+        throw nb::value_error((std::string(name) + ": not UTF-8 text of at most " + std::to_string(Size - 1) +
+                               " bytes without control characters")
+                                  .c_str());
     std::memset(field, 0, sizeof field);
     std::memcpy(field, text.data(), text.size());
+}
+
+template <auto Field> void bind_text(nb::class_<pf_profile> &type, const char *name)
+{
+    type.def_prop_rw(
+        name, [](const pf_profile &p) { return std::string(p.*Field); },
+        [name](pf_profile &p, const std::string &text) { set_text(p.*Field, text, name); });
 }
 
 void set_covariance(pf_profile &profile, const std::vector<uint8_t> &params, const std::vector<double> &lower)
@@ -138,16 +146,20 @@ void bind_camera(nb::module_ &m)
     FIELD(circle_v);
     FIELD(circle_radius);
 #undef FIELD
+    bind_text<&pf_profile::name>(type, "name");
+    bind_text<&pf_profile::serial>(type, "serial");
+    bind_text<&pf_profile::lens>(type, "lens");
+    bind_text<&pf_profile::tool>(type, "tool");
+    bind_text<&pf_profile::tool_version>(type, "tool_version");
+    bind_text<&pf_profile::model_choice>(type, "model_choice");
     type.def_rw("source", &pf_profile::source)
         .def_rw("created_unix_s", &pf_profile::created_unix_s)
         .def_rw("rms_px", &pf_profile::rms_px)
         .def_rw("theta_covered", &pf_profile::theta_covered)
-        .def_prop_rw(
-            "name", [](const pf_profile &p) { return std::string(p.name); },
-            [](pf_profile &p, const std::string &text) { set_text(p.name, text, "name"); })
-        .def_prop_rw(
-            "serial", [](const pf_profile &p) { return std::string(p.serial); },
-            [](pf_profile &p, const std::string &text) { set_text(p.serial, text, "serial"); })
+        .def_rw("held_out_rms_px", &pf_profile::held_out_rms_px)
+        .def_rw("views", &pf_profile::views)
+        .def_rw("points", &pf_profile::points)
+        .def_rw("held_out_views", &pf_profile::held_out_views)
         .def_prop_ro(
             "free_param",
             [](const pf_profile &p) { return std::vector<uint8_t>(p.free_param, p.free_param + p.free_count); })

@@ -40,6 +40,7 @@ typedef enum pf_status {
     PF_ERR_AGAIN = -10,      /* nothing to do now; try again later */
     PF_ERR_END = -11,        /* the stream is complete */
     PF_ERR_CLOSED = -12,     /* the peer or the device has gone */
+    PF_ERR_SELF_TEST = -13,  /* intact, but this device computes something else than the data say */
 } pf_status;
 
 /* One line of English for a status, never NULL. */
