@@ -12,8 +12,8 @@
  *
  * so f_u and f_v are pixels per radian near the axis, also on a tilted sensor: the affine part of the sensor's
  * homography is f_u, f_v, skew, c_u, c_v, and the tilt is its projective part. The asymmetric terms D (23 parameters
- * with the radial ones, Paper II) are continuous on the axis but have no derivative there; derivatives within 1e-9 rad
- * of it are those along phi = 0. The terms c_mn ("cpoly") are smooth everywhere.
+ * with the radial ones, Paper II) are continuous on the axis but have no derivative there; derivatives on it are those
+ * along phi = 0. The terms c_mn ("cpoly") are smooth everywhere.
  *
  * Only IEEE double +, -, *, / and sqrt are used, in a fixed order without contraction: the same bits on all targets
  * with IEEE doubles, in soft float too. Needs a hosted sqrt. All functions are pure.
