@@ -130,14 +130,14 @@ def decode(data: bytes) -> str:
     if len(data) > BYTES_MAX:
         raise ProfileError(None, None, f"longer than {BYTES_MAX} bytes: this is not a calibration")
     try:
-        return data.decode("utf-8-sig")
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise ProfileError(None, f"byte {error.start}", "not UTF-8 text: this is not a calibration") from None
 
 
 def parse_yaml(text: str) -> Any:
     """A YAML document; OpenCV's first line `%YAML:1.0` is no YAML and is left out."""
-    text = re.sub(r"\A%YAML:[^\n]*\n", "\n", text.replace("\r\n", "\n"))
+    text = re.sub(r"\A%YAML:[^\n]*\n", "\n", text)
     try:
         return yaml.load(text.replace("\t", "  "), Loader=_Loader)
     except yaml.YAMLError as error:

@@ -214,7 +214,7 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
     simple = {"perspective": "LENSMODEL_PINHOLE", "stereographic": "LENSMODEL_STEREOGRAPHIC"}
     points = camera_field(camera, wanted.max_theta).sample(77, 91, 0.013)
     pixels, _ = camera.project(points)
-    lost: list[str] = []
+    notes: list[str] = []
     if lost_terms(camera) == [f"the {camera.radial} radial function"] and camera.radial in simple:
         model, extra = simple[camera.radial], np.zeros(0)
         fit = compare(points, pixels, pixels, exact=True)
@@ -226,8 +226,9 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
         extra = lens.control.ravel()
         got, ok = lens.project(points)
         got[~ok] = np.nan
-        fit, lost = compare(points, pixels, got), [f"{camera.radial} model but a spline"]
-    notes = _accept("mrcal", camera, fit, wanted, lost)
+        fit = compare(points, pixels, got)
+        notes = [f"as a spline of {nx} x {ny} control points, mrcal's model for fisheyes"]
+    notes += _accept("mrcal", camera, fit, wanted, [])
     numbers = ", ".join(repr(float(v)) for v in (camera.f_u, camera.f_v, camera.c_u, camera.c_v, *extra))
     text = (
         f"{{\n    'lensmodel': '{model}',\n\n    'intrinsics': [ {numbers} ],\n\n"
@@ -238,19 +239,26 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
 
 
 def _spline(camera: Camera, wanted: Wanted) -> SplinedStereographic:
-    """Control points every 0.1 or so of the stereographic image, as dense as mrcal's own calibrations."""
+    """As many control points as mrcal's own calibrations have; fitted to all that the model holds, beyond the edge of
+    the picture too, or the spline would be loose there."""
     field = camera_field(camera, wanted.max_theta)
-    points = np.vstack([[[0.0, 0.0, 1.0]], field.sample(180, 60)])
-    pixels, _ = camera.project(points)
-    u = 2 * points[:, :2] / (1 + points[:, 2:])
-    reach = np.abs(u).max(axis=0) * 1.02
+    seen = field.sample(180, 30)
+    reach = np.abs(2 * seen[:, :2] / (1 + seen[:, 2:])).max(axis=0) * 1.02
     fov = min(2 * math.ceil(math.degrees(2 * math.atan(reach[0] / 2))), 358)
-    nx = 24
+    nx = 30
     per_unit = (nx - 3) / (4 * math.tan(math.radians(fov) / 4))
     ny = max(math.ceil(2 * reach[1] * per_unit) + 3, 5)
     size = {"width": camera.width, "height": camera.height}
     core = {"fx": camera.f_u, "fy": camera.f_v, "cx": camera.c_u, "cy": camera.c_v}
     lens = SplinedStereographic(order=3, fov_x=math.radians(fov), control=np.zeros((ny, nx, 2)), **core, **size)
+    u = np.stack(
+        np.meshgrid(*(np.linspace(-r, r, 2 * n) for r, n in zip(reach, (2 * nx, 2 * ny), strict=True))), axis=-1
+    )
+    u = u.reshape(-1, 2)
+    square = (u**2).sum(axis=1, keepdims=True)
+    points = np.hstack([4 * u, 4 - square]) / (4 + square)
+    pixels, ok = camera.project(points)
+    u, points, pixels = u[ok], points[ok], pixels[ok]
     _, _, (ix, iy, wx, wy), _ = lens.basis(*points.T)
     design = np.zeros((len(points), ny * nx))
     for j in range(4):
