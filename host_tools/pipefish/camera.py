@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _engine
+from .camera_sources import Sources
 from .errors import ArgumentError, ProfileError
 
 _FORMAT = "pipefish-profile"
@@ -124,7 +125,7 @@ def _split(error: ValueError) -> ProfileError:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Camera:
+class Camera(Sources):
     """One calibrated camera. Immutable; use dataclasses.replace() for a changed copy.
 
     Pixels: the centre of the top-left pixel is (0, 0), u right, v down. Camera frame: x right, y down, z along the

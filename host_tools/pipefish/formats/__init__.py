@@ -22,7 +22,7 @@ from .convert import MAX_ERROR, camera_of
 from .parse import BYTES_MAX, Found, decode, parse_json, parse_yaml
 from .writers import WRITERS, Wanted, Written
 
-__all__ = ["MAX_ERROR", "READERS", "WRITERS", "Conversion", "Wanted", "Written", "load", "write"]
+__all__ = ["MAX_ERROR", "READERS", "WRITERS", "Conversion", "Wanted", "Written", "from_lens", "load", "write"]
 
 _MAPPINGS: dict[str, Callable[[Any, Any], list[Found]]] = {
     "opencv-fisheye": readers.read_opencv_fisheye,
@@ -152,9 +152,7 @@ def load(
             return Conversion(own, "json", (own.name,), own.name, None, ())
         form, found = _read(data, form, size)
         chosen = _choose(found, 0 if camera is None else camera)
-        made, fit = camera_of(chosen.lens, model, max_theta)
-        if not fit.max_px <= max_error:
-            raise ProfileError(None, None, _does_not_fit(form, chosen.lens, model, fit, max_error))
+        made, fit = _within(form, chosen.lens, model, max_error, max_theta)
         notes = list(chosen.notes)
         if camera is None and len(found) > 1:
             notes.append(f"{len(found)} cameras in the file: {chosen.name} taken")
@@ -162,6 +160,21 @@ def load(
     except ProfileError as error:
         raise ProfileError(path, error.position, error.reason) from None
     return Conversion(made, form, tuple(f.name for f in found), chosen.name, fit, tuple(notes))
+
+
+def from_lens(
+    lens: Lens, *, model: str = "auto", max_error: float = MAX_ERROR, max_theta: float | None = None
+) -> Conversion:
+    """The Camera for a model of pipefish.lenses; options and errors as of load."""
+    made, fit = _within(type(lens).__name__, lens, model, max_error, max_theta)
+    return Conversion(made, type(lens).__name__, ("camera",), "camera", fit, ())
+
+
+def _within(form: str, lens: Lens, model: str, max_error: float, max_theta: float | None) -> tuple[Camera, Fit]:
+    made, fit = camera_of(lens, model, max_theta)
+    if not fit.max_px <= max_error:
+        raise ProfileError(None, None, _does_not_fit(form, lens, model, fit, max_error))
+    return made, fit
 
 
 def _does_not_fit(form: str, lens: Lens, model: str, fit: Fit, max_error: float) -> str:
