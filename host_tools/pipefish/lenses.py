@@ -19,8 +19,8 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 THETA_END = 3.1  # radians; no file describes a camera that sees behind itself, and phi means nothing there
-_STEPS = 620
-_PHIS = 720
+_STEPS = 310
+_PHIS = 360
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -284,11 +284,16 @@ class OCam(Lens):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplinedStereographic(CentredLens):
     """mrcal's splined model: u = stereographic(p), q = (u + spline(u)) f + c with B-splines of order 2 or 3 over a grid
-    of control points (ny, nx, 2)."""
+    of control points (ny, nx, 2). region: polygon (n, 2) of pixels outside which the spline means nothing."""
 
     order: int
     fov_x: float  # radians
     control: Array
+    region: Array | None = None
+
+    def project(self, points: Array) -> tuple[Array, Mask]:
+        pixels, ok = super().project(points)
+        return pixels, ok if self.region is None else ok & _inside(self.region, pixels)
 
     def basis(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, tuple[Array, Array, Array, Array], Mask]:
         """u (N,), v (N,); first column and row of the control points in use, their weights (N, order + 1) each; ok."""
@@ -332,6 +337,16 @@ class Generic(Lens):
         return self.fields
 
 
+def _inside(polygon: Array, pixels: Array) -> Mask:
+    """Whether pixels (N, 2) lie in the polygon (n, 2): a line to the right crosses its sides an odd number of times."""
+    inside = np.zeros(len(pixels), dtype=bool)
+    x, y = pixels.T
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        with np.errstate(all="ignore"):
+            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside
+
+
 def _bspline(t: Array, order: int) -> Array:
     """Weights (N, order + 1) of the uniform B-spline: t in 0..1 (cubic) or -1/2..1/2 (quadratic)."""
     if order == 2:
@@ -351,19 +366,27 @@ def rays(theta: Array, phi: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """How far an image sees: theta_edge[i] along phi[i], radians, and whether it is the model that ends there."""
+    """How far an image sees: theta_edge[i] along phi[i], radians, and whether it is the model that ends there. corners:
+    the azimuths of the image's corners, which are among phi."""
 
     phi: Array
     theta_edge: Array
     model_ends: Mask
+    corners: Array
 
     def edge(self, phi: Array) -> Array:
         """theta_edge between the samples."""
         return np.interp(phi % (2 * math.pi), self.phi, self.theta_edge, period=2 * math.pi)
 
+    def within(self, theta: float) -> Field:
+        """The part of the field at most theta off the axis."""
+        ends = self.model_ends & (self.theta_edge <= theta)
+        return Field(self.phi, np.minimum(self.theta_edge, theta), ends, self.corners)
+
     def sample(self, phis: int, thetas: int, start: float = 0.0) -> Array:
-        """Rays (phis * thetas, 3) over the field: azimuths from `start`, angles to the edge and the edge included."""
-        phi = start + 2 * math.pi * np.arange(phis) / phis
+        """Rays ((phis + 4) * thetas, 3) over the field: azimuths from `start` and those of the corners, angles to the
+        edge, which is included."""
+        phi = np.append(start + 2 * math.pi * np.arange(phis) / phis, self.corners)
         theta = np.linspace(1 / thetas, 1, thetas)[None, :] * self.edge(phi)[:, None] * (1 - 1e-9)
         return rays(theta, np.broadcast_to(phi[:, None], theta.shape)).reshape(-1, 3)
 
@@ -376,7 +399,6 @@ def field_of(project: Any, width: int, height: int, end: float = THETA_END, in_i
         def in_image(pixels: Array) -> Mask:
             return ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=1)
 
-    phi = 2 * math.pi * np.arange(_PHIS) / _PHIS
     centre, ok = project(np.array([[0.0, 0.0, 1.0]]))
     if not ok[0] or not in_image(centre)[0]:
         return None
@@ -387,8 +409,24 @@ def field_of(project: Any, width: int, height: int, end: float = THETA_END, in_i
             lit = in_image(pixels)
         return np.hypot(*(pixels - centre).T).reshape(theta.shape), valid.reshape(theta.shape), lit.reshape(theta.shape)
 
+    phi = 2 * math.pi * np.arange(_PHIS) / _PHIS
+    edge, ends = _edge(radius, phi, end)
+    pixels, _ = project(rays(edge, phi))
+    place = np.unwrap(np.arctan2(*(pixels - centre).T[::-1]))  # of the pixel; not phi where the lens is asymmetric
+    corner = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]]) - centre
+    turns = (np.arctan2(corner[:, 1], corner[:, 0]) - place[0]) % (2 * math.pi)
+    corners = np.interp(turns, np.append(place - place[0], 2 * math.pi), np.append(phi, 2 * math.pi)) % (2 * math.pi)
+    more = _edge(radius, corners, end)
+    order = np.argsort(np.append(phi, corners), kind="stable")
+    return Field(
+        np.append(phi, corners)[order], np.append(edge, more[0])[order], np.append(ends, more[1])[order], corners
+    )
+
+
+def _edge(radius: Any, phi: Array, end: float) -> tuple[Array, Mask]:
+    """theta_edge and model_ends of a Field along phi; radius: (theta, phi) -> pixels off the centre, valid, lit."""
     theta = np.linspace(0, end, _STEPS + 1)
-    grid = np.broadcast_to(theta[1:], (_PHIS, _STEPS))
+    grid = np.broadcast_to(theta[1:], (len(phi), _STEPS))
     r, valid, lit = radius(grid, np.broadcast_to(phi[:, None], grid.shape))
     with np.errstate(invalid="ignore"):
         valid &= np.diff(r, axis=1, prepend=0.0) > 0
@@ -406,4 +444,4 @@ def field_of(project: Any, width: int, height: int, end: float = THETA_END, in_i
     before, _, _ = radius(low, phi)
     with np.errstate(invalid="ignore"):
         ends = (low >= end - 1e-9) | ~valid | ~(r > before)
-    return Field(phi, low, ends)
+    return low, ends

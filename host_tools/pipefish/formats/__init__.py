@@ -16,9 +16,9 @@ from typing import Any
 from ..camera import Camera
 from ..errors import PipefishError, ProfileError
 from ..fit import Fit
-from ..lenses import Lens
+from ..lenses import KannalaBrandt, Lens, Unified
 from . import readers, texts
-from .convert import MAX_ERROR, camera_of
+from .convert import MAX_ERROR, camera_of, lens_field
 from .parse import BYTES_MAX, Found, decode, parse_json, parse_yaml
 from .writers import WRITERS, Wanted, Written
 
@@ -109,7 +109,10 @@ def _read(data: bytes, form: str | None, size: tuple[int, int] | None) -> tuple[
     if form is None or form == "json":
         raise ProfileError(None, None, "not a camera calibration in a format that is known (docs/formats.md)")
     found = _MAPPINGS[form](document, size)
-    return "opencv" if form == "opencv-any" else form, found
+    if form == "opencv-any":
+        kinds = {KannalaBrandt: "opencv-fisheye", Unified: "opencv-omnidir"}
+        form = kinds.get(type(found[0].lens), "opencv")
+    return form, found
 
 
 def _choose(found: list[Found], camera: int | str) -> Found:
@@ -179,11 +182,11 @@ def _within(form: str, lens: Lens, model: str, max_error: float, max_theta: floa
 
 def _does_not_fit(form: str, lens: Lens, model: str, fit: Fit, max_error: float) -> str:
     """The reason, with the angle up to which the lens can be had within max_error."""
-    low, high = 0.0, fit.theta_max
-    for _ in range(6):
+    field, low, high = lens_field(lens), 0.0, fit.theta_max
+    for _ in range(5):
         middle = (low + high) / 2
         try:
-            fits = camera_of(lens, model, middle)[1].max_px <= max_error
+            fits = camera_of(lens, model, middle, field)[1].max_px <= max_error
         except PipefishError:
             fits = False
         low, high = (middle, high) if fits else (low, middle)

@@ -20,15 +20,26 @@ _ASYMMETRIC_BELOW = 0.5  # "cpoly" is taken where it at least halves the error .
 _GOOD_ENOUGH = 0.005  # ... of more than this many pixels
 
 
-def camera_of(lens: Lens, model: str = "auto", max_theta: float | None = None) -> tuple[Camera, Fit]:
+def lens_field(lens: Lens) -> Field:
+    """What the lens's image sees. Raises ProfileError where its axis is not in the image."""
+    field = field_of(lens.project, lens.width, lens.height)
+    if field is None or not field.theta_edge.min() > 1e-3:
+        raise ProfileError(None, None, "the optical axis is not in the image, or the model does not begin there")
+    return field
+
+
+def camera_of(
+    lens: Lens, model: str = "auto", max_theta: float | None = None, field: Field | None = None
+) -> tuple[Camera, Fit]:
     """The Camera for `lens`, over what its image sees (at most max_theta, radians).
 
     model: "auto": the exact equivalent if there is one, else p9, else cpoly where that is much better; or one of
-    MODELS. Raises ProfileError where the lens has no axis in its image or the result is not one-to-one.
+    MODELS. field: lens_field(lens), where it is there already. Raises ProfileError where the lens has no axis in its
+    image or the result is not one-to-one.
     """
-    field = field_of(lens.project, lens.width, lens.height, min(max_theta or THETA_END, THETA_END))
-    if field is None or not field.theta_edge.min() > 1e-3:
-        raise ProfileError(None, None, "the optical axis is not in the image, or the model does not begin there")
+    field = field or lens_field(lens)
+    if max_theta is not None:
+        field = field.within(max_theta)
     fields = lens.exact() if model == "auto" else None
     points = field.sample(*_CHECK)
     expected, ok = lens.project(points)

@@ -116,9 +116,12 @@ def read_toolbox(text: str, size: Size | None) -> list[Found]:
     if len(p) not in (6, 9, 23):
         raise ProfileError(None, "p", f"{len(p)} parameters where 6, 9 or 23 belong")
     notes = []
-    start = re.search(r"^p0:[ \t]*\n[ \t]*((?:[-+.\deE]+[ \t,]+){6})", text, re.MULTILINE)
+    start = re.search(r"^p0:[ \t]*\n([^\n]*)", text, re.MULTILINE)
     if size is None and start:
-        u0, v0 = (finite(v, "p0") for v in re.split(r"[\s,]+", start[1].strip())[4:6])
+        p0 = start[1].replace(",", " ").split()
+        if len(p0) != 6:
+            raise ProfileError(None, "p0", f"{len(p0)} numbers where 6 belong")
+        u0, v0 = (finite(v, "p0") for v in p0[4:])
         size = whole(2 * u0, "p0"), whole(2 * v0, "p0")
         notes.append(f"image size {size[0]} x {size[1]} from the start values p0 (twice its centre)")
     shape = need_size(size)
@@ -169,6 +172,11 @@ def read_mrcal(text: str, size: Size | None) -> list[Found]:
         raise ProfileError(None, "intrinsics", f"{len(v)} numbers where {counts[model] + 4} belong")
     if splined:
         control = np.array(k).reshape(ny, nx, 2)
+        if node.value.get("valid_intrinsics_region"):
+            region = np.array(node.numbers("valid_intrinsics_region"))
+            if region.size % 2 or region.size < 6:
+                raise ProfileError(None, "valid_intrinsics_region", "not a list of three or more points")
+            core["region"] = region.reshape(-1, 2)
         return [Found("camera", SplinedStereographic(order=order, fov_x=math.radians(fov), control=control, **core))]
     if model == "LENSMODEL_STEREOGRAPHIC":
         return [Found("camera", Stereographic(**core))]

@@ -14,7 +14,7 @@ import numpy as np
 from ..camera import Camera
 from ..errors import ProfileError
 from ..fit import Fit, compare
-from ..lenses import SplinedStereographic
+from ..lenses import SplinedStereographic, rays
 from .convert import camera_field, lost_terms, plain_polynomial
 
 
@@ -212,9 +212,14 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
     """A .cameramodel: PINHOLE or STEREOGRAPHIC where the camera is that, else mrcal's own fisheye model, the splined
     stereographic one, whose control points come from linear least squares."""
     simple = {"perspective": "LENSMODEL_PINHOLE", "stereographic": "LENSMODEL_STEREOGRAPHIC"}
-    points = camera_field(camera, wanted.max_theta).sample(77, 91, 0.013)
+    field = camera_field(camera, wanted.max_theta)
+    points = field.sample(77, 91, 0.013)
     pixels, _ = camera.project(points)
     notes: list[str] = []
+    region = ""
+    if field.model_ends.any():
+        contour, _ = camera.project(rays(field.theta_edge, field.phi)[::4])
+        region = f"    'valid_intrinsics_region': {np.round(contour, 3).tolist()},\n\n"
     if lost_terms(camera) == [f"the {camera.radial} radial function"] and camera.radial in simple:
         model, extra = simple[camera.radial], np.zeros(0)
         fit = compare(points, pixels, pixels, exact=True)
@@ -232,7 +237,7 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
     numbers = ", ".join(repr(float(v)) for v in (camera.f_u, camera.f_v, camera.c_u, camera.c_v, *extra))
     text = (
         f"{{\n    'lensmodel': '{model}',\n\n    'intrinsics': [ {numbers} ],\n\n"
-        f"    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n\n"
+        f"    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n\n{region}"
         f"    'imagersize': [ {camera.width}, {camera.height} ]\n}}\n"
     )
     return Written(text, fit, notes)
@@ -259,6 +264,9 @@ def _spline(camera: Camera, wanted: Wanted) -> SplinedStereographic:
     points = np.hstack([4 * u, 4 - square]) / (4 + square)
     pixels, ok = camera.project(points)
     u, points, pixels = u[ok], points[ok], pixels[ok]
+    edge = field.sample(360, 4)
+    u = np.vstack([u, 2 * edge[:, :2] / (1 + edge[:, 2:])])
+    points, pixels = np.vstack([points, edge]), np.vstack([pixels, camera.project(edge)[0]])
     _, _, (ix, iy, wx, wy), _ = lens.basis(*points.T)
     design = np.zeros((len(points), ny * nx))
     for j in range(4):
