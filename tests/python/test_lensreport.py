@@ -73,7 +73,7 @@ def test_check_passes_a_good_camera_and_tells_its_limits(tmp_path, capsys):
     [
         ({"c_u": 4000.0}, "is not in the picture"),
         ({"f_v": 40.0}, "far from square"),
-        ({"f_u": 9e4, "f_v": 9e4, "theta_max": 0.001}, "pixels per radian"),
+        ({"f_u": 9e4, "f_v": 9e4, "theta_max": 0.0005}, "pixels per radian"),
         ({"pupil_e1": 0.6}, "millimetres"),
     ],
 )
@@ -116,7 +116,7 @@ def test_refusals_leave_no_file_and_say_why(tmp_path, capsys):
     assert run("convert", FORMATS / "kalibr.yaml", out, "--camera", "cam9") == 1
     assert "there are cam0, cam1" in capsys.readouterr().err
     assert run("check", FORMATS / "pyocamcalib.json") == 1
-    assert "--size" in capsys.readouterr().err
+    assert "--camera-size" in capsys.readouterr().err
 
 
 # ---- calib_profiles/

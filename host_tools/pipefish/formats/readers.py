@@ -29,7 +29,7 @@ Size = tuple[int, int]
 def need_size(size: Size | None, what: str = "image size") -> Size:
     """The size, or ProfileError that asks for it."""
     if size is None:
-        raise ProfileError(None, what, "not in the file: give it (--size WIDTHxHEIGHT, or size=(width, height))")
+        raise ProfileError(None, what, "not in the file: give it (--camera-size WxH; in Python size=(w, h))")
     return size
 
 
