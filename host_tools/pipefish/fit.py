@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 _RADIAL = ("k2", "k3", "k4", "k5")
 _CPOLY = tuple(f"cpoly[{i}]" for i in range(14))
 _ASYMMETRIC = tuple(name for name in PARAMETERS if name.startswith("asym_"))
-_LAWSON_STEPS = 40
+_LAWSON_STEPS = 30
 
 #: Free parameters besides focal lengths, principal point and skew.
 MODELS = {"p6": _RADIAL[:1], "p9": _RADIAL, "p23": _RADIAL + _ASYMMETRIC, "cpoly": _RADIAL + _CPOLY}

@@ -162,6 +162,18 @@ def test_the_same_camera_in_three_scaramuzza_dialects_is_one_camera():
     np.testing.assert_array_equal(svo.unproject(pixels)[0], toolbox.unproject(pixels)[0])
 
 
+def test_ros_messages_as_printed_are_read_like_ros_files(tmp_path):
+    text = (
+        "width: 640\nheight: 480\ndistortion_model: plumb_bob\nd: [-0.11, 0.02, 0.0003, -0.0002]\n"
+        "k: [610.0, 0.0, 322.5, 0.0, 611.0, 238.25, 0.0, 0.0, 1.0]\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nbinning_x: 0\n"
+    )
+    (tmp_path / "info").write_text(text)
+    loaded = formats.load(tmp_path / "info")
+    oracle = lf.pinhole((610, 611), (322.5, 238.25), (-0.11, 0.02), (3e-4, -2e-4))
+    pixel, _ = loaded.camera.project([[0.3, -0.2, 1.0]])
+    assert loaded.form == "ros" and np.abs(pixel[0] - oracle(0.3, -0.2, 1.0)).max() < 1.1 * loaded.fit.max_px
+
+
 # ---- writers
 
 

@@ -80,7 +80,7 @@ def _guess_mapping(document: Any) -> str | None:
         ("stella", isinstance(document.get("Camera"), dict)),
         ("woodscape", isinstance(document.get("intrinsic"), dict)),
         ("pyocamcalib", "taylor_coefficient" in keys),
-        ("ros", "distortion_model" in keys and bool({"projection_matrix", "P", "rectification_matrix", "R"} & keys)),
+        ("ros", "distortion_model" in keys and document["distortion_model"] in readers.ROS_MODELS),
         ("opencv-any", bool({"camera_matrix", "K", "cameraMatrix", "intrinsic_matrix"} & keys)),
     )
     return next((form for form, fits in tests if fits), None)

@@ -68,8 +68,12 @@ def _first(node: Node, *keys: str) -> str:
 # ---- OpenCV and ROS
 
 
+_MATRICES = ("camera_matrix", "K", "k", "cameraMatrix", "intrinsic_matrix")
+_COEFFICIENTS = ("distortion_coefficients", "D", "d", "distCoeffs", "distortion_coeffs", "dist_coeffs")
+
+
 def _opencv_parts(node: Node, size: Size | None) -> tuple[dict[str, Any], str]:
-    core: dict[str, Any] = dict(_matrix(node, _first(node, "camera_matrix", "K", "cameraMatrix", "intrinsic_matrix")))
+    core: dict[str, Any] = dict(_matrix(node, _first(node, *_MATRICES)))
     for width, height in (("image_width", "image_height"), ("width", "height"), ("image_Width", "image_Height")):
         if width in node:
             size = node.size(width, height)
@@ -79,9 +83,7 @@ def _opencv_parts(node: Node, size: Size | None) -> tuple[dict[str, Any], str]:
             if key in node:
                 size = (whole(v, node.place(key)) for v in node.numbers(key, 2))  # type: ignore[assignment]
                 break
-    return core | image(tuple(need_size(size))), _first(  # type: ignore[arg-type]
-        node, "distortion_coefficients", "D", "distCoeffs", "distortion_coeffs", "dist_coeffs"
-    )
+    return core | image(tuple(need_size(size))), _first(node, *_COEFFICIENTS)
 
 
 def read_opencv_fisheye(document: Any, size: Size | None) -> list[Found]:
@@ -116,7 +118,7 @@ def read_opencv_any(document: Any, size: Size | None) -> list[Found]:
     kind = str(node.value.get("distortion_model", node.value.get("model", ""))).lower()
     if node.value.get("fisheye_model") == 1 or kind in ("fisheye", "equidistant", "kannala_brandt"):
         return read_opencv_fisheye(document, size)
-    d = _first(node, "distortion_coefficients", "D", "distCoeffs", "distortion_coeffs", "dist_coeffs")
+    d = _first(node, *_COEFFICIENTS)
     if len(node.numbers(d)) == 4 and "fisheye_model" not in node:
         raise ProfileError(
             None,
@@ -127,6 +129,10 @@ def read_opencv_any(document: Any, size: Size | None) -> list[Found]:
     return read_opencv(document, size)
 
 
+#: CameraInfo's distortion_model and how many coefficients it has.
+ROS_MODELS = {"equidistant": (4,), "fisheye": (4,), "plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14)}
+
+
 def read_ros(document: Any, size: Size | None) -> list[Found]:
     """sensor_msgs/CameraInfo as YAML. K is used; R and P belong to rectified images."""
     node = Node(document)
@@ -134,15 +140,12 @@ def read_ros(document: Any, size: Size | None) -> list[Found]:
     core, d = _opencv_parts(node, size)
     name = node.text("camera_name", "camera")
     where = node.place(d)
+    if kind not in ROS_MODELS:
+        raise ProfileError(None, node.place("distortion_model"), f"{kind!r} is not read: {', '.join(ROS_MODELS)}")
+    k = node.numbers(d, ROS_MODELS[kind])
     if kind in ("equidistant", "fisheye"):
-        return [Found(name, KannalaBrandt(k=node.numbers(d, 4), **core))]
-    if kind == "plumb_bob":
-        return [Found(name, Perspective(**core, **opencv_distortion(node.numbers(d, (4, 5)), where)))]
-    if kind == "rational_polynomial":
-        return [Found(name, Perspective(**core, **opencv_distortion(node.numbers(d, (8, 12, 14)), where)))]
-    raise ProfileError(
-        None, node.place("distortion_model"), f"{kind!r} is not read: plumb_bob, rational_polynomial, equidistant"
-    )
+        return [Found(name, KannalaBrandt(k=k, **core))]
+    return [Found(name, Perspective(**core, **opencv_distortion(k, where)))]
 
 
 # ---- Kalibr and basalt
