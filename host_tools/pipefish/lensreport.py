@@ -102,7 +102,7 @@ def _charts(camera: Camera) -> list[tuple[str, str, list[tuple[str, Array, Array
     x = np.degrees(c.theta)
     ideal = math.sqrt(camera.f_u * camera.f_v) * c.theta
     lines = [("this camera", x, c.radius), ("equidistant, for comparison", x, ideal)]
-    if (c.most - c.least).max() > 0.05:
+    if (c.most - c.least).max() > 0.01 * c.most.max():  # else it hides the camera's own line
         lines += [("nearest azimuth", x, c.least), ("farthest azimuth", x, c.most)]
     both = [("outward", x, c.radial), ("around the axis", x, c.tangential)]
     return [
