@@ -105,7 +105,7 @@ def _text(key: str, value: object) -> str:
     return value
 
 
-def rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float64]:
+def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float64]:
     """(N, columns) numbers as a contiguous float64 array, or ArgumentError."""
     try:
         given = np.asarray(array)
@@ -250,24 +250,24 @@ class Camera(Sources):
 
         A pixel is NaN where ok is False: beyond theta_max, the origin, or not finite. A pixel may lie off the image.
         """
-        return self._profile.project(rows("points", points, 3))
+        return self._profile.project(_rows("points", points, 3))
 
     def unproject(self, pixels: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         """Pixels (N, 2) -> unit rays in the camera frame (N, 3), ok (N,).
 
         A ray is NaN where ok is False: beyond theta_max, or not finite.
         """
-        return self._profile.unproject(rows("pixels", pixels, 2))
+        return self._profile.unproject(_rows("pixels", pixels, 2))
 
     def origins(self, pixels: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera, else NaN
         where there is no ray."""
-        given = rows("pixels", pixels, 2)
+        given = _rows("pixels", pixels, 2)
         return self._profile.origins(given) if self.pupil_e1 else np.zeros((len(given), 3))
 
     def in_image(self, pixels: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether pixels (N, 2) lie on the sensor and inside the image circle, (N,)."""
-        return self._profile.in_image(rows("pixels", pixels, 2))
+        return self._profile.in_image(_rows("pixels", pixels, 2))
 
     def project_jacobian(
         self, points: npt.ArrayLike
@@ -276,7 +276,7 @@ class Camera(Sources):
 
         Everything is NaN where ok is False. Derivatives by a parameter are there also where it is zero now.
         """
-        return self._profile.project_jacobian(rows("points", points, 3))
+        return self._profile.project_jacobian(_rows("points", points, 3))
 
     @classmethod
     def fit(
@@ -307,27 +307,22 @@ class Camera(Sources):
             profile = _engine.Profile.decode(bytes(data))
         except ValueError as error:
             raise _split(error) from None
-        return cls.from_profile(profile)
-
-    @classmethod
-    def from_profile(cls, profile: Any, **about: Any) -> Camera:
-        """From the C core's struct (_engine.Profile); `about`: fields that replace its own."""
         values = {key: getattr(profile, key) for key in (*_INTEGERS, *_SCALARS, *_CIRCLE, *_ARRAYS, *_TEXTS)}
         names = tuple(PARAMETERS[i] for i in profile.free_param)
         if names:
             covariance = np.zeros((len(names), len(names)))
-            across, down = np.tril_indices(len(names))
-            covariance[across, down] = covariance[down, across] = profile.covariance
+            rows, columns = np.tril_indices(len(names))
+            covariance[rows, columns] = covariance[columns, rows] = profile.covariance
             values |= {"covariance_parameters": names, "covariance": covariance}
         if profile.created_unix_s:
             values["created"] = datetime.datetime.fromtimestamp(profile.created_unix_s, datetime.UTC)
-        values |= {
-            "radial": _RADIAL[profile.radial],
-            "source": _SOURCE[profile.source],
-            "rms_px": None if math.isnan(profile.rms_px) else profile.rms_px,
-            "theta_covered": profile.theta_covered or None,
-        }
-        return cls(**values | about)
+        return cls(
+            radial=_RADIAL[profile.radial],
+            source=_SOURCE[profile.source],
+            rms_px=None if math.isnan(profile.rms_px) else profile.rms_px,
+            theta_covered=profile.theta_covered or None,
+            **values,
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **options: Any) -> Camera:

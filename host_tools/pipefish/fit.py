@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _engine
-from .camera import PARAMETERS, Camera, rows
+from .camera import PARAMETERS, Camera, _rows
 from .errors import ArgumentError
 
 Array = npt.NDArray[np.float64]
@@ -22,6 +22,8 @@ _RADIAL = ("k2", "k3", "k4", "k5")
 _CPOLY = tuple(f"cpoly[{i}]" for i in range(14))
 _ASYMMETRIC = tuple(name for name in PARAMETERS if name.startswith("asym_"))
 _LAWSON_STEPS = 30
+
+_FIELDS = ("width", "height", "theta_max", *dict.fromkeys(name.partition("[")[0] for name in PARAMETERS))
 
 #: Free parameters besides focal lengths, principal point and skew.
 MODELS = {"p6": _RADIAL[:1], "p9": _RADIAL, "p23": _RADIAL + _ASYMMETRIC, "cpoly": _RADIAL + _CPOLY}
@@ -216,7 +218,7 @@ def fit_camera(
     about: name, serial, ... of the Camera. Points for a central camera are rays: any length.
     Raises ArgumentError for bad input, ProfileError if the result is not one-to-one up to theta_max.
     """
-    xyz, uv = rows("points", points, 3), rows("pixels", pixels, 2)
+    xyz, uv = _rows("points", points, 3), _rows("pixels", pixels, 2)
     if len(xyz) != len(uv):
         raise ArgumentError(f"fit: {len(xyz)} points but {len(uv)} pixels")
     if model not in MODELS:
@@ -232,7 +234,6 @@ def fit_camera(
 
     profile = _engine.Profile()
     profile.width, profile.height = size
-    profile.rms_px = math.nan
     profile.theta_max = min(float(theta.max()) * (1 + 1e-9), math.pi - 1e-9)
     radial = [name for name in MODELS[model] if name in _RADIAL]
     for key, value in _linear_start(xyz, uv, len(radial)).items():
@@ -246,5 +247,5 @@ def fit_camera(
     if even:
         _even_out(profile, names, xyz, uv)
     profile.theta_max = max(profile.theta_max, theta_max or 0.0)
-    camera = Camera.from_profile(profile, **about)
+    camera = Camera(**{key: getattr(profile, key) for key in _FIELDS}, **about)
     return camera, compare(xyz, uv, camera.project(xyz)[0])
