@@ -296,6 +296,7 @@ def test_what_does_not_fit_is_refused_with_the_angle_that_does():
 BAD = [
     ("a: [1, 2", "line"),
     ("nothing: here", "not a camera calibration"),
+    ("when: 2026-02-31\nwhat: !!timestamp never", "not a camera calibration"),
     ("1 OPENCV_FISHEYE 800 600 1 2 3", "8 belong"),
     ("1 DIVISION 800 600 1 2 3 4", "not read"),
     ("cam0: {camera_model: pinhole, intrinsics: [1, 2, 3], resolution: [10, 10]}", "cam0.intrinsics: 3 numbers"),

@@ -123,6 +123,8 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
 
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
+# Dates stay texts: no calibration needs one, and PyYAML stumbles over impossible ones.
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", yaml.SafeLoader.construct_yaml_str)
 
 
 def decode(data: bytes) -> str:
