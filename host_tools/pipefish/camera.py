@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _engine, profile_json
+from .camera_sources import Sources
 from .errors import ArgumentError, ProfileError
 from .profile_json import (
     ARRAYS,
@@ -97,7 +98,7 @@ class Provenance:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Camera:
+class Camera(Sources):
     """One calibrated camera. Immutable; use dataclasses.replace() for a changed copy.
 
     Pixels: the centre of the top-left pixel is (0, 0), u right, v down. Camera frame: x right, y down, z along the
@@ -244,8 +245,39 @@ class Camera:
         return self._profile.unproject(_rows("pixels", pixels, 2))
 
     def origins(self, pixels: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera."""
-        return np.zeros((_rows("pixels", pixels, 2).shape[0], 3))
+        """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera, else NaN
+        where there is no ray."""
+        given = _rows("pixels", pixels, 2)
+        return self._profile.origins(given) if self.pupil_e1 else np.zeros((len(given), 3))
+
+    def in_image(self, pixels: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether pixels (N, 2) lie on the sensor and inside the image circle, (N,)."""
+        return self._profile.in_image(_rows("pixels", pixels, 2))
+
+    def project_jacobian(
+        self, points: npt.ArrayLike
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """As project, with derivatives: pixels (N, 2), ok (N,), by the point (N, 2, 3), by PARAMETERS (N, 2, 41).
+
+        Everything is NaN where ok is False. Derivatives by a parameter are there also where it is zero now.
+        """
+        return self._profile.project_jacobian(_rows("points", points, 3))
+
+    @classmethod
+    def fit(
+        cls, rays: npt.ArrayLike, pixels: npt.ArrayLike, size: tuple[int, int], model: str = "p9", **more: Any
+    ) -> tuple[Camera, Any]:
+        """The generic camera that sees `rays` (N, 3) at `pixels` (N, 2), and how well; see pipefish.fit.fit_camera."""
+        from .fit import fit_camera
+
+        return fit_camera(rays, pixels, size, model, **more)
+
+    def to_generic(self, model: str = "p9", *, max_theta: float | None = None) -> tuple[Camera, Any]:
+        """This camera with the radial polynomial (and with model "p23" or "cpoly" its asymmetric terms) fitted over the
+        image, and how well it fits: pipefish.fit.Fit."""
+        from .formats.convert import generic
+
+        return generic(self, model, max_theta)
 
     # ------------------------------------------------------------------ files
 
@@ -279,7 +311,19 @@ class Camera:
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Camera:
+    def load(cls, path: str | os.PathLike[str], **options: Any) -> Camera:
+        """Reads a profile, JSON or binary, or the calibration file of another program, whatever its name.
+
+        Other programs' models become ours exactly or by a fit; docs/formats.md lists them, pipefish.formats.load also
+        tells how well it fits and takes the same options: camera, size, max_error, max_theta, form.
+        Raises ProfileError with the file, the key and the reason.
+        """
+        from .formats import load
+
+        return load(path, **options).camera
+
+    @classmethod
+    def load_json(cls, path: str | os.PathLike[str]) -> Camera:
         """Reads a profile in JSON. Raises ProfileError with the file, the key and the reason."""
         try:
             values = profile_json.read(path)

@@ -226,65 +226,6 @@ def run_simulate(args: argparse.Namespace) -> Result:
     return document, table(rows)
 
 
-def load_profile(path: Path) -> Any:
-    """A Camera from a JSON or binary profile; the content decides. Raises ProfileError, OSError."""
-    from pipefish.camera import Camera
-    from pipefish.errors import ProfileError
-
-    with open(path, "rb") as stream:
-        data = stream.read(65536)
-    if data.lstrip()[:1] in (b"{", b""):
-        return Camera.load(path)
-    try:
-        return Camera.from_binary(data)
-    except ProfileError as error:
-        raise ProfileError(path, error.position, error.reason) from None
-
-
-def run_profile_show(args: argparse.Namespace) -> Result:
-    import math
-
-    camera = load_profile(Path(args.profile))
-    covered = f"{math.degrees(camera.theta_covered):.1f} deg" if camera.theta_covered else "unknown"
-    circle = f"({camera.circle_u:.1f}, {camera.circle_v:.1f}) radius {camera.circle_radius:.1f} px"
-    rows = [
-        ("name", camera.name or "unnamed"),
-        ("serial", camera.serial),
-        ("source", camera.source),
-        ("created", camera.created.isoformat() if camera.created else None),
-        ("picture", f"{camera.width} x {camera.height}"),
-        ("model", camera.radial),
-        ("f_u, f_v", f"{camera.f_u:.4f}, {camera.f_v:.4f} px/rad"),
-        ("c_u, c_v", f"{camera.c_u:.4f}, {camera.c_v:.4f} px"),
-        ("skew", f"{camera.skew:.6g}" if camera.skew else None),
-        ("k2 .. k5", ", ".join(f"{k:.6g}" for k in (camera.k2, camera.k3, camera.k4, camera.k5))),
-        ("field of view", f"{2 * math.degrees(camera.theta_max):.1f} deg (data covered half of it up to {covered})"),
-        ("image circle", circle if camera.circle_radius else "the whole picture"),
-        ("residual", f"{camera.rms_px:.4f} px rms" if camera.rms_px is not None else "unknown"),
-        (
-            "covariance",
-            f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
-        ),
-    ]
-    return json.loads(camera.to_json()), table(rows)
-
-
-def run_profile_check(args: argparse.Namespace) -> Result:
-    camera = load_profile(Path(args.profile))
-    document = {"file": args.profile, "valid": True, "name": camera.name}
-    return document, f"{args.profile}: valid ({camera.name or 'unnamed'}, {camera.width} x {camera.height})"
-
-
-def run_profile_convert(args: argparse.Namespace) -> Result:
-    from pipefish.show import write_atomically
-
-    camera, out = load_profile(Path(args.profile)), Path(args.out)
-    form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
-    data = camera.to_json().encode() if form == "json" else camera.to_binary()
-    write_atomically(out, data)
-    return {"file": str(out), "form": form, "bytes": len(data)}, f"{out}: {form}, {len(data)} bytes"
-
-
 def stored_text(profile: Any) -> str:
     """A pb.Profile for people."""
     trial = f", on trial, {profile.starts_left} more starts" if profile.trial else ""
@@ -295,6 +236,7 @@ def stored_text(profile: Any) -> str:
 def run_flash(args: argparse.Namespace) -> Result:
     from google.protobuf.json_format import MessageToDict
 
+    from pipefish.cli_profile import load_profile
     from pipefish.flash import Flasher
     from pipefish.transport import open_transport
 
@@ -302,7 +244,7 @@ def run_flash(args: argparse.Namespace) -> Result:
         raise UsageError("flash: --revert goes with neither a profile nor --confirm")
     if not args.profile and not args.revert and not args.confirm:
         raise UsageError("flash: give a profile, or --confirm or --revert")
-    data = load_profile(Path(args.profile)).to_binary() if args.profile else None
+    data = load_profile(args).camera.to_binary() if args.profile else None
     with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
         if args.revert:
             state = device.revert()
@@ -464,6 +406,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]; 0: wait for ever"
     )
 
+    from pipefish.cli_profile import add_profile, add_profile_input  # they need what stands above
+
     add_profile(commands)
 
     p = add_command(
@@ -475,7 +419,7 @@ def build_parser() -> argparse.ArgumentParser:
         "pipefish flash tcp://127.0.0.1:7447 camera.json",
     )
     add_device(p)
-    p.add_argument("profile", metavar="PROFILE", nargs="?", help="JSON or binary profile")
+    p.add_argument("profile", metavar="PROFILE", nargs="?", help="a profile, or another program's calibration")
     p.add_argument(
         "--confirm",
         action=argparse.BooleanOptionalAction,
@@ -483,38 +427,11 @@ def build_parser() -> argparse.ArgumentParser:
         "back to the one before unless it is confirmed in time",
     )
     p.add_argument("--revert", action="store_true", help="drop the profile on trial, or go back to the one before")
+    add_profile_input(p)
     p.add_argument(
         "--timeout", type=not_negative, default=10.0, metavar="S", help="give up after S silent seconds [10]; 0: never"
     )
     return parser
-
-
-def add_profile(commands: Any) -> None:
-    """`pipefish profile show|check|convert`."""
-    parser = commands.add_parser(
-        "profile", help="look at, check and convert camera profiles", description="Camera profiles."
-    )
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    p = add_command(actions, "show", run_profile_show, "Tell what a profile says.", "pipefish profile show camera.json")
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p = add_command(
-        actions,
-        "check",
-        run_profile_check,
-        "Check a profile; exit code 1 if it is not valid.",
-        "pipefish profile check camera.json",
-    )
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p = add_command(
-        actions,
-        "convert",
-        run_profile_convert,
-        "Convert a profile between JSON (for people) and binary (for devices).",
-        "pipefish profile convert camera.json camera.profile",
-    )
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p.add_argument("out", metavar="OUT", help="file to write; .json: JSON, anything else: binary")
-    p.add_argument("--to", choices=("json", "binary"), help="form to write, whatever the name")
 
 
 def main(argv: list[str] | None = None) -> int:

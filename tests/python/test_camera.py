@@ -200,7 +200,7 @@ BAD_VALUES = [
     ("tilt", [0]),
     ("tilt", "00"),
     ("asym_radial_theta", [2e6, 0, 0]),
-    ("asym_radial_phi", [2e6, 0, 0, 0]),
+    ("asym_radial_phi[0]", ["1", 0, 0, 0]),
     ("asym_tangential_theta", [0, 0, 2e6]),
     ("asym_tangential_phi", 0),
     ("cpoly", [0] * 13),
