@@ -56,6 +56,8 @@ void pf_fixed_lookup_four(const pf_camera_rays *rays, const pf_point_q16 *pixels
         ((cell)->shift < EXACT && pf_camera_fixed_in_image(rays->fixed, pixels[lane])))                        \
         put(out + (lane), cell_sum(cell, _mm_shuffle_epi32(first, (lane)*0x55),                                        \
                                    _mm_shuffle_epi32(second, (lane)*0x55), _mm_shuffle_epi32(third, (lane)*0x55)));    \
+    else if ((cell)->shift & OUTSIDE)                                                                                  \
+        out[lane] = (pf_ray_q30){0, 0, 0};                                                                             \
     else                                                                                                               \
         out[lane] = pf_camera_rays_at(rays, pixels[lane])
     TAKE(0, c0);

@@ -8,10 +8,11 @@
  *
  * Worst errors, against the model in long double (tests/unit/test_camera_fixed.c asserts them for all radial functions
  * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift):
- *   projection                5e-5 px (1.5e-5 where the image lies within 2048 px of the principal point)
- *   back-projection           2e-7 rad where r' >= 0.18; everywhere 4e-9 + (1.5e-5 px / f + 3e-9 r_max) / r' rad
- *   round trip of a pixel     as the projection
- *   table of rays             1e-5 rad, wherever the camera is defined
+ *   projection          2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad f (3.2e-5 px at 640 px and
+ *                       f = 300, 9e-5 px at most)
+ *   back-projection     2e-9 rad + 2.5e-9 r_max / r', r' the least magnification of theta on the plane (2e-7 rad where
+ *                       r' >= 0.18); what is to be back-projected is a pixel of Q16.16: 2^-16.5 px / (f r') besides
+ *   table of rays       1e-5 rad, wherever the camera is defined
  * What cannot keep them is refused when the camera is built, never computed wrongly.
  */
 #ifndef PIPEFISH_CAMERA_FIXED_H
