@@ -32,7 +32,8 @@ static void add_asymmetry(lens_sample *h, double re, double im, const double a[3
     double s = theta * theta;
     double value = theta * (a[0] + s * (a[1] + s * a[2])), slope = a[0] + s * (3 * a[1] + s * (5 * a[2]));
     for (int n = 1; n <= 2; n++) {
-        double c = b[2 * n - 2] / 2, d = b[2 * n - 1] / 2; /* c - i d goes with e^(i n phi), c + i d with e^(-i n phi) */
+        double c = b[2 * n - 2] / 2,
+               d = b[2 * n - 1] / 2; /* c - i d goes with e^(i n phi), c + i d with e^(-i n phi) */
         add(h, 1 + n, re * c + im * d, im * c - re * d, value, slope);
         add(h, 1 - n, re * c - im * d, im * c + re * d, value, slope);
     }
@@ -61,7 +62,7 @@ static double magnitude_of(double v)
 /* What init works out before it writes: everything but the knots. */
 typedef struct plan {
     pf_camera_fixed fixed;
-    double per_theta;                  /* intervals per radian, as exactly as scale has it */
+    double per_theta;            /* intervals per radian, as exactly as scale has it */
     double bound, steepest;      /* of |W|; of all channels' change in an interval */
     double tilt[2], pixel_scale; /* of the sensor's homography; largest factor from W to pixels */
 } plan;
@@ -202,7 +203,6 @@ static void set_sensor(plan *p, const pf_camera *camera)
     f->center[0] = rounded(camera->c_u * pixel);
     f->center[1] = rounded(camera->c_v * pixel);
     double focal = camera->f_u < camera->f_v ? camera->f_u : camera->f_v;
-    f->focal_px = (uint32_t)focal;
     f->rim_slack = rounded(plane / focal / 16384) + 2;
     /* Z in Q30 is half a unit off in both directions, a slope of (steepest) plane units to the interval; and each
      * channel rounds. */
@@ -249,8 +249,8 @@ static pf_status make_plan(plan *p, const pf_camera *camera)
     set_sensor(p, camera);
     f->theta_max = (uint64_t)rounded(camera->theta_max * 4294967296.0);
     f->pupil_e1 = (int32_t)rounded(camera->pupil_e1 * (double)ONE_Q30);
-    f->pupil_near = rounded(magnitude_of(camera->pupil_e1) * camera->theta_max * (camera->theta_max + 2) *
-                            (double)ONE_Q30);
+    f->pupil_near =
+        rounded(magnitude_of(camera->pupil_e1) * camera->theta_max * (camera->theta_max + 2) * (double)ONE_Q30);
     return PF_OK;
 }
 
@@ -282,8 +282,8 @@ pf_status pf_camera_fixed_init(const pf_camera_fixed **fixed, const pf_camera *c
         lens_sample h = sample_knot(&p, camera, k);
         for (uint32_t i = 0; i < f->channels; i++) {
             uint32_t part = part_of(f->channel[i].harmonic, f->channel[i].imaginary);
-            *knots++ = (knot){(int32_t)rounded(h.value[part] * plane),
-                              (int32_t)rounded(h.slope[part] / p.per_theta * plane)};
+            *knots++ =
+                (knot){(int32_t)rounded(h.value[part] * plane), (int32_t)rounded(h.slope[part] / p.per_theta * plane)};
         }
     }
     *fixed = f;

@@ -2,12 +2,13 @@
  * dense grid and rounded to Q32; their own errors are below 1e-11. */
 #include "fixed.h"
 
-/* sqrt(a / 2^32) for 2^30 <= a < 2^32: 1 / sqrt in Q31 by Newton from a parabola within 2.5 %, four steps to 32 bits. */
+/* sqrt(a / 2^32) for 2^30 <= a < 2^32: 1 / sqrt in Q31 by Newton from a parabola within 2.5 %, four steps to 32 bits.
+ */
 static uint64_t inverse_root(uint64_t a)
 {
     uint64_t y = (5735607946u - ((3527688184u * a) >> 31)) + ((3518908926u * ((a * a) >> 32)) >> 32);
     for (int i = 0; i < 3; i++) {
-        uint64_t t = (a * y + ONE_Q31) >> 32;             /* a y, Q31 */
+        uint64_t t = (a * y + ONE_Q31) >> 32;                 /* a y, Q31 */
         int64_t rest = ((int64_t)1 << 62) - (int64_t)(t * y); /* 1 - a y^2, Q62 */
         y = (uint64_t)((int64_t)y + round_shift((rest >> 31) * (int64_t)y, 32));
     }
@@ -86,7 +87,8 @@ void pf_fixed_sine_cosine(uint64_t theta_q32, int32_t *sine, int32_t *cosine)
         p = s[i] + round_shift(p * z, 32);
     for (int i = 4; i >= 0; i--)
         q = c[i] + round_shift(q * z, 32);
-    int32_t first = (int32_t)((((uint64_t)p * (uint64_t)x) + ((uint64_t)1 << 33)) >> 34), second = (int32_t)round_shift(q, 2);
+    int32_t first = (int32_t)((((uint64_t)p * (uint64_t)x) + ((uint64_t)1 << 33)) >> 34),
+            second = (int32_t)round_shift(q, 2);
     *sine = steep ? second : first;
     *cosine = steep ? first : second;
     if (back)

@@ -1,7 +1,8 @@
 /* The lens before the sensor: theta and phi to the plane. */
 #include "fixed.h"
 
-/* The cubic between two knots (slopes and rises below 2^28), t in Q31 (beyond 1: its tangent there goes on); *slope (may be NULL) by position. */
+/* The cubic between two knots (slopes and rises below 2^28), t in Q31 (beyond 1: its tangent there goes on); *slope
+ * (may be NULL) by position. */
 static int64_t between(const knot *low, const knot *high, int64_t t, int64_t *slope)
 {
     if (t > ONE_Q31) {
@@ -51,8 +52,8 @@ plane_point pf_fixed_lens(const pf_camera_fixed *fixed, uint64_t theta_q32, int3
         int n = part.harmonic, m = n < 0 ? -n : n;
         int64_t a = cosine[m], b = n < 0 ? -sine[m] : sine[m];
         int64_t re = part.imaginary ? -b : a, im = part.imaginary ? a : b; /* of the part times e^(i n phi) */
-        w.x += round_shift(value * re, 30);
-        w.y += round_shift(value * im, 30);
+        w.x += value * re; /* the sum of all moduli fits the plane: no overflow before the one rounding */
+        w.y += value * im;
         if (slopes) {
             /* Near the axis H_n / theta is the slope: what has none there is quadratic and small. */
             int64_t over = position < (1u << 25) ? slope : (value * ONE_Q31) / (int64_t)position;
@@ -62,5 +63,7 @@ plane_point pf_fixed_lens(const pf_camera_fixed *fixed, uint64_t theta_q32, int3
             w.phi_y += round_shift(n * over * re, 30);
         }
     }
+    w.x = round_shift(w.x, 30);
+    w.y = round_shift(w.y, 30);
     return w;
 }

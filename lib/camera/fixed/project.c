@@ -75,12 +75,11 @@ static bool solve_pupil(const pf_camera_fixed *fixed, const direction *d, uint32
 {
     int64_t low = 0, high = (int64_t)(fixed->theta_max + THETA_SLACK_Q32);
     int64_t below = -(int64_t)pf_fixed_angle(rho, d->z * 65536);
-    int64_t above =
-        high - (int64_t)pf_fixed_angle(rho, seen_from_pupil(fixed, d, point_bits, (uint64_t)high));
+    int64_t above = high - (int64_t)pf_fixed_angle(rho, seen_from_pupil(fixed, d, point_bits, (uint64_t)high));
     if (above < 0)
         return false;
     for (int i = 0; i < 64 && high - low > 1 && below < 0; i++) {
-        int64_t span = high - low, share = (-below * ONE_Q30 / 2) / (above - below); /* Q29, 0..1 */
+        int64_t span = high - low, share = -below * (ONE_Q30 / 2) / (above - below); /* Q29, 0..1 */
         int64_t at = low + (span * share >> 29);
         at = i % 4 == 3 ? low + span / 2 : at <= low ? low + 1 : at >= high ? high - 1 : at;
         int64_t rest = at - (int64_t)pf_fixed_angle(rho, seen_from_pupil(fixed, d, point_bits, (uint64_t)at));
@@ -133,5 +132,6 @@ bool pf_camera_fixed_in_image(const pf_camera_fixed *fixed, pf_point_q16 pixel)
     if (fixed->circle_radius2 == 0)
         return true;
     uint64_t du = magnitude(pixel.x - fixed->circle[0]), dv = magnitude(pixel.y - fixed->circle[1]);
-    return du <= UINT32_MAX / 2 + 1u && dv <= UINT32_MAX / 2 + 1u && du * du + dv * dv <= (uint64_t)fixed->circle_radius2;
+    return du <= UINT32_MAX / 2 + 1u && dv <= UINT32_MAX / 2 + 1u &&
+           du * du + dv * dv <= (uint64_t)fixed->circle_radius2;
 }

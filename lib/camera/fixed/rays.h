@@ -11,8 +11,8 @@
 #define MARKS   RIM /* the lowest: below it there is none */
 
 /* One cell, one cache line. With (s, t) the way from its centre in half steps, Q15, a coordinate of the ray is
- * origin + (sum of factors times s, t, s^2, s t, t^2, 0) >> shift, in Q30; the squares are in Q14. Next to the shift are
- * the marks above; no mark: the whole cell is in the image. */
+ * origin + (sum of factors times s, t, s^2, s t, t^2, 0) >> shift, in Q30; the squares are in Q14. Next to the shift
+ * are the marks above; no mark: the whole cell is in the image. */
 typedef struct ray_cell {
     int32_t origin[3], shift;
     int16_t factor[3][4][2]; /* (s, t), (s^2, s t), (t^2, 0): for each coordinate */

@@ -3,14 +3,6 @@
 
 #define CELL_ERROR_Q30 8590 /* 8e-6 */
 
-uint32_t pf_camera_rays_step(const pf_camera_fixed *fixed)
-{
-    uint32_t step = 64;
-    while (step > 4 && fixed->focal_px < step * 18)
-        step /= 2;
-    return step;
-}
-
 static bool lay_out(const pf_camera_fixed *fixed, uint32_t step, pf_camera_rays *rays)
 {
     if (step < 4 || step > 64 || (step & (step - 1)) != 0)
@@ -51,7 +43,7 @@ static int32_t coordinate(const pf_ray_q30 *ray, int i)
 static void fit(int32_t v[3][3], int64_t a[6])
 {
     const int64_t third = 357913941, root_third = 619925131; /* 1/3, 1/sqrt 3, Q30 */
-    int64_t mean[3], bend_t[3], slope_t[3]; /* along t, for each s */
+    int64_t mean[3], bend_t[3], slope_t[3];                  /* along t, for each s */
     for (int i = 0; i < 3; i++) {
         mean[i] = round_shift(((int64_t)v[i][0] + v[i][1] + v[i][2]) * third, 30);
         slope_t[i] = round_shift(((int64_t)v[i][2] - v[i][0]) * root_third, 30);
@@ -67,8 +59,8 @@ static void fit(int32_t v[3][3], int64_t a[6])
     a[5] = 2 * bend;
 }
 
-/* Packs the three quadratics with the finest common shift at which the sums stay within 31 bits; false if there is none.
- * A factor is in Q30 times 2^(shift - 15), of a square 2^(shift - 14). */
+/* Packs the three quadratics with the finest common shift at which the sums stay within 31 bits; false if there is
+ * none. A factor is in Q30 times 2^(shift - 15), of a square 2^(shift - 14). */
 static bool pack(int64_t a[3][6], ray_cell *cell)
 {
     for (int32_t shift = 15; shift >= 0; shift--) {
@@ -130,18 +122,44 @@ static bool sample_cell(const pf_camera_fixed *fixed, const square *q, int32_t v
     return true;
 }
 
-static ray_cell make_cell(const pf_camera_fixed *fixed, const square *q)
+/* The quadratics of a cell from the rays at its nodes; false where they are not good enough. */
+static bool fit_cell(const pf_camera_fixed *fixed, const square *q, int32_t v[3][3][3], ray_cell *cell)
 {
-    ray_cell cell = {{0, 0, 0}, EXACT, {{{0, 0}}}}, fitted = cell;
-    int32_t v[3][3][3];
     int64_t a[3][6];
-    if (!sample_cell(fixed, q, v))
-        return cell;
     for (int k = 0; k < 3; k++)
         fit(v[k], a[k]);
-    if (pack(a, &fitted) && cell_error(fixed, q, &fitted) <= (int64_t)CELL_ERROR_Q30 * CELL_ERROR_Q30)
-        return fitted;
-    return cell;
+    return pack(a, cell) && cell_error(fixed, q, cell) <= (int64_t)CELL_ERROR_Q30 * CELL_ERROR_Q30;
+}
+
+static ray_cell make_cell(const pf_camera_fixed *fixed, const square *q)
+{
+    const ray_cell exact = {{0, 0, 0}, EXACT, {{{0, 0}}}};
+    ray_cell cell = exact;
+    int32_t v[3][3][3];
+    return sample_cell(fixed, q, v) && fit_cell(fixed, q, v, &cell) ? cell : exact;
+}
+
+uint32_t pf_camera_rays_step(const pf_camera_fixed *fixed)
+{
+    enum { TRIALS = 12, SHARE = 16 };
+    bool any = false;
+    for (uint32_t step = 64; step > 4; step /= 2) {
+        uint32_t tried = 0, failed = 0;
+        for (uint32_t i = 0; i < TRIALS * TRIALS; i++) {
+            square q = {(int64_t)fixed->width * 65536 * (2 * (i % TRIALS) + 1) / (2 * TRIALS),
+                        (int64_t)fixed->height * 65536 * (2 * (i / TRIALS) + 1) / (2 * TRIALS), (int64_t)step * 32768};
+            int32_t v[3][3][3];
+            ray_cell cell;
+            if (sample_cell(fixed, &q, v)) {
+                tried++;
+                failed += !fit_cell(fixed, &q, v, &cell);
+            }
+        }
+        any = any || tried > 0;
+        if (tried > 0 && failed * SHARE <= tried)
+            return step;
+    }
+    return any ? 4 : 64;
 }
 
 static int64_t clamped(int64_t v, int64_t low, int64_t high)

@@ -1,5 +1,5 @@
-/* Look-up of rays on x86: SSE2 alone, which every x86-64 has. pmaddwd, the sum of two products in a lane, three times is
- * a whole cell. The same bits as rays.c. */
+/* Look-up of rays on x86: SSE2 alone, which every x86-64 has. pmaddwd, the sum of two products in a lane, three times
+ * is a whole cell. The same bits as rays.c. */
 #include "rays.h"
 
 #if defined(__SSE2__)
@@ -23,7 +23,8 @@ static inline void put(pf_ray_q30 *out, __m128i v)
 void pf_fixed_lookup_four(const pf_camera_rays *rays, const pf_point_q16 *pixels, pf_ray_q30 *out)
 {
     const __m128i edge = _mm_set1_epi32(32768), sign = _mm_set1_epi32(INT32_MIN);
-    const __m128i to_cell = _mm_cvtsi32_si128((int)rays->step_bits + 16), to_way = _mm_cvtsi32_si128((int)rays->step_bits);
+    const __m128i to_cell = _mm_cvtsi32_si128((int)rays->step_bits + 16),
+                  to_way = _mm_cvtsi32_si128((int)rays->step_bits);
     const int columns = (int)rays->columns;
     const __m128i a = _mm_add_epi32(_mm_loadu_si128((const __m128i *)(const void *)pixels), edge);
     const __m128i b = _mm_add_epi32(_mm_loadu_si128((const __m128i *)(const void *)(pixels + 2)), edge);
@@ -52,8 +53,8 @@ void pf_fixed_lookup_four(const pf_camera_rays *rays, const pf_point_q16 *pixels
     /* Rim cells one by one. */
     const bool whole = (c0->shift | c1->shift | c2->shift | c3->shift) < MARKS;
 #define TAKE(lane, cell)                                                                                               \
-    if (whole || (cell)->shift < MARKS ||                                                                            \
-        ((cell)->shift < EXACT && pf_camera_fixed_in_image(rays->fixed, pixels[lane])))                        \
+    if (whole || (cell)->shift < MARKS ||                                                                              \
+        ((cell)->shift < EXACT && pf_camera_fixed_in_image(rays->fixed, pixels[lane])))                                \
         put(out + (lane), cell_sum(cell, _mm_shuffle_epi32(first, (lane)*0x55),                                        \
                                    _mm_shuffle_epi32(second, (lane)*0x55), _mm_shuffle_epi32(third, (lane)*0x55)));    \
     else if ((cell)->shift & OUTSIDE)                                                                                  \

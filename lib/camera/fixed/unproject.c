@@ -96,7 +96,8 @@ static bool newton_step(const pf_camera_fixed *fixed, const guess *g, const plan
     int64_t det = ax * by - ay * bx;
     if (det <= 0)
         return false;
-    int64_t along = (ex * by - ey * bx) * ((int64_t)1 << 20) / det, turn = (ax * ey - ay * ex) * ((int64_t)1 << 20) / det;
+    int64_t along = (ex * by - ey * bx) * ((int64_t)1 << 20) / det,
+            turn = (ax * ey - ay * ex) * ((int64_t)1 << 20) / det;
     if (magnitude(along) >= (uint64_t)1 << 31 || magnitude(turn) >= (uint64_t)1 << 31)
         return false;
     /* Positions to Q30 radians: theta_q30 = position * step 2^(31 - step_shift - 2). */
@@ -156,14 +157,13 @@ static bool to_plane(const pf_camera_fixed *fixed, pf_point_q16 pixel, int64_t p
     if (magnitude(at[0]) > (uint64_t)ONE_Q31 || magnitude(at[1]) > (uint64_t)ONE_Q31)
         return false;
     for (int i = 0; i < 2; i++)
-        plane[i] = round_shift(fixed->from_pixel[i].a * at[0] + fixed->from_pixel[i].b * at[1],
-                               fixed->from_pixel[i].shift);
+        plane[i] =
+            round_shift(fixed->from_pixel[i].a * at[0] + fixed->from_pixel[i].b * at[1], fixed->from_pixel[i].shift);
     if (magnitude(plane[0]) > (uint64_t)ONE_Q31 || magnitude(plane[1]) > (uint64_t)ONE_Q31)
         return false;
     if (fixed->tilt[0] | fixed->tilt[1]) {
         /* (X, Y) = (x_d, y_d) d and d = 1 + tilt . (X, Y), so 1 / d = 1 - tilt . (x_d, y_d). */
-        int64_t inverse =
-            ONE_Q30 - round_shift(fixed->tilt[0] * plane[0] + fixed->tilt[1] * plane[1], fixed->plane_q);
+        int64_t inverse = ONE_Q30 - round_shift(fixed->tilt[0] * plane[0] + fixed->tilt[1] * plane[1], fixed->plane_q);
         if (inverse <= 0)
             return false;
         plane[0] = plane[0] * ONE_Q30 / inverse;
@@ -212,7 +212,7 @@ pf_status pf_camera_fixed_unproject(const pf_camera_fixed *fixed, pf_point_q16 p
     ray->y = (int32_t)round_shift((int64_t)sine * across.s, 30);
     ray->z = cosine;
     if (origin_z_q27) {
-        uint64_t square = ((theta >> 2) * (theta >> 2)) >> 31;             /* Q29 */
+        uint64_t square = ((theta >> 2) * (theta >> 2)) >> 31;                       /* Q29 */
         *origin_z_q27 = (int32_t)round_shift(fixed->pupil_e1 * (int64_t)square, 32); /* Q59 to Q27 */
     }
     return PF_OK;
