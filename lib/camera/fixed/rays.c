@@ -35,8 +35,7 @@ void pf_camera_rays_lookup(const pf_camera_rays *rays, size_t n, const pf_point_
 {
     size_t i = 0;
 #if defined(__SSE2__)
-    for (; i + 4 <= n; i += 4)
-        pf_fixed_lookup_four(rays, pixels + i, out + i);
+    i = pf_fixed_lookup_fours(rays, n, pixels, out);
 #endif
     for (; i < n; i++)
         out[i] = pf_camera_rays_at(rays, pixels[i]);
