@@ -7,13 +7,14 @@
  * 2049 knots, as many as the lens needs (ordinary ones: 129, 1 KB symmetric, 13 KB with all harmonics).
  *
  * Worst errors, against the model in long double (tests/unit/test_camera_fixed.c asserts them for all radial functions
- * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift):
- *   projection          2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad f (3.2e-5 px at 640 px and
- *                       f = 300, 9e-5 px at most)
- *   back-projection     2e-9 rad + 2.5e-9 r_max / r' (5e-9 with asymmetric terms or tilt), r' the least magnification
- * of theta on the plane; 2e-7 rad where r' >= 0.18. This is for the pixel as it stands; that a pixel is rounded to
- * Q16.16 moves its ray by 1.1e-5 px / (f r') besides table of rays       1e-5 rad, wherever the camera is defined What
- * cannot keep them is refused when the camera is built, never computed wrongly.
+ * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift; docs/camera.md has what is
+ * measured): projection       2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad f: 2.3e-5 px for a
+ * fisheye of f = 300, 9e-5 px at most back-projection  2e-9 rad + 2.5e-9 r_max / r' (5e-9 with asymmetric terms or
+ * tilt), r' the least magnification of theta on the plane; 2e-7 rad where r' >= 0.18. For the pixel as it stands: that
+ * it was rounded to Q16.16 moves its ray by 1.1e-5 px / (f r') besides table of rays    1e-5 rad, wherever the camera
+ * is defined
+ *
+ * What cannot keep them is refused when the camera is built, never computed wrongly.
  */
 #ifndef PIPEFISH_CAMERA_FIXED_H
 #define PIPEFISH_CAMERA_FIXED_H
