@@ -7,12 +7,13 @@
  * 2049 knots, as many as the lens needs (ordinary ones: 129, 1 KB symmetric, 13 KB with all harmonics).
  *
  * Worst errors, against the model in long double (tests/unit/test_camera_fixed.c asserts them for all radial functions
- * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift; docs/camera.md has what is
- * measured): projection       2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad f: 2.3e-5 px for a
- * fisheye of f = 300, 9e-5 px at most back-projection  2e-9 rad + 2.5e-9 r_max / r' (5e-9 with asymmetric terms or
- * tilt), r' the least magnification of theta on the plane; 2e-7 rad where r' >= 0.18. For the pixel as it stands: that
- * it was rounded to Q16.16 moves its ray by 1.1e-5 px / (f r') besides table of rays    1e-5 rad, wherever the camera
- * is defined
+ * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift; docs/camera.md has the figures):
+ *   projection       2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad f: 2.3e-5 px for a fisheye of
+ *                    f = 300, 9e-5 px at most
+ *   back-projection  2e-9 rad + 2.5e-9 r_max / r' (5e-9 with asymmetric terms or tilt), r' the least magnification
+ *                    of theta on the plane; 2e-7 rad where r' >= 0.18. For the pixel as it stands: that it was
+ *                    rounded to Q16.16 moves its ray by 1.1e-5 px / (f r') besides
+ *   table of rays    1e-5 rad, wherever the camera is defined
  *
  * What cannot keep them is refused when the camera is built, never computed wrongly.
  */
@@ -33,15 +34,15 @@ typedef struct pf_camera_fixed pf_camera_fixed;
  * lenses, 214 KB at most. */
 size_t pf_camera_fixed_workspace_size(const pf_camera *camera);
 
-/* Builds the tables: some 300 evaluations of r(theta). `camera` is not kept. Returns PF_OK and *fixed (inside
+/* Builds the tables: some 500 evaluations of r(theta). `camera` is not kept. Returns PF_OK and *fixed (inside
  * `workspace`), or with *fixed untouched
  *   PF_ERR_SPACE        size < pf_camera_fixed_workspace_size
  *   PF_ERR_UNSUPPORTED  some projection lies farther than 32768 px from the principal point (or the image circle's
- *                       radius is more); 1024 intervals do not reach 1e-5 px (r nearly singular); the tilted sensor
+ *                       radius is more); 2048 intervals do not reach 1e-5 px (r nearly singular); the tilted sensor
  *                       magnifies by more than 8 */
 pf_status pf_camera_fixed_init(const pf_camera_fixed **fixed, const pf_camera *camera, void *workspace, size_t size);
 
-/* Projects a ray: any length but 0; precise from 2^-2 up.
+/* Projects a ray of any length but 0.
  * Returns PF_OK, or with *pixel untouched PF_ERR_DOMAIN: theta > theta_max (by more than 2e-9 rad: what unproject
  * returns at the rim projects again), no direction, or a pixel beyond Q16.16. With a pupil shift this is the image of
  * what lies on the ray of that direction which enters the lens: the inverse of unproject. */
@@ -83,7 +84,7 @@ pf_status pf_camera_rays_init(const pf_camera_rays **rays, const pf_camera_fixed
 
 typedef struct pf_camera_rays_stats {
     uint32_t cells;   /* in all */
-    uint32_t outside; /* nothing in the image, or nothing in the domain */
+    uint32_t outside; /* nothing of them on the sensor and in the image circle */
     uint32_t rim;     /* tabulated, with the image's rim through them */
     uint32_t exact;   /* not tabulated: computed exactly at each look-up */
 } pf_camera_rays_stats;
@@ -95,10 +96,9 @@ pf_ray_q30 pf_camera_rays_at(const pf_camera_rays *rays, pf_point_q16 pixel);
 /* The same for n pixels, the same bits, with vectors where the target has them. */
 void pf_camera_rays_lookup(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out);
 
-/* --- Remap tables
- * ----------------------------------------------------------------------------------------------------- For each pixel
- * of a view, where in the source image it comes from: the pixel to the upper left and the way to the next in 1/256. 6
- * bytes a pixel. */
+/* --- Remap tables ---------------------------------------------------------------------------------------------------
+ * For each pixel of a view, where in the source image it comes from: the pixel to the upper left and the way to the
+ * next in 1/256. 6 bytes a pixel. */
 typedef struct pf_remap_q8 {
     int16_t x, y; /* x = PF_REMAP_OUTSIDE: nothing there */
     uint8_t x_q8, y_q8;
