@@ -31,3 +31,17 @@ function(pipefish_vectors name)
     endif()
   endif()
 endfunction()
+
+# pipefish_bare_metal(TARGET): the program gets the board's start-up code and memory map.
+if(CMAKE_SYSTEM_NAME STREQUAL "Generic")
+  set(PIPEFISH_BARE_METAL ON)
+  set(PIPEFISH_BOARD ${CMAKE_CURRENT_SOURCE_DIR}/tests/unit/cortex_m)
+  add_library(cortex_m_start OBJECT EXCLUDE_FROM_ALL ${PIPEFISH_BOARD}/start.c)
+  target_link_libraries(cortex_m_start PRIVATE pipefish_flags)
+  function(pipefish_bare_metal target)
+    target_sources(${target} PRIVATE $<TARGET_OBJECTS:cortex_m_start>)
+    target_link_options(${target} PRIVATE --specs=rdimon.specs -nostartfiles -T ${PIPEFISH_BOARD}/board.ld
+      -Wl,--gc-sections)
+    set_target_properties(${target} PROPERTIES LINK_DEPENDS ${PIPEFISH_BOARD}/board.ld)
+  endfunction()
+endif()

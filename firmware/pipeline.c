@@ -22,7 +22,9 @@ struct pf_pipeline {
     _Atomic bool is_done;
     pf_tracker *tracker;
     void *workspace;
-    pf_ray_q30 *rays; /* of the whole table: live and just lost tracks */
+    void *camera_workspace, *bearing_workspace;
+    const pf_camera_rays *bearings; /* NULL = no profile */
+    pf_ray_q30 *rays;               /* of the whole table: live and just lost tracks */
     pf_keyframe_config choice;
     pf_keyframe_state choice_state;
     pf_jpeg *jpeg;
@@ -103,6 +105,32 @@ static bool open_tracker(pf_pipeline *p, char *error, size_t n)
         return false;
     }
     return true;
+}
+
+/* The camera's table of rays, for bearings. */
+static bool open_bearings(pf_pipeline *p, char *error, size_t n)
+{
+    const pf_daemon *d = p->daemon;
+    const pf_camera_fixed *fixed;
+    if (!d->has_profile)
+        return true;
+    size_t size = pf_camera_fixed_workspace_size(&d->profile.camera);
+    if (size == 0) {
+        (void)snprintf(error, n, "%s: a lens beyond the range of fixed point", d->config.camera.profile);
+        return false;
+    }
+    p->camera_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+    if (p->camera_workspace != NULL &&
+        pf_camera_fixed_init(&fixed, &d->profile.camera, p->camera_workspace, size) == PF_OK) {
+        uint32_t step = pf_camera_rays_step(fixed);
+        size = pf_camera_rays_workspace_size(fixed, step);
+        p->bearing_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+        if (p->bearing_workspace != NULL &&
+            pf_camera_rays_init(&p->bearings, fixed, step, p->bearing_workspace, size) == PF_OK)
+            return true;
+    }
+    (void)snprintf(error, n, "no memory for the camera's tables");
+    return false;
 }
 
 static void open_choice(pf_pipeline *p)
@@ -215,6 +243,8 @@ static void release(pf_pipeline *p)
 {
     pf_jpeg_close(p->jpeg);
     free(p->rays);
+    free(p->bearing_workspace);
+    free(p->camera_workspace);
     free(p->workspace);
     free(p);
 }
@@ -235,7 +265,7 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) ||
+    if (!open_tracker(p, error, n) || !open_bearings(p, error, n) || !open_jpeg(p, error, n) ||
         (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
         release(p);
         return false;
@@ -417,8 +447,8 @@ static void take_frame(pf_pipeline *p, const pf_frame *frame)
     p->previous = *frame;
     p->has_previous = true;
     tracks = pf_tracker_tracks(p->tracker, &n);
-    if (d->has_profile)
-        pf_track_bearings(&d->profile.camera, tracks, n, p->rays);
+    if (p->bearings != NULL)
+        pf_track_bearings(p->bearings, tracks, n, p->rays);
     cause = pf_keyframe_decide(&p->choice_state, &p->choice, tracks, p->rays, n,
                                telemetry.has_encoder ? &telemetry.encoder_count : NULL, &common);
     chosen = end = pf_now();

@@ -43,7 +43,7 @@ def bench_sim() -> list[dict]:
 
 
 def bench_camera() -> list[dict]:
-    """camera.project, camera.unproject against every peer that is installed."""
+    """camera.project, camera.unproject, camera.lut against every peer that is installed."""
     library = PROGRAMS / "libbench_camera_core.so"
     script = ROOT / "tests" / "bench" / "camera_peers.py"
     return [figure for python in PEERS.values() if python.exists() for figure in run_program(python, script, library)]

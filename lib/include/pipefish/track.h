@@ -1,12 +1,10 @@
 /* The feature tracker: corners spread over the image, pyramidal KLT with forward-backward check, a table of tracks with
- * stable ids, bearings, keyframe choice. The tracker itself is integers only: the same bits on all targets. Bearings
- * are doubles rounded to Q1.30, so a keyframe chosen by parallax may differ where libm does; one chosen by encoder does
- * not.
+ * stable ids, bearings, keyframe choice. Tracker and bearings are integers only: the same bits on all targets.
  */
 #ifndef PIPEFISH_TRACK_H
 #define PIPEFISH_TRACK_H
 
-#include "pipefish/camera.h"
+#include "pipefish/camera_fixed.h"
 #include "pipefish/image.h"
 
 #ifdef __cplusplus
@@ -35,10 +33,6 @@ typedef enum pf_track_reason {
     PF_TRACK_DRIFT = 7,    /* no longer looks like its template (first sight, renewed as its shape changes), or lies
                             * elsewhere than the template says */
 } pf_track_reason;
-
-typedef struct pf_point_q16 {
-    int32_t x, y; /* Q16.16 pixels */
-} pf_point_q16;
 
 typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
@@ -112,12 +106,9 @@ const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 /* Forgets all tracks (a break in the video). Ids go on; none is reused. */
 void pf_tracker_reset(pf_tracker *tracker);
 
-/* Bearings: unit rays of track positions in Q1.30, camera frame. Items outside the camera's domain get (0, 0, 0).
- * Rounded from double (camera/real); the table version of camera/fixed replaces it on targets without libm. */
-typedef struct pf_ray_q30 {
-    int32_t x, y, z;
-} pf_ray_q30;
-void pf_track_bearings(const pf_camera *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+/* Bearings: unit rays of track positions, from the table of rays. Items outside the image or the camera's domain get
+ * (0, 0, 0). Integers only. */
+void pf_track_bearings(const pf_camera_rays *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
 
 /* --- Keyframe choice (RECONSTRUCTION section 6) --------------------------------------------------------------------
  * A frame becomes a keyframe when the encoder has moved `step_counts` since the last one; without an encoder, when the
