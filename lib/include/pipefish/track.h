@@ -1,7 +1,5 @@
 /* The feature tracker: corners spread over the image, pyramidal KLT with forward-backward check, a table of tracks with
- * stable ids, bearings, keyframe choice. The tracker itself is integers only: the same bits on all targets. Bearings
- * are doubles rounded to Q1.30, so a keyframe chosen by parallax may differ where libm does; one chosen by encoder does
- * not.
+ * stable ids, prediction, masks, states of the scene, keyframe choice. Integers only: the same bits on all targets.
  */
 #ifndef PIPEFISH_TRACK_H
 #define PIPEFISH_TRACK_H
@@ -146,7 +144,8 @@ typedef struct pf_keyframe_state { /* private; zero-initialise */
     int64_t encoder;
     uint64_t id[PF_TRACKS_MAX];
     pf_ray_q30 ray[PF_TRACKS_MAX];
-    uint32_t chord[PF_TRACKS_MAX]; /* scratch: squared chords for the median */
+    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX]; /* scratch: common bearings */
+    uint32_t chord[PF_TRACKS_MAX];                     /* scratch: squared chords for the median */
 } pf_keyframe_state;
 
 /* Decides for the current frame and, when it becomes a keyframe, makes it the new reference.
