@@ -3,12 +3,13 @@
  * bits are enough there; the torque keeps all 30. */
 #include "track_private.h"
 
-#define STEPS      8
-#define ONE        1073741824         /* Q30 */
-#define ROBUST_C2  2684355            /* Q30 squared chord (0.05 rad) at which a pair's weight has halved */
-#define STEP_MAX   (ONE / 2)          /* rad; the linear model of a larger one says nothing */
-#define WELL_POSED ((int64_t)1 << 40) /* Q60 determinant of the matrix with trace 1: 1e-6; a cone of 2 degrees has it  \
-                                       */
+#define STEPS     8
+#define ONE       1073741824 /* Q30 */
+#define ROBUST_C2 2684355    /* Q30 squared chord (0.05 rad) at which a pair's weight has halved */
+#define STEP_MAX  (ONE / 2)  /* rad; the linear model of a larger one says nothing */
+#define WELL_POSED                                                                                                     \
+    ((int64_t)1 << 40) /* Q60 determinant of the matrix with trace 1: 1e-6; a cone of 2 degrees has it                 \
+                        */
 
 void pf_ray_rotate(const int32_t r[9], const pf_ray_q30 *v, pf_ray_q30 *out)
 {

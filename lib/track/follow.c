@@ -1,0 +1,318 @@
+/* Live tracks in a new frame: where to look, what to believe. */
+#include "tracker_private.h"
+
+/* A template is renewed when its warp has moved this far from identity: the affine model then leaves, at the edge of a
+ * 21-pixel window, second-order terms of a few tenths of a pixel on a pipe's wall. */
+#define RENEW        (65536 / 5)
+#define PULL_MAX     (3 << 15) /* the template may move a track by 1.5 px from where the previous frame put it */
+#define DRIFT_SLACK  3277      /* the template may look 0.1 less similar than the previous patch */
+#define CERTAIN      (2 << 16) /* a result this near its guess is checked backwards from half resolution on */
+#define GUESS_MARGIN (64 << 16)
+#define GUESS_MOST   (4096 << 16)
+#define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
+#define STARTS       3
+#define COARSE       2u /* level at which starts are compared: a pixel of it is 4 px */
+#define COARSE_HALF  5
+#define MARGIN       1638                           /* 0.05 of similarity */
+#define FLOW_LEAST   5u                             /* tracks in a cell before its median is believed */
+#define FLOW_STIRS   ((int64_t)(4 << 8) * (4 << 8)) /* surroundings that have moved 4 px, squared, Q8 */
+#define STILL_PART   4 /* a track that has made less than a quarter (half, across) of that way stands still */
+#define SATURATED    4 /* at most this fraction of a window may be saturated */
+#define NEIGHBOURS   3
+
+static int32_t median3(int32_t a, int32_t b, int32_t c)
+{
+    const int32_t low = a < b ? a : b, high = a < b ? b : a;
+    return c < low ? low : c > high ? high : c;
+}
+
+/* Median displacement of the nearest tracks already found in this frame; false with fewer than three. */
+static bool neighbours_move(const pf_tracker *t, pf_point_q16 at, pf_point_q16 *move)
+{
+    int64_t distance[NEIGHBOURS];
+    pf_point_q16 near[NEIGHBOURS];
+    uint32_t n = 0;
+    for (uint32_t i = 0; i < t->n; i++) {
+        if (t->table[i].status != PF_TRACK_TRACKED)
+            continue;
+        const pf_point_q16 m = t->slots[t->slot_of[i]].move, p = t->table[i].pos;
+        const int64_t dx = (int64_t)p.x - m.x - at.x, dy = (int64_t)p.y - m.y - at.y, d = dx * dx + dy * dy;
+        uint32_t k = n < NEIGHBOURS ? n++ : NEIGHBOURS;
+        if (k == NEIGHBOURS && d >= distance[NEIGHBOURS - 1])
+            continue;
+        for (k = k == NEIGHBOURS ? NEIGHBOURS - 1 : k; k > 0 && distance[k - 1] > d; k--) {
+            distance[k] = distance[k - 1];
+            near[k] = near[k - 1];
+        }
+        distance[k] = d;
+        near[k] = m;
+    }
+    if (n < NEIGHBOURS)
+        return false;
+    *move = (pf_point_q16){median3(near[0].x, near[1].x, near[2].x), median3(near[0].y, near[1].y, near[2].y)};
+    return true;
+}
+
+static bool farther(pf_point_q16 a, pf_point_q16 b, int64_t reach)
+{
+    const int64_t dx = (int64_t)a.x - b.x, dy = (int64_t)a.y - b.y;
+    return dx * dx + dy * dy > reach * reach;
+}
+
+static int32_t clamp_guess(int64_t v, uint32_t size)
+{
+    const int64_t most = ((int64_t)size << 16) + GUESS_MARGIN;
+    return (int32_t)(v < -GUESS_MARGIN ? -GUESS_MARGIN : v > most ? most : v);
+}
+
+/* --- where to look ----------------------------------------------------------------------------------------------- */
+
+/* How alike the surroundings of `from` in the last frame and of `to` in this one are at a coarse level, Q0.15; -32768
+ * where they are not in the picture. Whole pixels: at that level a few pixels of the frame. */
+static int32_t coarse_likeness(const pf_tracker *t, pf_point_q16 from, pf_point_q16 to)
+{
+    const uint32_t level = t->config.levels > COARSE ? COARSE : t->config.levels - 1u;
+    const pf_image *a = &t->pyramid[1u - t->now].level[level], *b = &t->pyramid[t->now].level[level];
+    const int32_t half_pixel = 1 << (15 + level), shift = 16 + (int32_t)level;
+    const int32_t ax = ((from.x + half_pixel) >> shift) - COARSE_HALF,
+                  ay = ((from.y + half_pixel) >> shift) - COARSE_HALF;
+    const int32_t bx = ax + ((to.x - from.x + half_pixel) >> shift), by = ay + ((to.y - from.y + half_pixel) >> shift);
+    const int32_t side = 2 * COARSE_HALF + 1, w = (int32_t)a->width - side, h = (int32_t)a->height - side;
+    int64_t sa = 0, sb = 0, saa = 0, sbb = 0, sab = 0;
+    if (ax < 0 || ay < 0 || bx < 0 || by < 0 || ax > w || ay > h || bx > w || by > h)
+        return -32768;
+    for (int32_t y = 0; y < side; y++) {
+        const uint8_t *p = a->data + (size_t)(ay + y) * a->stride + (size_t)ax;
+        const uint8_t *q = b->data + (size_t)(by + y) * b->stride + (size_t)bx;
+        int32_t ra = 0, rb = 0, raa = 0, rbb = 0, rab = 0;
+        for (int32_t x = 0; x < side; x++) {
+            ra += p[x];
+            rb += q[x];
+            raa += p[x] * p[x];
+            rbb += q[x] * q[x];
+            rab += p[x] * q[x];
+        }
+        sa += ra, sb += rb, saa += raa, sbb += rbb, sab += rab;
+    }
+    const int64_t n = side * side;
+    return pf_zncc(32 * (n * sab - sa * sb), 32 * (n * saa - sa * sa), 32 * (n * sbb - sb * sb));
+}
+
+/* The starts for a track, best first: its own last move (its neighbours' if it is new), what the caller expects, and
+ * none at all. A start must look better by a margin to go before one earlier in this list. Returns how many. */
+static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf_slot *slot, pf_point_q16 start[STARTS])
+{
+    const pf_point_q16 at = track->pos, none = {0, 0};
+    pf_point_q16 move = slot->move, given = {0, 0};
+    uint32_t n = 0;
+    if (track->age == 0 && slot->expected.x == PF_NO_GUESS)
+        (void)neighbours_move(t, at, &move);
+    start[n++] = move;
+    if (slot->expected.x != PF_NO_GUESS) {
+        given = (pf_point_q16){pf_clamp_i64((int64_t)slot->expected.x - at.x, GUESS_MOST),
+                               pf_clamp_i64((int64_t)slot->expected.y - at.y, GUESS_MOST)};
+        if (farther(given, move, SAME_START))
+            start[n++] = given;
+    }
+    if (farther(none, start[0], SAME_START) && (n < 2u || farther(none, start[1], SAME_START)))
+        start[n++] = none;
+    if (n == 1u)
+        return n;
+    int32_t like[STARTS];
+    for (uint32_t i = 0; i < n; i++) {
+        const pf_point_q16 to = {clamp_guess((int64_t)at.x + start[i].x, t->config.width),
+                                 clamp_guess((int64_t)at.y + start[i].y, t->config.height)};
+        like[i] = coarse_likeness(t, at, to) - (int32_t)i * MARGIN;
+    }
+    for (uint32_t i = 1; i < n; i++)
+        for (uint32_t k = i; k > 0 && like[k] > like[k - 1u]; k--) {
+            const int32_t l = like[k];
+            const pf_point_q16 s = start[k];
+            like[k] = like[k - 1u];
+            like[k - 1u] = l;
+            start[k] = start[k - 1u];
+            start[k - 1u] = s;
+        }
+    return n;
+}
+
+/* One attempt at one track from one guess; on success `track` and its slot are up to date. */
+static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move)
+{
+    const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
+    const uint32_t top = t->config.levels - 1u;
+    const pf_point_q16 old = track->pos;
+    const pf_point_q16 guess = {clamp_guess((int64_t)old.x + move.x, t->config.width),
+                                clamp_guess((int64_t)old.y + move.y, t->config.height)};
+    pf_point_q16 at = guess;
+    pf_fit fit = pf_klt_track(&t->klt, from, to, old, &at, top);
+    if (fit.reason != PF_TRACK_OK)
+        return fit.reason;
+    if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
+        return PF_TRACK_RESIDUAL;
+    const uint32_t back_top = farther(at, guess, CERTAIN) || top == 0 ? top : 1u;
+    pf_point_q16 back = {old.x + at.x - guess.x, old.y + at.y - guess.y};
+    if (pf_klt_track(&t->klt, to, from, at, &back, back_top).reason != PF_TRACK_OK ||
+        farther(back, old, t->config.fb_q16))
+        return PF_TRACK_BACKWARD;
+    pf_slot *s = &t->slots[slot];
+    const pf_anchor saved = s->anchor;
+    uint8_t *pixels = t->pixels + (size_t)slot * t->patch_bytes;
+    pf_point_q16 fine = at;
+    const pf_fit anchored = pf_anchor_fit(&t->klt, &to->level[0], &s->anchor, pixels, &fine);
+    pf_track_reason reason = anchored.reason;
+    if (reason == PF_TRACK_OK &&
+        (anchored.zncc_q15 < (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK || farther(fine, at, PULL_MAX)))
+        reason = PF_TRACK_DRIFT;
+    if (reason == PF_TRACK_OK && !pf_klt_inside(&t->klt, &to->level[0], fine))
+        reason = PF_TRACK_LEFT;
+    if (reason == PF_TRACK_OK && !pf_mask_allows(t, fine))
+        reason = PF_TRACK_MASKED;
+    if (reason == PF_TRACK_OK &&
+        pf_mask_saturated(t, &to->level[0], fine, t->config.window * t->config.window / SATURATED))
+        reason = PF_TRACK_SATURATED;
+    if (reason == PF_TRACK_OK && pf_grid_near(t, fine, (int64_t)t->config.cell << 14))
+        reason = PF_TRACK_CROWDED;
+    if (reason != PF_TRACK_OK) {
+        s->anchor = saved;
+        return reason;
+    }
+    s->move = (pf_point_q16){fine.x - old.x, fine.y - old.y};
+    track->pos = fine;
+    track->quality = (uint16_t)fit.zncc_q15;
+    pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored.gain_q14, track);
+    for (int32_t k = 0; k < 4; k++) {
+        const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
+        if (d > RENEW || d < -RENEW) {
+            pf_anchor_take(&t->klt, &to->level[0], fine, &s->anchor, pixels);
+            break;
+        }
+    }
+    return PF_TRACK_OK;
+}
+
+/* --- what to believe --------------------------------------------------------------------------------------------- */
+
+static uint32_t flow_cell(const pf_tracker *t, pf_point_q16 at)
+{
+    return (uint32_t)(at.y >> 16) * FLOW_H / t->config.height * FLOW_W +
+           (uint32_t)(at.x >> 16) * FLOW_W / t->config.width;
+}
+
+static int32_t median_of(int32_t *v, uint32_t n)
+{
+    for (uint32_t i = 1; i < n; i++) {
+        const int32_t x = v[i];
+        uint32_t k = i;
+        for (; k > 0 && v[k - 1u] > x; k--)
+            v[k] = v[k - 1u];
+        v[k] = x;
+    }
+    return v[n / 2u];
+}
+
+/* The median move of the tracks in each cell. */
+static void measure_flow(pf_tracker *t)
+{
+    pf_flow *f = &t->flow;
+    for (uint32_t c = 0; c < FLOW_W * FLOW_H; c++) {
+        uint32_t n = 0;
+        for (uint32_t i = 0; i < t->n && n < FLOW_CELL_MAX; i++)
+            if (t->table[i].status == PF_TRACK_TRACKED && t->cell_of[i] == c) {
+                f->x[n] = t->slots[t->slot_of[i]].move.x;
+                f->y[n++] = t->slots[t->slot_of[i]].move.y;
+            }
+        f->n[c] = n;
+        if (n > 0)
+            f->move[c] = (pf_point_q16){median_of(f->x, n), median_of(f->y, n)};
+    }
+}
+
+/* Sums with forgetting, over some 8 frames. */
+static int32_t forget_and_add(int32_t sum, int32_t more)
+{
+    return pf_clamp_i64((int64_t)sum - sum / 8 + more, 1 << 24);
+}
+
+/* Whether the track has stood still, or nearly, while its surroundings have moved on. */
+static bool stands_still(pf_slot *s, const pf_flow *f, uint32_t cell)
+{
+    const pf_point_q16 flow = f->move[cell];
+    s->own = (pf_point_q16){forget_and_add(s->own.x, s->move.x), forget_and_add(s->own.y, s->move.y)};
+    s->flow = (pf_point_q16){forget_and_add(s->flow.x, flow.x), forget_and_add(s->flow.y, flow.y)};
+    if (f->n[cell] < FLOW_LEAST)
+        return false;
+    const int64_t ox = s->own.x >> 8, oy = s->own.y >> 8, fx = s->flow.x >> 8, fy = s->flow.y >> 8;
+    const int64_t along = ox * fx + oy * fy, whole = fx * fx + fy * fy;
+    return whole > FLOW_STIRS && STILL_PART * along < whole && STILL_PART * (ox * ox + oy * oy) < whole;
+}
+
+static void lose(pf_tracker *t, uint32_t row, pf_track_reason reason)
+{
+    t->table[row].status = PF_TRACK_LOST;
+    t->table[row].reason = (uint8_t)reason;
+    t->spare[t->spare_n++] = t->slot_of[row];
+    t->stats.lost++;
+    t->stats.lost_by[reason]++;
+}
+
+/* Tracks that stick to something that goes with the camera are lost; what they stick to is masked. */
+static void drop_stuck(pf_tracker *t)
+{
+    for (uint32_t i = 0; i < t->n; i++)
+        if (t->table[i].status == PF_TRACK_TRACKED)
+            t->cell_of[i] = (uint8_t)flow_cell(t, t->table[i].pos);
+    measure_flow(t);
+    for (uint32_t i = 0; i < t->n; i++)
+        if (t->table[i].status == PF_TRACK_TRACKED && stands_still(&t->slots[t->slot_of[i]], &t->flow, t->cell_of[i])) {
+            lose(t, i, PF_TRACK_STATIC);
+            pf_mask_condemn(t, t->table[i].pos);
+            t->stats.tracked--;
+            t->stats.live--;
+        }
+}
+
+/* Whether another start may help: it cannot where the patch itself is the reason. */
+static bool worth_another(pf_track_reason reason)
+{
+    return reason == PF_TRACK_LEFT || reason == PF_TRACK_DIVERGED || reason == PF_TRACK_RESIDUAL ||
+           reason == PF_TRACK_BACKWARD;
+}
+
+static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
+{
+    pf_slot *s = &t->slots[slot];
+    pf_point_q16 start[STARTS], near;
+    const uint32_t n = rank_starts(t, track, s, start);
+    pf_track_reason reason = attempt(t, track, slot, start[0]);
+    s->expected.x = PF_NO_GUESS;
+    for (uint32_t i = 1; i < n && worth_another(reason); i++)
+        reason = attempt(t, track, slot, start[i]);
+    if (!worth_another(reason) || !neighbours_move(t, track->pos, &near))
+        return reason;
+    for (uint32_t i = 0; i < n; i++)
+        if (!farther(near, start[i], SAME_START))
+            return reason;
+    return attempt(t, track, slot, near);
+}
+
+void pf_tracks_follow(pf_tracker *t)
+{
+    for (uint32_t i = 0; i < t->n; i++)
+        t->table[i].status = PF_TRACK_NEW; /* not yet found in this frame */
+    for (uint32_t i = 0; i < t->n; i++) {
+        pf_track *track = &t->table[i];
+        const pf_track_reason reason = follow(t, track, t->slot_of[i]);
+        track->age++;
+        track->reason = (uint8_t)reason;
+        if (reason == PF_TRACK_OK) {
+            track->status = PF_TRACK_TRACKED;
+            pf_grid_insert(t, i);
+            t->stats.tracked++;
+            t->stats.live++;
+        } else {
+            lose(t, i, reason);
+        }
+    }
+    drop_stuck(t);
+}
