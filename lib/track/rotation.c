@@ -26,8 +26,8 @@ uint32_t pf_ray_chord2(const pf_ray_q30 *a, const pf_ray_q30 *b)
     return sum > UINT32_MAX ? UINT32_MAX : (uint32_t)sum;
 }
 
-/* r <- C(w) r with Cayley's map C(w) = (1 - [w/2])^-1 (1 + [w/2]): a rotation without a trigonometric function. */
-static void turn(const int32_t w[3], int32_t r[9])
+/* C(w) = (1 - [w/2])^-1 (1 + [w/2]): a rotation without a trigonometric function. */
+void pf_rotation_turn(const int32_t w[3], int32_t r[9])
 {
     const int64_t x = w[0] / 2, y = w[1] / 2, z = w[2] / 2;
     const int64_t xx = (x * x) >> 30, yy = (y * y) >> 30, zz = (z * z) >> 30;
@@ -107,7 +107,7 @@ uint32_t pf_rotation_fit(const pf_ray_q30 *a, const pf_ray_q30 *b, uint32_t n, i
         }
         if (used < PF_ROTATION_LEAST || !solve(h, g, w))
             break;
-        turn(w, r);
+        pf_rotation_turn(w, r);
     }
     return used;
 }

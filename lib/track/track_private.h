@@ -102,6 +102,9 @@ void pf_ray_rotate(const int32_t r[9], const pf_ray_q30 *v, pf_ray_q30 *out);
 /* Squared chord between two unit rays, Q2.30, at most 3 LSB too low, saturating just below 4. */
 uint32_t pf_ray_chord2(const pf_ray_q30 *a, const pf_ray_q30 *b);
 
+/* r <- C(w) r with Cayley's map of the small rotation w, Q30 rad: for |w| << 1 the rotation by w. */
+void pf_rotation_turn(const int32_t w[3], int32_t r[9]);
+
 /* The rotation (row-major, Q30) that takes the rays a[n] to b[n], n <= 2048, with Cauchy weights of 0.05 rad: what
  * moved with the others counts, near walls that did not count little. From 30 degrees apart and less it converges.
  * Invalid rays (0, 0, 0) are left out. Returns the pairs used; with fewer than PF_ROTATION_LEAST, or where they do not

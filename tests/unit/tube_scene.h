@@ -28,7 +28,8 @@ typedef struct tube_view {
 static const tube_view tube_usual = {0, 0, 1, 0, 1, 2};
 
 static float tube_texture[TUBE_TEXELS][TUBE_TEXELS];
-static float tube_along[TUBE_H][TUBE_W], tube_around[TUBE_H][TUBE_W];
+static float tube_along[TUBE_H][TUBE_W], tube_around[TUBE_H][TUBE_W], tube_fade[TUBE_H][TUBE_W];
+static float tube_noise[1 << 16];
 static uint32_t tube_seed;
 
 static inline double tube_uniform(void)
@@ -72,35 +73,40 @@ static inline void tube_make(void)
         for (int i = 0; i < TUBE_TEXELS * TUBE_TEXELS; i++)
             (&tube_texture[0][0])[i] += (float)(17.3 / sigma) * (&scratch[0][0])[i];
     }
+    for (int i = 0; i < 1 << 16; i++)
+        tube_noise[i] = (float)tube_normal();
     for (int y = 0; y < TUBE_H; y++)
         for (int x = 0; x < TUBE_W; x++) {
             const double dx = x - TUBE_W / 2, dy = y - TUBE_H / 2, theta = hypot(dx, dy) / TUBE_FOCAL;
             tube_around[y][x] = (float)(atan2(dy, dx) * TUBE_RADIUS);
-            tube_along[y][x] = theta < 0.05 ? 1e9f : (float)(TUBE_RADIUS / tan(theta < 1.55 ? theta : 1.55));
+            const double far = theta < 0.05 ? 1e9 : TUBE_RADIUS / tan(theta < 1.55 ? theta : 1.55);
+            tube_along[y][x] = (float)far;
+            tube_fade[y][x] = far < 8 * TUBE_RADIUS && hypot(dx, dy) < TUBE_CIRCLE
+                                  ? (float)(1 / (1 + far * far / (9 * TUBE_RADIUS * TUBE_RADIUS)))
+                                  : 0;
         }
 }
 
 static inline double tube_wall(double along, double around)
 {
-    const double u = along - TUBE_TEXELS * floor(along / TUBE_TEXELS);
-    const double v = around - TUBE_TEXELS * floor(around / TUBE_TEXELS);
+    const double u = along + 1024 * TUBE_TEXELS, v = around + 1024 * TUBE_TEXELS; /* positive */
     const int i = (int)u % TUBE_TEXELS, j = (int)v % TUBE_TEXELS;
     const int i1 = (i + 1) % TUBE_TEXELS, j1 = (j + 1) % TUBE_TEXELS;
-    const double a = u - floor(u), b = v - floor(v);
+    const double a = u - (int)u, b = v - (int)v;
     return (1 - b) * ((1 - a) * tube_texture[j][i] + a * tube_texture[j][i1]) +
            b * ((1 - a) * tube_texture[j1][i] + a * tube_texture[j1][i1]);
 }
 
 static inline void tube_render(uint8_t *out, const tube_view *view)
 {
+    const uint32_t at = (uint32_t)(tube_uniform() * 65536);
     for (int y = 0; y < TUBE_H; y++)
         for (int x = 0; x < TUBE_W; x++) {
-            const double far = tube_along[y][x], fade = 1 / (1 + far * far / (9 * TUBE_RADIUS * TUBE_RADIUS));
             double v = 0;
-            if (far < 8 * TUBE_RADIUS && hypot(x - TUBE_W / 2, y - TUBE_H / 2) < TUBE_CIRCLE)
-                v = fade *
-                    (130 + view->contrast * tube_wall(far + view->z, tube_around[y][x] - view->roll * TUBE_RADIUS));
-            v = view->gain * v + view->bias + view->noise * tube_normal();
+            if (tube_fade[y][x] > 0)
+                v = tube_fade[y][x] * (130 + view->contrast * tube_wall(tube_along[y][x] + view->z,
+                                                                        tube_around[y][x] - view->roll * TUBE_RADIUS));
+            v = view->gain * v + view->bias + view->noise * tube_noise[(at + (uint32_t)(y * TUBE_W + x)) & 0xFFFFu];
             out[y * TUBE_W + x] = (uint8_t)(v < 0 ? 0 : v > 255 ? 255 : lrint(v));
         }
 }
@@ -117,7 +123,7 @@ static inline void tube_move(const double p[2], const tube_view *a, const tube_v
 
 static const pf_tracker_config tube_config = {.width = TUBE_W,
                                               .height = TUBE_H,
-                                              .max_tracks = 120,
+                                              .max_tracks = 80,
                                               .window = 15,
                                               .circle = {(TUBE_W / 2) << 16, (TUBE_H / 2) << 16},
                                               .circle_radius_q16 = (uint32_t)TUBE_CIRCLE << 16};

@@ -148,12 +148,69 @@ const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 /* Forgets all tracks (a break in the video). Ids go on; none is reused. */
 void pf_tracker_reset(pf_tracker *tracker);
 
-/* Bearings: unit rays of track positions in Q1.30, camera frame. Items outside the camera's domain get (0, 0, 0).
- * Rounded from double (camera/real); the table version of camera/fixed replaces it on targets without libm. */
-typedef struct pf_ray_q30 {
+/* --- Lens and bearings ------------------------------------------------------------------------------------------
+ * A radially symmetric lens as a table, in integers: bearings for keyframe choice and prediction. Of a camera with
+ * asymmetric terms it is the mean; what is measured on the host takes the camera itself. */
+typedef struct pf_ray_q30 { /* unit ray, camera frame; (0, 0, 0) = none */
     int32_t x, y, z;
 } pf_ray_q30;
-void pf_track_bearings(const pf_camera *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+
+#define PF_LENS_KNOTS 129u
+
+typedef struct pf_lens {
+    pf_point_q16 centre;
+    int32_t reach_q30;                 /* sin(theta_max / 2) */
+    int32_t skew_q16, aspect_q16;      /* skew / f_u, f_v / f_u */
+    int32_t radius_q16[PF_LENS_KNOTS]; /* px along u at s = sin(theta / 2) = reach i / 128; ascending */
+} pf_lens;
+
+/* Tabulates a checked camera (library pf_lens, needs libm). PF_ERR_DOMAIN: it lies beyond 16384 px. */
+pf_status pf_lens_make(pf_lens *lens, const pf_camera *camera);
+
+/* Projects a ray by the table: within 0.02 px of a camera without asymmetric terms, f <= 400 px/rad. False beyond
+ * theta_max. The signature is pf_ray_project's. */
+bool pf_lens_project(const void *lens, const pf_ray_q30 *ray, pf_point_q16 *at);
+
+/* Rays of the positions of tracks[n], lost ones too; (0, 0, 0) beyond theta_max. Inverse of pf_lens_project to 0.01 px.
+ */
+void pf_lens_bearings(const pf_lens *lens, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+
+/* --- Prediction ---------------------------------------------------------------------------------------------------
+ * Where the tracks will be in the next frame, from the last motion, the encoder and the roll: rotation, then a drive
+ * along a tube, each track with its own distance from the camera's path. For pf_tracker_expect. */
+typedef struct pf_motion_hints { /* with a frame; a reading counts only if its has_ flag is set */
+    bool has_encoder, has_roll;
+    int64_t encoder;
+    int32_t roll_urad; /* about the optical axis, 0 = image y axis down; rises as the picture turns from y to x */
+} pf_motion_hints;
+
+/* Projects a ray of the camera frame; false where it cannot be seen. pf_lens_project is one. */
+typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
+
+#define PF_FALL_UNKNOWN INT32_MIN
+
+typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker_reset */
+    uint32_t n;
+    uint64_t id[PF_TRACKS_MAX];
+    pf_ray_q30 ray[PF_TRACKS_MAX];
+    pf_motion_hints last;
+    bool is_known, has_per_count;
+    int32_t turn[9];                                   /* rotation of the last frame, Q30 */
+    int32_t forward;                                   /* median fall of the cotangents in the last frame, Q16 */
+    int64_t per_count_q30;                             /* the same for each encoder count */
+    int32_t fall[2u * PF_TRACKS_MAX];                  /* of each row of the table */
+    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX]; /* scratch */
+    uint16_t pair[PF_TRACKS_MAX];
+    uint32_t value[PF_TRACKS_MAX];
+} pf_predictor;
+
+/* Learns from a frame just tracked: tracks[n], rays[n] are its table and bearings. */
+void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                        const pf_motion_hints *now);
+
+/* Fills at[n] for pf_tracker_expect, for the same table; `next` comes with the frame that follows. */
+void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_point_q16 *at);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
  * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */
