@@ -89,7 +89,8 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
     const uint16_t slot = t->spare[--t->spare_n];
     const uint32_t row = t->n++;
     pf_slot *s = &t->slots[slot];
-    s->move = s->own = s->flow = (pf_point_q16){0, 0};
+    s->move = s->own = (pf_point_q16){0, 0};
+    s->radial = s->flow = 0;
     s->expected.x = PF_NO_GUESS;
     s->from = (pf_point_q16){corner->x * 65536, corner->y * 65536};
     t->slot_of[row] = slot;

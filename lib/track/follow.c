@@ -13,11 +13,11 @@
 #define STARTS       3
 #define COARSE       2u /* level at which starts are compared: a pixel of it is 4 px */
 #define COARSE_HALF  5
-#define MARGIN       1638                           /* 0.05 of similarity */
-#define FLOW_LEAST   5u                             /* tracks in a cell before its median is believed */
-#define FLOW_STIRS   ((int64_t)(4 << 8) * (4 << 8)) /* surroundings that have moved 4 px, squared, Q8 */
-#define STILL_PART   4 /* a track that has made less than a quarter (half, across) of that way stands still */
-#define SATURATED    4 /* at most this fraction of a window may be saturated */
+#define MARGIN       1638      /* 0.05 of similarity */
+#define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
+#define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
+#define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
+#define SATURATED    4         /* at most this fraction of a window may be saturated */
 #define NEIGHBOURS   3
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
@@ -193,38 +193,35 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
 
 /* --- what to believe --------------------------------------------------------------------------------------------- */
 
-static uint32_t flow_cell(const pf_tracker *t, pf_point_q16 at)
+pf_point_q16 pf_flow_centre(const pf_tracker *t)
 {
-    return (uint32_t)(at.y >> 16) * FLOW_H / t->config.height * FLOW_W +
-           (uint32_t)(at.x >> 16) * FLOW_W / t->config.width;
+    if (t->config.circle_radius_q16)
+        return t->config.circle;
+    return (pf_point_q16){(int32_t)(t->config.width << 15), (int32_t)(t->config.height << 15)};
 }
 
-static int32_t median_of(int32_t *v, uint32_t n)
+/* Length along its radius of a track's last move, outward positive, Q16 px; and the ring that it is in. */
+static int32_t radial_move(const pf_tracker *t, uint32_t row, uint32_t *ring)
 {
-    for (uint32_t i = 1; i < n; i++) {
-        const int32_t x = v[i];
-        uint32_t k = i;
-        for (; k > 0 && v[k - 1u] > x; k--)
-            v[k] = v[k - 1u];
-        v[k] = x;
-    }
-    return v[n / 2u];
+    const pf_point_q16 centre = pf_flow_centre(t), p = t->table[row].pos, move = t->slots[t->slot_of[row]].move;
+    const int64_t x = ((int64_t)p.x - centre.x) >> 8, y = ((int64_t)p.y - centre.y) >> 8;
+    const int64_t r = pf_isqrt64((uint64_t)(x * x + y * y)) + 1u; /* Q8 */
+    const uint32_t side = t->config.width < t->config.height ? t->config.width : t->config.height;
+    const int64_t reach = t->config.circle_radius_q16 ? t->config.circle_radius_q16 >> 8 : (int64_t)side << 7;
+    *ring = r * RINGS < reach * RINGS ? (uint32_t)(r * RINGS / reach) : RINGS - 1u;
+    return (int32_t)((x * move.x + y * move.y) / r);
 }
 
-/* The median move of the tracks in each cell. */
-static void measure_flow(pf_tracker *t)
+/* The median radial move of each ring's tracks: in a tube it hardly depends on the azimuth. Too few: 0. */
+static void measure_flow(pf_tracker *t, int32_t flow[RINGS])
 {
-    pf_flow *f = &t->flow;
-    for (uint32_t c = 0; c < FLOW_W * FLOW_H; c++) {
+    for (uint32_t ring = 0; ring < RINGS; ring++) {
         uint32_t n = 0;
-        for (uint32_t i = 0; i < t->n && n < FLOW_CELL_MAX; i++)
-            if (t->table[i].status == PF_TRACK_TRACKED && t->cell_of[i] == c) {
-                f->x[n] = t->slots[t->slot_of[i]].move.x;
-                f->y[n++] = t->slots[t->slot_of[i]].move.y;
-            }
-        f->n[c] = n;
-        if (n > 0)
-            f->move[c] = (pf_point_q16){median_of(f->x, n), median_of(f->y, n)};
+        for (uint32_t i = 0; i < t->n; i++)
+            if (t->table[i].status == PF_TRACK_TRACKED && t->ring_of[i] == ring)
+                t->value[n++] = (uint32_t)((int64_t)t->radial[i] + ((int64_t)1 << 31));
+        flow[ring] =
+            n < FLOW_LEAST ? 0 : (int32_t)((int64_t)pf_value_of_rank(t->value, n, n / 2u) - ((int64_t)1 << 31));
     }
 }
 
@@ -234,17 +231,15 @@ static int32_t forget_and_add(int32_t sum, int32_t more)
     return pf_clamp_i64((int64_t)sum - sum / 8 + more, 1 << 24);
 }
 
-/* Whether the track has stood still, or nearly, while its surroundings have moved on. */
-static bool stands_still(pf_slot *s, const pf_flow *f, uint32_t cell)
+/* Whether the track has stood still, or nearly, while its ring has moved on. */
+static bool stands_still(pf_slot *s, int32_t radial, int32_t flow)
 {
-    const pf_point_q16 flow = f->move[cell];
     s->own = (pf_point_q16){forget_and_add(s->own.x, s->move.x), forget_and_add(s->own.y, s->move.y)};
-    s->flow = (pf_point_q16){forget_and_add(s->flow.x, flow.x), forget_and_add(s->flow.y, flow.y)};
-    if (f->n[cell] < FLOW_LEAST)
-        return false;
-    const int64_t ox = s->own.x >> 8, oy = s->own.y >> 8, fx = s->flow.x >> 8, fy = s->flow.y >> 8;
-    const int64_t along = ox * fx + oy * fy, whole = fx * fx + fy * fy;
-    return whole > FLOW_STIRS && STILL_PART * along < whole && STILL_PART * (ox * ox + oy * oy) < whole;
+    s->radial = forget_and_add(s->radial, radial);
+    s->flow = forget_and_add(s->flow, flow);
+    const int64_t whole = s->flow < 0 ? -(int64_t)s->flow : s->flow;
+    const int64_t along = s->flow < 0 ? -(int64_t)s->radial : s->radial;
+    return whole > FLOW_STIRS && STILL_PART * along < whole && !farther(s->own, (pf_point_q16){0, 0}, whole / 2);
 }
 
 static void lose(pf_tracker *t, uint32_t row, pf_track_reason reason)
@@ -259,12 +254,14 @@ static void lose(pf_tracker *t, uint32_t row, pf_track_reason reason)
 /* Tracks that stick to something that goes with the camera are lost; what they stick to is masked. */
 static void drop_stuck(pf_tracker *t)
 {
+    int32_t flow[RINGS];
     for (uint32_t i = 0; i < t->n; i++)
         if (t->table[i].status == PF_TRACK_TRACKED)
-            t->cell_of[i] = (uint8_t)flow_cell(t, t->table[i].pos);
-    measure_flow(t);
+            t->radial[i] = radial_move(t, i, &t->ring_of[i]);
+    measure_flow(t, flow);
     for (uint32_t i = 0; i < t->n; i++)
-        if (t->table[i].status == PF_TRACK_TRACKED && stands_still(&t->slots[t->slot_of[i]], &t->flow, t->cell_of[i])) {
+        if (t->table[i].status == PF_TRACK_TRACKED &&
+            stands_still(&t->slots[t->slot_of[i]], t->radial[i], flow[t->ring_of[i]])) {
             lose(t, i, PF_TRACK_STATIC);
             pf_mask_condemn(t, t->table[i].pos);
             t->stats.tracked--;

@@ -2,17 +2,17 @@
  * dirt on the lens, overlaid text; RECONSTRUCTION section 3). The latter are learned from one pixel a block, a quarter
  * of the blocks at a time, each time the picture has moved by 2 px. A block is static when that pixel has hardly
  * changed over some 45 lessons and there is something in the block to hold on to: bare ground needs no mask. */
-#include <string.h>
-
 #include "tracker_private.h"
 
 #define SLICES       4u
 #define TRAVEL       (2u << 16)
 #define RATE         16        /* of both running means */
 #define DEVIATION_Q6 (16 * 64) /* a block's first: it takes 37 quiet lessons to come below 1.5 */
-#define STILL_Q6     96        /* 1.5 grey: noise of sigma 2 leaves 0.5 at this level */
+#define UNSEEN       UINT16_MAX
+#define STILL_Q6     96 /* 1.5 grey: noise of sigma 2 leaves 0.5 at this level */
 #define MOVES_Q6     192
 #define CONTRAST     10 /* grey levels within the block: less than this is no corner */
+#define SENTENCE     40 /* lessons for which a block where a track got stuck stays closed, whatever its own pixel does */
 #define BRIGHT       250
 
 /* New tracks keep a block's distance from static ones: a window reaches further than the pixel it is centred on. */
@@ -35,11 +35,19 @@ static void close_blocks(pf_tracker *t)
     }
 }
 
+/* Whether no window centred in the block fits into the circle: there its rim would be learned. */
+static bool is_outside(const pf_tracker *t, uint32_t i)
+{
+    const int64_t x = (int64_t)(i % t->block_w * BLOCK + BLOCK / 2u) - (t->config.circle.x >> 16);
+    const int64_t y = (int64_t)(i / t->block_w * BLOCK + BLOCK / 2u) - (t->config.circle.y >> 16);
+    const int64_t reach = (int64_t)(t->config.circle_radius_q16 >> 16) - t->klt.half;
+    return t->config.circle_radius_q16 && (reach <= 0 || x * x + y * y > reach * reach);
+}
+
 void pf_mask_init(pf_tracker *t, const pf_image *mask)
 {
-    memset(t->block, 0, (size_t)t->block_w * t->block_h * sizeof *t->block);
     for (uint32_t i = 0; i < t->block_w * t->block_h; i++)
-        t->block[i].deviation_q6 = DEVIATION_Q6;
+        t->block[i] = (pf_block){.mean_q6 = UNSEEN, .deviation_q6 = DEVIATION_Q6, .is_outside = is_outside(t, i)};
     for (uint32_t y = 0; mask && y < mask->height; y++)
         for (uint32_t x = 0; x < mask->width; x++)
             if (mask->data[(size_t)y * mask->stride + x] == 0)
@@ -69,8 +77,8 @@ void pf_mask_condemn(pf_tracker *t, pf_point_q16 at)
     if (t->config.no_static_mask)
         return;
     b->is_static = 1;
+    b->sentence = SENTENCE;
     t->is_mask_stale = true;
-    b->deviation_q6 = STILL_Q6;
 }
 
 /* Largest difference among the block's pixels at level 1. */
@@ -91,10 +99,14 @@ static bool learn_block(pf_block *b, const pf_image *image, uint32_t x, uint32_t
 {
     const uint32_t px = x + side / 2u < image->width ? x + side / 2u : image->width - 1u;
     const uint32_t py = y + side / 2u < image->height ? y + side / 2u : image->height - 1u;
-    const int32_t v = image->data[(size_t)py * image->stride + px] * 64, mean = b->mean_q6;
+    const int32_t v = image->data[(size_t)py * image->stride + px] * 64, mean = b->mean_q6 == UNSEEN ? v : b->mean_q6;
     const int32_t off = v > mean ? v - mean : mean - v, deviation = b->deviation_q6;
     b->mean_q6 = (uint16_t)(mean + (v - mean) / RATE);
     b->deviation_q6 = (uint16_t)(deviation + (off - deviation) / RATE);
+    if (b->sentence > 0) {
+        b->sentence--;
+        return false;
+    }
     if (b->is_static ? b->deviation_q6 <= MOVES_Q6
                      : b->deviation_q6 >= STILL_Q6 || contrast(image, x, y, side) < CONTRAST)
         return false;
@@ -113,7 +125,8 @@ void pf_mask_learn(pf_tracker *t)
         t->travel_q16 = 0;
         for (uint32_t y = t->slice; y < t->block_h; y += SLICES)
             for (uint32_t x = 0; x < t->block_w; x++)
-                t->is_mask_stale |= learn_block(&t->block[y * t->block_w + x], image, x * side, y * side, side);
+                t->is_mask_stale |= !t->block[y * t->block_w + x].is_outside &&
+                                    learn_block(&t->block[y * t->block_w + x], image, x * side, y * side, side);
         t->slice = (t->slice + 1u) % SLICES;
     }
     if (t->is_mask_stale)

@@ -123,9 +123,7 @@ static void measure_drift(pf_tracker *t)
 
 static void measure_tracks(pf_tracker *t, pf_scene_measures *m)
 {
-    const pf_point_q16 centre = t->config.circle_radius_q16 ? t->config.circle
-                                                            : (pf_point_q16){(int32_t)(t->config.width << 15),
-                                                                             (int32_t)(t->config.height << 15)};
+    const pf_point_q16 centre = pf_flow_centre(t);
     uint32_t n = 0, seen = 0;
     for (uint32_t i = 0; i < t->n; i++) {
         if (t->table[i].status != PF_TRACK_TRACKED)

@@ -76,7 +76,8 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     t->grid_h = (c->height + c->cell - 1u) / c->cell;
     t->table = carve(base, &used, 2u * c->max_tracks * sizeof *t->table);
     t->slot_of = carve(base, &used, 2u * c->max_tracks * sizeof *t->slot_of);
-    t->cell_of = carve(base, &used, 2u * c->max_tracks * sizeof *t->cell_of);
+    t->ring_of = carve(base, &used, 2u * c->max_tracks * sizeof *t->ring_of);
+    t->radial = carve(base, &used, 2u * c->max_tracks * sizeof *t->radial);
     t->slots = carve(base, &used, c->max_tracks * sizeof *t->slots);
     t->pixels = carve(base, &used, (size_t)c->max_tracks * t->patch_bytes);
     t->spare = carve(base, &used, c->max_tracks * sizeof *t->spare);

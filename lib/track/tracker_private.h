@@ -5,33 +5,27 @@
 
 #include "track_private.h"
 
-#define BLOCK         8u /* px: side of a block of the masks */
-#define FLOW_W        8u /* cells in which the flow's median is taken */
-#define FLOW_H        6u
-#define FLOW_CELL_MAX 32u /* tracks of a cell that count */
-#define SECTORS       12u /* detection in polar cells: sectors of 30 degrees */
-#define RINGS         6u
+#define BLOCK   8u  /* px: side of a block of the masks */
+#define SECTORS 12u /* detection in polar cells: sectors of 30 degrees */
+#define RINGS   6u
 
-typedef struct pf_slot {    /* the hidden part of a live track */
-    pf_point_q16 move;      /* its last displacement */
-    pf_point_q16 own, flow; /* of it and of its surroundings, summed with forgetting: see follow.c */
-    pf_point_q16 expected;  /* start that the caller gave for the next frame; x = PF_NO_GUESS: none */
-    pf_point_q16 from;      /* where it was when the current window of PF_SCENE_WINDOW frames began */
+typedef struct pf_slot {   /* the hidden part of a live track */
+    pf_point_q16 move;     /* its last displacement */
+    pf_point_q16 own;      /* its moves summed with forgetting; */
+    int32_t radial, flow;  /* what of them is radial, and the same of its ring: see follow.c */
+    pf_point_q16 expected; /* start that the caller gave for the next frame; x = PF_NO_GUESS: none */
+    pf_point_q16 from;     /* where it was when the current window of PF_SCENE_WINDOW frames began */
     pf_anchor anchor;
 } pf_slot;
 
 typedef struct pf_block {           /* 8 x 8 px; of the masks */
     uint16_t mean_q6, deviation_q6; /* of one pixel over time, while the rest moves */
     uint8_t is_masked;              /* by the user */
+    uint8_t is_outside;             /* no window fits there */
+    uint8_t sentence;               /* lessons for which it stays static */
     uint8_t is_closed;              /* to new tracks */
     uint8_t is_static;              /* by what was seen */
 } pf_block;
-
-typedef struct pf_flow { /* median move of each cell's tracks */
-    uint32_t n[FLOW_W * FLOW_H];
-    pf_point_q16 move[FLOW_W * FLOW_H];
-    int32_t x[FLOW_CELL_MAX], y[FLOW_CELL_MAX];
-} pf_flow;
 
 struct pf_tracker {
     pf_tracker_config config; /* defaults filled in; .mask NULL */
@@ -42,7 +36,8 @@ struct pf_tracker {
     uint64_t last_id;
     pf_track *table;
     uint16_t *slot_of; /* of each live row of the table */
-    uint8_t *cell_of;  /* flow cell of each row, scratch */
+    uint32_t *ring_of; /* scratch: ring and radial move of each row */
+    int32_t *radial;
     uint32_t n;
     pf_slot *slots;
     uint8_t *pixels; /* templates, patch_bytes each */
@@ -63,7 +58,6 @@ struct pf_tracker {
     uint32_t frame;                /* of the current window of PF_SCENE_WINDOW */
     uint32_t drift_q16;            /* of the last one */
     uint32_t bin[SECTORS * RINGS]; /* live tracks of each polar cell */
-    pf_flow flow;
     pf_klt klt;
     pf_corner_scratch corners;
 };
@@ -79,6 +73,9 @@ bool pf_grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach);
 
 /* Finds every live track in the new frame, or loses it. */
 void pf_tracks_follow(pf_tracker *t);
+
+/* The centre of the flow: the circle's, or the picture's. */
+pf_point_q16 pf_flow_centre(const pf_tracker *t);
 
 /* --- new tracks (detect.c) */
 
