@@ -139,6 +139,10 @@ def info_text(info: dict[str, Any]) -> str:
                 f"frames; median {tracks['length_keyframes_median']:.0f} keyframes",
             ),
         ]
+    if info["states"]:
+        rows.append(("states", ", ".join(f"{state} at {count} keyframes" for state, count in info["states"].items())))
+    if info["lost_tracks"]:
+        rows.append(("tracks lost", losses_text(info["lost_tracks"])))
     rows.append(("ended", info["end_reason"]))
     if info["object_bytes"]:
         rows.append(("received", size_text(info["object_bytes"])))
@@ -149,11 +153,23 @@ def info_text(info: dict[str, Any]) -> str:
     return table(rows)
 
 
+def losses_text(losses: dict[str, int]) -> str:
+    """Lost tracks by reason, most first."""
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(losses.items(), key=lambda item: -item[1]))
+
+
 def run_show(args: argparse.Namespace) -> Result:
+    from pipefish.page import write_statistics
     from pipefish.show import show
     from pipefish.survey import Survey
 
-    written = show(Survey.open(args.survey), Path(args.output), args.keyframe, quiet=args.json)
+    survey, out = Survey.open(args.survey), Path(args.output)
+    if args.stats:
+        if out.suffix.lower() not in (".html", ".htm"):
+            raise PipefishError(f"{out}: --stats writes a .html page")
+        size = write_statistics(survey, out)
+        return {"file": str(out), "kind": "statistics", "bytes": size}, f"{out} (statistics, {size_text(size)})"
+    written = show(survey, out, args.keyframe, quiet=args.json, colour=args.colour)
     return written, f"{written['file']} ({written['kind']}, {size_text(float(str(written['bytes'])))})"
 
 
@@ -162,6 +178,7 @@ def run_status(args: argparse.Namespace) -> Result:
 
     from pipefish import pipefish_pb2 as pb
     from pipefish.client import Client, Handlers
+    from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
     client = Client(open_transport(args.device, args.baud), Handlers(), wants_objects=False)
@@ -187,6 +204,8 @@ def run_status(args: argparse.Namespace) -> Result:
             f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped",
         ),
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
+        ("scene", ", ".join(states_of(status.tracking)) or "nothing special"),
+        ("lost so far", losses_text(losses_of(status.tracking)) or "none"),
         ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
         ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"),
         (
@@ -380,6 +399,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="picture to write")
     p.add_argument("--keyframe", type=int, metavar="N", help="index of the keyframe [the middle one]")
+    p.add_argument("--colour", choices=("age", "quality"), default="age", help="what the tracks' colour tells [age]")
+    p.add_argument("--stats", action="store_true", help="a .html page instead: what became of the tracks, and why")
 
     p = add_command(
         commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"
