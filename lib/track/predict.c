@@ -83,7 +83,7 @@ void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q3
     p->forward = p->is_known ? median_signed(p->value, measured) : 0;
     if (p->is_known && p->last.has_encoder && now->has_encoder && now->encoder != p->last.encoder) {
         const int64_t step = pf_clamp_i64(now->encoder - p->last.encoder, 1 << 24);
-        const int64_t per_count = ((int64_t)p->forward << 14) / step;
+        const int64_t per_count = (int64_t)p->forward * 16384 / step;
         /* an eighth each time: counts are coarse, and the median falls by a few per cent from frame to frame */
         p->per_count_q30 = p->has_per_count ? p->per_count_q30 + (per_count - p->per_count_q30) / 8 : per_count;
         p->has_per_count = true;
