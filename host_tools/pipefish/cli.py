@@ -218,6 +218,33 @@ def run_status(args: argparse.Namespace) -> Result:
     return document, table(rows)
 
 
+def run_evaluate(args: argparse.Namespace) -> Result:
+    from pipefish.evaluate import compare_with_opencv, evaluate, verdict
+    from pipefish.simulate import Scene
+    from pipefish.survey import Survey
+
+    stem = Path(args.recording)
+    truth = Scene.from_truth(stem.with_name(stem.name + ".truth.json"))
+    survey = Survey.open(args.survey)
+    ours = evaluate(survey, truth)
+    if ours is None:
+        raise PipefishError(f"{survey.path}: no track was seen in two keyframes")
+    peer = compare_with_opencv(survey, truth, stem.with_name(stem.name + ".y4m")) if args.opencv else None
+    bars = verdict(ours, peer, smooth=args.smooth)
+    rows: list[tuple[str, object]] = [("", "device" + (", OpenCV's recipe" if peer else ""))]
+    for name, what in (
+        ("within_1px", "within 1 px"),
+        ("survival", "kept of those visible"),
+        ("median_px", "median error, px"),
+        ("length_median", "median length, frames"),
+    ):
+        values = [side[name] for side in (ours, peer) if side is not None]
+        rows.append((what, ", ".join("-" if v is None else f"{v:.4g}" for v in values)))
+    failed = [name for name, row in bars.items() if not row["holds"]]
+    rows.append(("bars", "all hold" if not failed else "missed: " + ", ".join(failed)))
+    return {"device": ours, "opencv": peer, "bars": bars}, table(rows)
+
+
 def run_simulate(args: argparse.Namespace) -> Result:
     from pipefish.simulate import simulate
 
@@ -401,6 +428,18 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--keyframe", type=int, metavar="N", help="index of the keyframe [the middle one]")
     p.add_argument("--colour", choices=("age", "quality"), default="age", help="what the tracks' colour tells [age]")
     p.add_argument("--stats", action="store_true", help="a .html page instead: what became of the tracks, and why")
+
+    p = add_command(
+        commands,
+        "evaluate",
+        run_evaluate,
+        "Compare the tracks of a survey of a simulated pipe with the truth, and with OpenCV's.",
+        "pipefish evaluate survey.mcap --recording /tmp/pipe --opencv",
+    )
+    p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
+    p.add_argument("--recording", required=True, metavar="STEM", help="of pipefish simulate: STEM.truth.json, STEM.y4m")
+    p.add_argument("--opencv", action="store_true", help="also run OpenCV's usual chain over the recording's frames")
+    p.add_argument("--smooth", action="store_true", help="the bars for smooth plastic")
 
     p = add_command(
         commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -237,6 +238,28 @@ def _tracks_of(rows: np.ndarray) -> Tracks:
         boot=np.zeros(len(ids), np.uint64),
         id=ids,
     )
+
+
+def compare_with_opencv(survey: Survey, truth: Any, recording: Path) -> dict[str, Any] | None:
+    """`figures` of OpenCV's recipe on the frames of a simulated recording (STEM.y4m, grey) at the survey's keyframes.
+
+    truth: a pipefish.simulate.Scene. Raises PipefishError (OpenCV is missing, no such frames), OSError."""
+    seen = observed(survey)
+    width, height = survey.keyframes[0].width, survey.keyframes[0].height
+    with recording.open("rb") as file:
+        head = len(file.readline(4096))
+    stored = np.memmap(recording, dtype=np.uint8, mode="r")
+    size = width * height + len(b"FRAME\n")
+    if (len(stored) - head) // size <= max(seen.sequence.values()):
+        raise PipefishError(f"{recording}: has fewer frames than the survey, or of another size")
+
+    def frame(k: int) -> np.ndarray:
+        return np.array(stored[head + k * size : head + (k + 1) * size][-width * height :]).reshape(height, width)
+
+    lens = truth.spec["lens"]
+    most = int(np.median([len(k.observations.id) for k in survey.keyframes]))
+    circle = (lens["c_u"], lens["c_v"], lens["circle_radius"])
+    return figures(opencv_tracks(frame, seen.sequence, seen.pairs, most, circle), truth)
 
 
 # Bounds of an accepted tracker in a simulated pipe: (figure, least or most, bound). On PVC 0.96 within 1 px.
