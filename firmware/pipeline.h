@@ -1,6 +1,6 @@
-/* The capture thread: camera -> tracker -> keyframe choice -> JPEG -> message -> store. With daemon.threads = 2 a worker
- * tracks while this thread takes the next frame and makes the last one's keyframe; nothing else of the daemon can stall
- * either.
+/* The capture thread: camera -> tracker -> keyframe choice -> JPEG -> message -> store. With daemon.threads = 2 a
+ * worker tracks while this thread takes the next frame and makes the last one's keyframe; nothing else of the daemon
+ * can stall either.
  */
 #ifndef PIPEFISHD_PIPELINE_H
 #define PIPEFISHD_PIPELINE_H

@@ -16,7 +16,7 @@ struct pf_tracking {
     pf_lens lens;
     pf_predictor predictor;
     pf_ray_q30 *rays; /* of the whole table: live and just lost tracks */
-    pf_point_q16 *expected;
+    pf_expected *expected;
     pf_keyframe_config choice;
     pf_keyframe_state choice_state;
     pf_scene scene;
@@ -39,6 +39,16 @@ double pf_tracking_circle(const pf_daemon *d, double *u, double *v)
 }
 
 /* ---- opening */
+
+/* Nothing is known of the motion but, with an encoder and a nominal diameter, what a count means. */
+static void forget_motion(pf_tracking *p)
+{
+    const pf_config *c = &p->daemon->config;
+    const double radius = c->survey.nominal_diameter_mm / 2e3;
+    memset(&p->predictor, 0, sizeof p->predictor);
+    if (radius > 0 && c->encoder.metres_per_count != 0)
+        pf_predictor_assume(&p->predictor, (int32_t)lround(c->encoder.metres_per_count / radius * 1073741824.0 / 8));
+}
 
 static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size_t n)
 {
@@ -152,6 +162,7 @@ bool pf_tracking_open(pf_tracking **tracking, const pf_daemon *daemon, char *err
         return false;
     }
     open_choice(p);
+    forget_motion(p);
     *tracking = p;
     return true;
 }
@@ -178,7 +189,7 @@ static void check_gap(pf_tracking *p, pf_shot *shot)
     if (p->has_sequence && (!is_later || shot->missing > p->daemon->config.tracker.reset_gap)) {
         pf_tracker_reset(p->tracker);
         memset(&p->choice_state, 0, sizeof p->choice_state);
-        memset(&p->predictor, 0, sizeof p->predictor);
+        forget_motion(p);
         (void)snprintf(shot->break_reason, sizeof shot->break_reason, "gap of %llu frames",
                        (unsigned long long)shot->missing);
         pf_log(PF_LOG_WARNING, "%s before frame %llu: tracks begin anew", shot->break_reason,

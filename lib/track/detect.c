@@ -91,7 +91,7 @@ static void add_track(pf_tracker *t, const pf_corner *corner)
     pf_slot *s = &t->slots[slot];
     s->move = s->own = (pf_point_q16){0, 0};
     s->radial = s->flow = 0;
-    s->expected.x = PF_NO_GUESS;
+    s->expected.at.x = PF_NO_GUESS;
     s->from = (pf_point_q16){corner->x * 65536, corner->y * 65536};
     t->slot_of[row] = slot;
     t->table[row] = (pf_track){.id = ++t->last_id,

@@ -10,6 +10,7 @@
 #define GUESS_MARGIN (64 << 16)
 #define GUESS_MOST   (4096 << 16)
 #define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
+#define WARPED_APART 49152     /* 3/4 px: the two starts of a warped template differ by 1.7 px */
 #define STARTS       3
 #define COARSE       2u /* level at which starts are compared: a pixel of it is 4 px */
 #define COARSE_HALF  5
@@ -105,12 +106,12 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
     const pf_point_q16 at = track->pos, none = {0, 0};
     pf_point_q16 move = slot->move, given = {0, 0};
     uint32_t n = 0;
-    if (track->age == 0 && slot->expected.x == PF_NO_GUESS)
+    if (track->age == 0 && slot->expected.at.x == PF_NO_GUESS)
         (void)neighbours_move(t, at, &move);
     start[n++] = move;
-    if (slot->expected.x != PF_NO_GUESS) {
-        given = (pf_point_q16){pf_clamp_i64((int64_t)slot->expected.x - at.x, GUESS_MOST),
-                               pf_clamp_i64((int64_t)slot->expected.y - at.y, GUESS_MOST)};
+    if (slot->expected.at.x != PF_NO_GUESS) {
+        given = (pf_point_q16){pf_clamp_i64((int64_t)slot->expected.at.x - at.x, GUESS_MOST),
+                               pf_clamp_i64((int64_t)slot->expected.at.y - at.y, GUESS_MOST)};
         if (farther(given, move, SAME_START))
             start[n++] = given;
     }
@@ -136,8 +137,47 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
     return n;
 }
 
-/* One attempt at one track from one guess; on success `track` and its slot are up to date. */
-static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move)
+/* What a track must pass wherever it was found: `fit` of its template in the new frame at `fine`. */
+static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_q16 fine, int32_t least_q15)
+{
+    const pf_image *image = &t->pyramid[t->now].level[0];
+    if (fit->reason != PF_TRACK_OK)
+        return fit->reason;
+    if (fit->zncc_q15 < least_q15)
+        return PF_TRACK_DRIFT;
+    if (!pf_klt_inside(&t->klt, image, fine))
+        return PF_TRACK_LEFT;
+    if (!pf_mask_allows(t, fine))
+        return PF_TRACK_MASKED;
+    if (pf_mask_saturated(t, image, fine, t->config.window * t->config.window / SATURATED))
+        return PF_TRACK_SATURATED;
+    if (pf_grid_near(t, fine, (int64_t)t->config.cell << 14))
+        return PF_TRACK_CROWDED;
+    return PF_TRACK_OK;
+}
+
+/* Brings a track and its slot up to date: found at `fine`. */
+static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 fine, const pf_fit *anchored,
+                   int32_t quality)
+{
+    pf_slot *s = &t->slots[slot];
+    s->move = (pf_point_q16){fine.x - track->pos.x, fine.y - track->pos.y};
+    track->pos = fine;
+    track->quality = (uint16_t)quality;
+    pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored->gain_q14, track);
+    for (int32_t k = 0; k < 4; k++) {
+        const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
+        if (d > RENEW || d < -RENEW) {
+            pf_anchor_take(&t->klt, &t->pyramid[t->now].level[0], fine, &s->anchor,
+                           t->pixels + (size_t)slot * t->patch_bytes);
+            break;
+        }
+    }
+}
+
+/* One attempt at one track from one guess; on success `track` and its slot are up to date. *reached gets how far the
+ * coarse levels came. */
+static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 move, pf_point_q16 *reached)
 {
     const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
     const uint32_t top = t->config.levels - 1u;
@@ -146,6 +186,7 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
                                 clamp_guess((int64_t)old.y + move.y, t->config.height)};
     pf_point_q16 at = guess;
     pf_fit fit = pf_klt_track(&t->klt, from, to, old, &at, top);
+    *reached = at;
     if (fit.reason != PF_TRACK_OK)
         return fit.reason;
     if (fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
@@ -157,38 +198,54 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
         return PF_TRACK_BACKWARD;
     pf_slot *s = &t->slots[slot];
     const pf_anchor saved = s->anchor;
-    uint8_t *pixels = t->pixels + (size_t)slot * t->patch_bytes;
     pf_point_q16 fine = at;
-    const pf_fit anchored = pf_anchor_fit(&t->klt, &to->level[0], &s->anchor, pixels, &fine);
-    pf_track_reason reason = anchored.reason;
-    if (reason == PF_TRACK_OK &&
-        (anchored.zncc_q15 < (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK || farther(fine, at, PULL_MAX)))
+    const pf_fit anchored =
+        pf_anchor_fit(&t->klt, &to->level[0], &s->anchor, t->pixels + (size_t)slot * t->patch_bytes, &fine);
+    pf_track_reason reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK);
+    if (anchored.reason == PF_TRACK_OK && farther(fine, at, PULL_MAX))
         reason = PF_TRACK_DRIFT;
-    if (reason == PF_TRACK_OK && !pf_klt_inside(&t->klt, &to->level[0], fine))
-        reason = PF_TRACK_LEFT;
-    if (reason == PF_TRACK_OK && !pf_mask_allows(t, fine))
-        reason = PF_TRACK_MASKED;
-    if (reason == PF_TRACK_OK &&
-        pf_mask_saturated(t, &to->level[0], fine, t->config.window * t->config.window / SATURATED))
-        reason = PF_TRACK_SATURATED;
-    if (reason == PF_TRACK_OK && pf_grid_near(t, fine, (int64_t)t->config.cell << 14))
-        reason = PF_TRACK_CROWDED;
-    if (reason != PF_TRACK_OK) {
+    if (reason == PF_TRACK_OK)
+        accept(t, track, slot, fine, &anchored, fit.zncc_q15);
+    else
         s->anchor = saved;
-        return reason;
+    return reason;
+}
+
+/* The template's fit from `start` with its warp taken on by `warp`. */
+static pf_fit fit_warped(pf_tracker *t, uint16_t slot, const pf_anchor *before, const int32_t warp[4],
+                         pf_point_q16 *start)
+{
+    pf_anchor *a = &t->slots[slot].anchor;
+    *a = *before;
+    for (int32_t i = 0; i < 2; i++)
+        for (int32_t j = 0; j < 2; j++)
+            a->a[2 * i + j] = pf_clamp_i64(
+                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, 4 << 16);
+    return pf_anchor_fit(&t->klt, &t->pyramid[t->now].level[0], a, t->pixels + (size_t)slot * t->patch_bytes, start);
+}
+
+/* For a patch that has changed too much from frame to frame: its template, with the warp that is expected, from where
+ * the coarse levels came to. There is no way back to check: instead it must look like the template as much as a patch
+ * must like the last frame's, and be found at the same place from two starts. */
+static pf_track_reason attempt_warped(pf_tracker *t, pf_track *track, uint16_t slot, const int32_t warp[4],
+                                      pf_point_q16 reached)
+{
+    const pf_anchor saved = t->slots[slot].anchor;
+    pf_point_q16 one = {reached.x + WARPED_APART, reached.y},
+                 two = {reached.x - WARPED_APART, reached.y + WARPED_APART};
+    const pf_fit first = fit_warped(t, slot, &saved, warp, &one);
+    pf_track_reason reason = first.reason;
+    if (reason == PF_TRACK_OK) {
+        const pf_fit second = fit_warped(t, slot, &saved, warp, &two);
+        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15);
+        if (reason == PF_TRACK_OK && farther(one, two, t->config.fb_q16))
+            reason = PF_TRACK_DIVERGED;
+        if (reason == PF_TRACK_OK)
+            accept(t, track, slot, two, &second, second.zncc_q15);
     }
-    s->move = (pf_point_q16){fine.x - old.x, fine.y - old.y};
-    track->pos = fine;
-    track->quality = (uint16_t)fit.zncc_q15;
-    pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored.gain_q14, track);
-    for (int32_t k = 0; k < 4; k++) {
-        const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
-        if (d > RENEW || d < -RENEW) {
-            pf_anchor_take(&t->klt, &to->level[0], fine, &s->anchor, pixels);
-            break;
-        }
-    }
-    return PF_TRACK_OK;
+    if (reason != PF_TRACK_OK)
+        t->slots[slot].anchor = saved;
+    return reason;
 }
 
 /* --- what to believe --------------------------------------------------------------------------------------------- */
@@ -276,21 +333,37 @@ static bool worth_another(pf_track_reason reason)
            reason == PF_TRACK_BACKWARD;
 }
 
+static bool has_warp(const pf_expected *e)
+{
+    return e->at.x != PF_NO_GUESS &&
+           (e->warp_q16[0] != 65536 || e->warp_q16[1] != 0 || e->warp_q16[2] != 0 || e->warp_q16[3] != 65536);
+}
+
 static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
 {
     pf_slot *s = &t->slots[slot];
-    pf_point_q16 start[STARTS], near;
+    const pf_expected expected = s->expected;
+    pf_point_q16 start[STARTS], near, reached, other;
     const uint32_t n = rank_starts(t, track, s, start);
-    pf_track_reason reason = attempt(t, track, slot, start[0]);
-    s->expected.x = PF_NO_GUESS;
+    pf_track_reason reason = attempt(t, track, slot, start[0], &reached);
+    s->expected.at.x = PF_NO_GUESS;
+    if (worth_another(reason) && has_warp(&expected)) {
+        const pf_track_reason first = reason;
+        reason = attempt_warped(t, track, slot, expected.warp_q16, reached);
+        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2))
+            reason = attempt_warped(t, track, slot, expected.warp_q16, expected.at);
+        if (reason == PF_TRACK_OK)
+            return reason;
+        reason = first;
+    }
     for (uint32_t i = 1; i < n && worth_another(reason); i++)
-        reason = attempt(t, track, slot, start[i]);
+        reason = attempt(t, track, slot, start[i], &other);
     if (!worth_another(reason) || !neighbours_move(t, track->pos, &near))
         return reason;
     for (uint32_t i = 0; i < n; i++)
         if (!farther(near, start[i], SAME_START))
             return reason;
-    return attempt(t, track, slot, near);
+    return attempt(t, track, slot, near, &other);
 }
 
 void pf_tracks_follow(pf_tracker *t)

@@ -10,7 +10,9 @@
 #define LEAST     8u
 #define STIRS     65 /* Q16: a thousandth of the radius; from less no ratio is taken */
 #define RATIO_MAX (8 << 16)
-#define ROLL_JUMP 20000 /* urad: below, the last frame's own rotation is better than an inclinometer */
+#define FAST      (65536 / 25) /* of the radius a frame: patches then grow by 4 % and more */
+#define TILT      64           /* 1/64 rad */
+#define ROLL_JUMP 20000        /* urad: below, the last frame's own rotation is better than an inclinometer */
 
 static int64_t sine_of(const pf_ray_q30 *v)
 {
@@ -59,6 +61,12 @@ static void remember(pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *
     p->last = *now;
 }
 
+void pf_predictor_assume(pf_predictor *p, int32_t radii_per_count_q27)
+{
+    p->per_count_q30 = (int64_t)radii_per_count_q27 * 8;
+    p->has_per_count = true;
+}
+
 void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *now)
 {
@@ -81,7 +89,9 @@ void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q3
     }
     p->is_known = p->is_known && measured >= LEAST;
     p->forward = p->is_known ? median_signed(p->value, measured) : 0;
-    if (p->is_known && p->last.has_encoder && now->has_encoder && now->encoder != p->last.encoder) {
+    /* Of a few survivors the slow ones are too many: then what a count means stays as it is. */
+    if (p->is_known && 3u * measured >= n && p->last.has_encoder && now->has_encoder &&
+        now->encoder != p->last.encoder) {
         const int64_t step = pf_clamp_i64(now->encoder - p->last.encoder, 1 << 24);
         const int64_t per_count = (int64_t)p->forward * 16384 / step;
         /* an eighth each time: counts are coarse, and the median falls by a few per cent from frame to frame */
@@ -124,26 +134,77 @@ static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
     return (pf_ray_q30){(int32_t)(sine * v->x / rho), (int32_t)(sine * v->y / rho), (int32_t)(c * ONE / norm)};
 }
 
+/* What the next frame does to a ray. */
+typedef struct pf_drive {
+    int32_t turn[9];
+    int64_t fall; /* of the cotangent */
+} pf_drive;
+
+static pf_ray_q30 drive(const pf_drive *d, const pf_ray_q30 *ray)
+{
+    pf_ray_q30 turned;
+    pf_ray_rotate(d->turn, ray, &turned);
+    const int32_t cot = cotangent(&turned);
+    return cot == INT32_MAX ? turned : with_cotangent(&turned, cot - d->fall);
+}
+
+static pf_ray_q30 tilted(const pf_ray_q30 *v, const int64_t by[3])
+{
+    /* by is of length TILT and normal to v: the sum is longer than 1 by TILT^2 / 2 = 1e-4, which projection ignores */
+    return (pf_ray_q30){pf_clamp_i64(v->x + by[0], (int32_t)ONE), pf_clamp_i64(v->y + by[1], (int32_t)ONE),
+                        pf_clamp_i64(v->z + by[2], (int32_t)ONE)};
+}
+
+/* How the surroundings of a ray are distorted: the derivatives of the new pixel along the radius and across, times the
+ * inverse of the old ones. Leaves the identity where a neighbour cannot be seen. */
+static void warp_of(const pf_drive *d, const pf_ray_q30 *ray, pf_ray_project project, const void *camera,
+                    int32_t warp[4])
+{
+    const int64_t rho = sine_of(ray);
+    pf_point_q16 old[3], new[3];
+    if (rho < STEEP)
+        return;
+    const int64_t radial[3] = {(int64_t)ray->z * ray->x / rho / TILT, (int64_t)ray->z * ray->y / rho / TILT,
+                               -rho / TILT};
+    const int64_t across[3] = {-ONE * ray->y / rho / TILT, ONE * ray->x / rho / TILT, 0};
+    const pf_ray_q30 near[3] = {*ray, tilted(ray, radial), tilted(ray, across)};
+    for (int32_t k = 0; k < 3; k++) {
+        const pf_ray_q30 driven = drive(d, &near[k]);
+        if (!project(camera, &near[k], &old[k]) || !project(camera, &driven, &new[k]))
+            return;
+    }
+    const int64_t ox1 = old[1].x - old[0].x, oy1 = old[1].y - old[0].y, ox2 = old[2].x - old[0].x,
+                  oy2 = old[2].y - old[0].y;
+    const int64_t nx1 = new[1].x - new[0].x, ny1 = new[1].y - new[0].y, nx2 = new[2].x - new[0].x,
+                  ny2 = new[2].y - new[0].y;
+    const int64_t det = (ox1 * oy2 - ox2 * oy1) >> 16;
+    if (det < 4096 && det > -4096) /* a sixteenth of a square pixel */
+        return;
+    warp[0] = pf_clamp_i64((nx1 * oy2 - nx2 * oy1) / det, 2 << 16);
+    warp[1] = pf_clamp_i64((nx2 * ox1 - nx1 * ox2) / det, 2 << 16);
+    warp[2] = pf_clamp_i64((ny1 * oy2 - ny2 * oy1) / det, 2 << 16);
+    warp[3] = pf_clamp_i64((ny2 * ox1 - ny1 * ox2) / det, 2 << 16);
+}
+
 void pf_predictor_guess(const pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
-                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_point_q16 *at)
+                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected)
 {
     const int32_t forward = next_forward(p, next);
-    const bool is_moving = p->forward > STIRS || p->forward < -STIRS;
+    const bool is_moving = p->forward > STIRS || p->forward<-STIRS, is_fast = forward> FAST || forward < -FAST;
     const int64_t ratio = is_moving ? pf_clamp_i64((int64_t)forward * 65536 / p->forward, RATIO_MAX) : 0;
-    int32_t r[9];
-    next_turn(p, next, r);
+    pf_drive d;
+    next_turn(p, next, d.turn);
     for (uint32_t i = 0; i < n; i++) {
-        pf_ray_q30 turned;
-        at[i].x = PF_NO_GUESS;
+        pf_expected *e = &expected[i];
+        *e = (pf_expected){{PF_NO_GUESS, 0}, {65536, 0, 0, 65536}};
         if (tracks[i].status == PF_TRACK_LOST || !pf_ray_valid(&rays[i]))
             continue;
-        pf_ray_rotate(r, &rays[i], &turned);
-        const int32_t cot = cotangent(&turned);
-        if (cot != INT32_MAX) {
-            const bool has_own = i < 2u * PF_TRACKS_MAX && p->fall[i] != PF_FALL_UNKNOWN && is_moving;
-            turned = with_cotangent(&turned, cot - (has_own ? (p->fall[i] * ratio) >> 16 : (int64_t)forward));
-        }
-        if (!project(camera, &turned, &at[i]))
-            at[i].x = PF_NO_GUESS;
+        const bool has_own = i < 2u * PF_TRACKS_MAX && p->fall[i] != PF_FALL_UNKNOWN && is_moving;
+        d.fall = has_own ? (p->fall[i] * ratio) >> 16 : forward;
+        const pf_ray_q30 driven = drive(&d, &rays[i]);
+        if (!project(camera, &driven, &e->at))
+            e->at.x = PF_NO_GUESS;
+        else if (is_fast)
+            warp_of(&d, &rays[i], project, camera, e->warp_q16);
     }
 }

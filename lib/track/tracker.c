@@ -181,13 +181,13 @@ bool pf_grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach)
     return false;
 }
 
-pf_status pf_tracker_expect(pf_tracker *tracker, const pf_point_q16 *at, uint32_t n)
+pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, uint32_t n)
 {
-    if (!tracker || n != tracker->n || (n && !at))
+    if (!tracker || n != tracker->n || (n && !expected))
         return PF_ERR_ARGUMENT;
     for (uint32_t i = 0; i < n; i++)
         if (tracker->table[i].status != PF_TRACK_LOST)
-            tracker->slots[tracker->slot_of[i]].expected = at[i];
+            tracker->slots[tracker->slot_of[i]].expected = expected[i];
     return PF_OK;
 }
 

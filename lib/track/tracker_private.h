@@ -9,12 +9,12 @@
 #define SECTORS 12u /* detection in polar cells: sectors of 30 degrees */
 #define RINGS   6u
 
-typedef struct pf_slot {   /* the hidden part of a live track */
-    pf_point_q16 move;     /* its last displacement */
-    pf_point_q16 own;      /* its moves summed with forgetting; */
-    int32_t radial, flow;  /* what of them is radial, and the same of its ring: see follow.c */
-    pf_point_q16 expected; /* start that the caller gave for the next frame; x = PF_NO_GUESS: none */
-    pf_point_q16 from;     /* where it was when the current window of PF_SCENE_WINDOW frames began */
+typedef struct pf_slot {  /* the hidden part of a live track */
+    pf_point_q16 move;    /* its last displacement */
+    pf_point_q16 own;     /* its moves summed with forgetting; */
+    int32_t radial, flow; /* what of them is radial, and the same of its ring: see follow.c */
+    pf_expected expected; /* by the caller, of the next frame */
+    pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
     pf_anchor anchor;
 } pf_slot;
 

@@ -14,7 +14,7 @@ static uint8_t texture[TEXTURE * TEXTURE], frame[2][WIDTH * HEIGHT];
 static _Alignas(16) uint8_t workspace[400000];
 static pf_keyframe_state keyframes;
 static pf_ray_q30 rays[PF_TRACKS_MAX];
-static pf_point_q16 expected[PF_TRACKS_MAX];
+static pf_expected expected[PF_TRACKS_MAX];
 static pf_predictor predictor;
 static pf_scene scene;
 static pf_lens lens;

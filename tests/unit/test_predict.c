@@ -8,7 +8,7 @@ static pf_tracker *tracker;
 static pf_predictor predictor;
 static pf_lens lens;
 static pf_ray_q30 rays[2 * PF_TRACKS_MAX];
-static pf_point_q16 at[2 * PF_TRACKS_MAX];
+static pf_expected at[2 * PF_TRACKS_MAX];
 static pf_track before[2 * PF_TRACKS_MAX];
 static tube_view view, last;
 static uint32_t fed, before_n;
@@ -72,8 +72,8 @@ static double guess_error(const tube_view *next, bool with_sensors, double *shar
         tube_move(p, &view, next, q);
         if (tracks[i].status == PF_TRACK_LOST || hypot(q[0] - TUBE_W / 2, q[1] - TUBE_H / 2) > TUBE_CIRCLE)
             continue;
-        TEST_ASSERT_NOT_EQUAL_INT32(PF_NO_GUESS, at[i].x);
-        const double e = hypot(at[i].x / 65536.0 - q[0], at[i].y / 65536.0 - q[1]);
+        TEST_ASSERT_NOT_EQUAL_INT32(PF_NO_GUESS, at[i].at.x);
+        const double e = hypot(at[i].at.x / 65536.0 - q[0], at[i].at.y / 65536.0 - q[1]);
         good += e < 3;
         error[count++] = (uint32_t)(e * 1000);
     }
@@ -164,10 +164,11 @@ static void test_wrong_predictions_harm_nothing(void)
         view.z += 2;
         const pf_track *tracks = pf_tracker_tracks(tracker, &n);
         for (uint32_t i = 0; i < n; i++) {
-            at[i] = (pf_point_q16){tracks[i].pos.x + (int32_t)(40 * 65536 * cos(k)),
-                                   tracks[i].pos.y + (int32_t)(40 * 65536 * sin(k))};
+            at[i] = (pf_expected){.warp_q16 = {65536, 0, 0, 65536},
+                                  .at = {tracks[i].pos.x + (int32_t)(40 * 65536 * cos(k)),
+                                         tracks[i].pos.y + (int32_t)(40 * 65536 * sin(k))}};
             if (k == 8)
-                at[i] = (pf_point_q16){INT32_MAX, INT32_MIN + 1};
+                at[i] = (pf_expected){.warp_q16 = {65536, 0, 0, 65536}, .at = {INT32_MAX, INT32_MIN + 1}};
         }
         if (k)
             TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_expect(tracker, at, n));

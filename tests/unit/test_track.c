@@ -303,7 +303,7 @@ static void test_forward_backward_distance_is_enforced(void)
  */
 static void test_shifts_of_60_px_are_recovered_with_prediction(void)
 {
-    static pf_point_q16 at[400];
+    static pf_expected at[400];
     for (int k = 0; k < 24; k++) {
         const double angle = k / 3 * 0.7853981633974483;
         const bool comes = k % 3 != 2, expected = k % 3 != 1;
@@ -315,8 +315,9 @@ static void test_shifts_of_60_px_are_recovered_with_prediction(void)
         feed(t, frame[0]);
         memcpy(before, pf_tracker_tracks(t, &n), sizeof before[0] * pf_tracker_last_stats(t)->live);
         for (uint32_t i = 0; i < n; i++)
-            at[i] = (pf_point_q16){before[i].pos.x + (int32_t)(65536 * (60 * cos(angle) + 4 * sin(i))),
-                                   before[i].pos.y + (int32_t)(65536 * (60 * sin(angle) + 4 * cos(i)))};
+            at[i] = (pf_expected){.warp_q16 = {65536, 0, 0, 65536},
+                                  .at = {before[i].pos.x + (int32_t)(65536 * (60 * cos(angle) + 4 * sin(i))),
+                                         before[i].pos.y + (int32_t)(65536 * (60 * sin(angle) + 4 * cos(i)))}};
         if (expected)
             TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_expect(t, at, n));
         feed(t, frame[1]);

@@ -133,12 +133,19 @@ typedef enum pf_tracker_stage {
  * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
 pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
 
-/* Says where the tracks of the table are expected in the next frame: at[n] in the order of pf_tracker_tracks, Q16.16
- * px, x = PF_NO_GUESS where nothing is expected. A hint: each track starts from whichever of this, its own last move
- * and its old place looks most like it at a coarse level, and is tried from another if that fails. PF_ERR_ARGUMENT: n
- * is not the table's. */
+/* What is expected of a track in the next frame. */
+typedef struct pf_expected {
+    pf_point_q16 at;     /* x = PF_NO_GUESS: nothing */
+    int32_t warp_q16[4]; /* how its surroundings are distorted from this frame to the next, row-major; identity = not */
+} pf_expected;
 #define PF_NO_GUESS INT32_MIN
-pf_status pf_tracker_expect(pf_tracker *tracker, const pf_point_q16 *at, uint32_t n);
+
+/* Says what is expected of the tracks of the table: expected[n] in the order of pf_tracker_tracks. A hint: each track
+ * starts from whichever of this, its own last move and its old place looks most like it at a coarse level, and is tried
+ * from another if that fails. With a warp, a track that does not look like the last frame's patch any more may still be
+ * found by its template, warped so: at high speed in a narrow pipe a patch grows by a sixth from frame to frame.
+ * PF_ERR_ARGUMENT: n is not the table's. */
+pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, uint32_t n);
 
 /* The table after the last frame: live tracks (max_tracks at most) and those lost in it (as many again at most), by
  * ascending id. Valid until the next call. */
@@ -204,13 +211,16 @@ typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker
     uint32_t value[PF_TRACKS_MAX];
 } pf_predictor;
 
+/* Before the first frame: one encoder count moves the camera on by so much of the pipe's radius, Q5.27. */
+void pf_predictor_assume(pf_predictor *predictor, int32_t radii_per_count_q27);
+
 /* Learns from a frame just tracked: tracks[n], rays[n] are its table and bearings. */
 void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *now);
 
-/* Fills at[n] for pf_tracker_expect, for the same table; `next` comes with the frame that follows. */
+/* Fills expected[n] for pf_tracker_expect, for the same table; `next` comes with the frame that follows. */
 void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
-                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_point_q16 *at);
+                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
  * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */
