@@ -67,28 +67,61 @@ void pf_predictor_assume(pf_predictor *p, int32_t radii_per_count_q27)
     p->has_per_count = true;
 }
 
+/* Moves a ray to the cotangent `cot`. */
+static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
+{
+    const int64_t rho = sine_of(v), c = pf_clamp_i64(cot, COT_MOST);
+    const int64_t norm = pf_isqrt64((uint64_t)(((int64_t)1 << 32) + c * c)); /* Q16 */
+    const int64_t sine = ((int64_t)65536 << 30) / norm;
+    return (pf_ray_q30){(int32_t)(sine * v->x / rho), (int32_t)(sine * v->y / rho), (int32_t)(c * ONE / norm)};
+}
+
+/* The common fall in the next frame. */
+static int32_t next_forward(const pf_predictor *p, const pf_motion_hints *next)
+{
+    if (!p->has_per_count || !p->last.has_encoder || !next->has_encoder)
+        return p->forward;
+    const int64_t step = pf_clamp_i64(next->encoder - p->last.encoder, 1 << 24);
+    return pf_clamp_i64((pf_clamp_i64(p->per_count_q30, INT32_MAX) * step) >> 14, COT_MOST);
+}
+
+/* The rotation that is left when the rays of the last frame have been driven on by `fall`, and then each track's own
+ * fall and the median. Under a large fall a rotation fitted to the bare rays would be that of whichever side has more.
+ */
+static void separate(pf_predictor *p, uint32_t count, int32_t fall, uint32_t *measured)
+{
+    for (uint32_t k = 0; k < count; k++) {
+        const int32_t cot = cotangent(&p->from[k]);
+        p->driven[k] = cot == INT32_MAX ? (pf_ray_q30){0, 0, 0} : with_cotangent(&p->from[k], (int64_t)cot - fall);
+    }
+    p->is_known = pf_rotation_fit(p->driven, p->to, count, p->turn) >= LEAST;
+    const int32_t *r = p->turn, back[9] = {r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]};
+    *measured = 0;
+    for (uint32_t k = 0; k < count; k++) {
+        pf_ray_q30 turned;
+        if (!pf_ray_valid(&p->driven[k]) || !pf_ray_valid(&p->to[k]))
+            continue;
+        pf_ray_rotate(back, &p->to[k], &turned);
+        const int32_t before = cotangent(&p->from[k]), after = cotangent(&turned);
+        if (after == INT32_MAX)
+            continue;
+        p->fall[p->pair[k]] = before - after;
+        if (after < SIDE)
+            p->value[(*measured)++] = (uint32_t)((int64_t)before - after + ((int64_t)1 << 31));
+    }
+    p->is_known = p->is_known && *measured >= LEAST;
+    p->forward = p->is_known ? median_signed(p->value, *measured) : 0;
+}
+
 void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *now)
 {
     const uint32_t count = match(p, tracks, rays, n);
-    uint32_t measured = 0;
+    uint32_t measured;
     for (uint32_t j = 0; j < n && j < 2u * PF_TRACKS_MAX; j++)
         p->fall[j] = PF_FALL_UNKNOWN;
-    p->is_known = pf_rotation_fit(p->from, p->to, count, p->turn) >= LEAST;
-    for (uint32_t k = 0; k < count; k++) {
-        pf_ray_q30 turned;
-        if (!pf_ray_valid(&p->from[k]) || !pf_ray_valid(&p->to[k]))
-            continue;
-        pf_ray_rotate(p->turn, &p->from[k], &turned);
-        const int32_t before = cotangent(&turned), after = cotangent(&p->to[k]);
-        if (before == INT32_MAX || after == INT32_MAX)
-            continue;
-        p->fall[p->pair[k]] = before - after;
-        if (after < SIDE)
-            p->value[measured++] = (uint32_t)((int64_t)before - after + ((int64_t)1 << 31));
-    }
-    p->is_known = p->is_known && measured >= LEAST;
-    p->forward = p->is_known ? median_signed(p->value, measured) : 0;
+    separate(p, count, next_forward(p, now), &measured);
+    separate(p, count, p->forward, &measured);
     /* Of a few survivors the slow ones are too many: then what a count means stays as it is. */
     if (p->is_known && 3u * measured >= n && p->last.has_encoder && now->has_encoder &&
         now->encoder != p->last.encoder) {
@@ -99,15 +132,6 @@ void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q3
         p->has_per_count = true;
     }
     remember(p, tracks, rays, n, now);
-}
-
-/* The common fall in the next frame. */
-static int32_t next_forward(const pf_predictor *p, const pf_motion_hints *next)
-{
-    if (!p->has_per_count || !p->last.has_encoder || !next->has_encoder)
-        return p->forward;
-    const int64_t step = pf_clamp_i64(next->encoder - p->last.encoder, 1 << 24);
-    return pf_clamp_i64((pf_clamp_i64(p->per_count_q30, INT32_MAX) * step) >> 14, COT_MOST);
 }
 
 /* The rotation in the next frame: the last one again, but a jump of the inclinometer's roll is believed. */
@@ -125,15 +149,6 @@ static void next_turn(const pf_predictor *p, const pf_motion_hints *next, int32_
     pf_rotation_turn((const int32_t[3]){0, 0, (int32_t)((rolled - already) * ONE / 1000000)}, r);
 }
 
-/* Moves a ray to the cotangent `cot`. */
-static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
-{
-    const int64_t rho = sine_of(v), c = pf_clamp_i64(cot, COT_MOST);
-    const int64_t norm = pf_isqrt64((uint64_t)(((int64_t)1 << 32) + c * c)); /* Q16 */
-    const int64_t sine = ((int64_t)65536 << 30) / norm;
-    return (pf_ray_q30){(int32_t)(sine * v->x / rho), (int32_t)(sine * v->y / rho), (int32_t)(c * ONE / norm)};
-}
-
 /* What the next frame does to a ray. */
 typedef struct pf_drive {
     int32_t turn[9];
@@ -142,10 +157,11 @@ typedef struct pf_drive {
 
 static pf_ray_q30 drive(const pf_drive *d, const pf_ray_q30 *ray)
 {
+    const int32_t cot = cotangent(ray);
+    const pf_ray_q30 driven = cot == INT32_MAX ? *ray : with_cotangent(ray, cot - d->fall);
     pf_ray_q30 turned;
-    pf_ray_rotate(d->turn, ray, &turned);
-    const int32_t cot = cotangent(&turned);
-    return cot == INT32_MAX ? turned : with_cotangent(&turned, cot - d->fall);
+    pf_ray_rotate(d->turn, &driven, &turned);
+    return turned;
 }
 
 static pf_ray_q30 tilted(const pf_ray_q30 *v, const int64_t by[3])

@@ -5,6 +5,7 @@
 
 #define STEPS     8
 #define ONE       1073741824 /* Q30 */
+#define SETTLED   32         /* 3e-8 rad */
 #define ROBUST_C2 2684355    /* Q30 squared chord (0.05 rad) at which a pair's weight has halved */
 #define STEP_MAX  (ONE / 2)  /* rad; the linear model of a larger one says nothing */
 #define WELL_POSED                                                                                                     \
@@ -108,6 +109,8 @@ uint32_t pf_rotation_fit(const pf_ray_q30 *a, const pf_ray_q30 *b, uint32_t n, i
         if (used < PF_ROTATION_LEAST || !solve(h, g, w))
             break;
         pf_rotation_turn(w, r);
+        if (w[0] < SETTLED && w[0] > -SETTLED && w[1] < SETTLED && w[1] > -SETTLED && w[2] < SETTLED && w[2] > -SETTLED)
+            break;
     }
     return used;
 }

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x01D3028Bu
+#define GOLDEN 0xAD33E2C0u
 
 void setUp(void) {}
 void tearDown(void) {}

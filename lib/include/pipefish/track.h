@@ -202,11 +202,11 @@ typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker
     pf_ray_q30 ray[PF_TRACKS_MAX];
     pf_motion_hints last;
     bool is_known, has_per_count;
-    int32_t turn[9];                                   /* rotation of the last frame, Q30 */
-    int32_t forward;                                   /* median fall of the cotangents in the last frame, Q16 */
-    int64_t per_count_q30;                             /* the same for each encoder count */
-    int32_t fall[2u * PF_TRACKS_MAX];                  /* of each row of the table */
-    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX]; /* scratch */
+    int32_t turn[9];                  /* rotation of the last frame, Q30 */
+    int32_t forward;                  /* median fall of the cotangents in the last frame, Q16 */
+    int64_t per_count_q30;            /* the same for each encoder count */
+    int32_t fall[2u * PF_TRACKS_MAX]; /* of each row of the table */
+    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX], driven[PF_TRACKS_MAX]; /* scratch */
     uint16_t pair[PF_TRACKS_MAX];
     uint32_t value[PF_TRACKS_MAX];
 } pf_predictor;
