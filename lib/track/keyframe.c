@@ -1,6 +1,10 @@
 /* Keyframe choice, in integers: the same bits on all targets. */
 #include "track_private.h"
 
+/* A reference taken in the dark shares nothing with anything: it goes when there are so many tracks again. */
+#define OUTGROWN       2u
+#define OUTGROWN_LEAST 16u
+
 static uint32_t or_default(uint32_t value, uint32_t fallback)
 {
     return value ? value : fallback;
@@ -90,6 +94,14 @@ static uint32_t count_common(const pf_keyframe_state *state, const pf_track *tra
     return count;
 }
 
+static uint32_t count_alive(const pf_track *tracks, uint32_t n)
+{
+    uint32_t count = 0;
+    for (uint32_t i = 0; i < n; i++)
+        count += alive(&tracks[i]);
+    return count;
+}
+
 static void take_reference(pf_keyframe_state *state, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                            const int64_t *encoder)
 {
@@ -128,7 +140,8 @@ pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe
                 median >= chord2_of_angle(or_default(config->parallax_urad, 174533)))
                 cause = PF_KEYFRAME_PARALLAX;
         }
-        if (cause == PF_KEYFRAME_NO && shared < (wanted < half ? wanted : half))
+        if (cause == PF_KEYFRAME_NO &&
+            (shared < (wanted < half ? wanted : half) || count_alive(tracks, n) > OUTGROWN * state->n + OUTGROWN_LEAST))
             cause = PF_KEYFRAME_FEW_COMMON;
     }
     if (cause != PF_KEYFRAME_NO)

@@ -146,6 +146,21 @@ static void test_few_common_tracks_force_a_keyframe(void)
     TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FEW_COMMON, decide(&config, NULL, NULL));
 }
 
+/* Proves: after a keyframe in the dark, without a track, light forces one; a few tracks do not. */
+static void test_a_reference_without_tracks_is_not_kept(void)
+{
+    look(0, 0, 0);
+    for (int i = 0; i < N; i++)
+        tracks[i].status = PF_TRACK_LOST;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, NULL));
+    for (int i = 0; i < 16; i++)
+        tracks[i].status = PF_TRACK_NEW;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, NULL));
+    tracks[16].status = PF_TRACK_NEW;
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FEW_COMMON, decide(&config, NULL, NULL));
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, NULL));
+}
+
 /* Proves: the interval holds whatever the cause. */
 static void test_interval_between_keyframes_is_kept(void)
 {
@@ -183,6 +198,7 @@ int main(void)
     RUN_TEST(test_rotation_is_found_to_a_ten_thousandth);
     RUN_TEST(test_forward_motion_makes_a_keyframe_at_the_parallax);
     RUN_TEST(test_few_common_tracks_force_a_keyframe);
+    RUN_TEST(test_a_reference_without_tracks_is_not_kept);
     RUN_TEST(test_interval_between_keyframes_is_kept);
     RUN_TEST(test_invalid_bearings_are_left_out);
     return UNITY_END();

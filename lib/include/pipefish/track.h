@@ -267,7 +267,8 @@ typedef struct pf_keyframe_config { /* zero = default in brackets */
     uint32_t step_counts;           /* encoder counts between keyframes; 0 = do not use the encoder */
     uint32_t parallax_urad;         /* micro-radians [174533 = 10 degrees] */
     uint32_t min_common;   /* forced below so many common tracks [100], or below half of what the last keyframe had
-                            * where that is less: weak texture alone must not force one at every frame */
+                            * where that is less: weak texture alone must not force one at every frame. Forced as well
+                            * when there are over twice as many tracks as the last keyframe had, and 16 */
     uint32_t min_interval; /* frames, at least so many between keyframes [2] */
 } pf_keyframe_config;
 
