@@ -75,7 +75,7 @@ pytest: build
 bench: build
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-accept: build unit fuzz-build
+accept: build unit fuzz-build cross
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv
