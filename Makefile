@@ -90,7 +90,7 @@ bench: build $(STAMP)/venv-peers
 	@tools/install-packages bench
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-accept: build unit fuzz-build $(STAMP)/venv-peers
+accept: build unit fuzz-build cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv

@@ -66,6 +66,14 @@ static const setting settings[] = {
      "radius of the image circle; 0 = the profile's; without one the whole image is used"},
     {"tracker", "reset_gap", INTEGER, AT(tracker.reset_gap), "frames", "5", 0, 1000000, NULL,
      "after a gap of more missing frames than this all tracks begin anew: a marked break"},
+    {"tracker", "mask", TEXT, AT(tracker.mask), "", "", 0, 0, NULL,
+     "picture of the frame's size (PGM, PNG), black where nothing is to be tracked; empty = none"},
+    {"tracker", "static_mask", SWITCH, AT(tracker.static_mask), "", "true", 0, 0, NULL,
+     "find by itself what stands still in the picture while the rest moves, and mask it"},
+    {"tracker", "cells", CHOICE, AT(tracker.cells), "", "grid", 0, 0, "grid|polar",
+     "how new tracks are spread: over the picture, or over rings and sectors of the image circle"},
+    {"tracker", "prediction", SWITCH, AT(tracker.prediction), "", "true", 0, 0, NULL,
+     "look for tracks where the last motion, the encoder and the roll put them; needs a profile"},
 
     {"keyframe", "step_mm", NUMBER, AT(keyframe.step_mm), "mm", "0", 0, 100000, NULL,
      "distance between keyframes by the encoder; 0 = a quarter of the nominal radius"},
@@ -118,6 +126,8 @@ static const setting settings[] = {
      "false = after the survey the daemon goes on serving the host until SIGTERM"},
     {"daemon", "status_file", TEXT, AT(daemon.status_file), "", "", 0, 0, NULL,
      "JSON file with the status message's figures, replaced at intervals and at the end; empty = none"},
+    {"daemon", "threads", INTEGER, AT(daemon.threads), "", "2", 1, 2, NULL,
+     "2 = while a frame is tracked the next one is taken and the last one's keyframe made; the results are the same"},
     {"daemon", "log_level", CHOICE, AT(daemon.log_level), "", "info", 0, 0, "error|warning|info|debug",
      "what goes to standard error"},
 };

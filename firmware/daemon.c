@@ -69,6 +69,7 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
         .uptime_ns = now - d->started_ns,
         .has_clock = c->has_clock,
         .clock = c->clock,
+        .tracking = c->tracking,
     };
     if (c->last_ns > c->first_ns)
         status->fps = (double)c->frames_tracked * 1e9 / (double)(c->last_ns - c->first_ns);
@@ -77,6 +78,23 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
     status->has_profile = d->has_profile;
     if (d->has_profile)
         status->profile = pf_daemon_profile(d);
+}
+
+static void print_tracking(FILE *out, const pf_msg_tracking *t)
+{
+    static const char *const states[PF_SCENE_FLAGS] = {"standing", "reversing",    "dark",
+                                                       "covered",  "over_exposed", "weak_texture"};
+    static const char *const reasons[PF_TRACK_REASONS] = {
+        "", "left", "flat", "diverged", "residual", "backward", "crowded", "drift", "masked", "static", "saturated"};
+    (void)fputs("  \"tracking\": {", out);
+    for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
+        (void)fprintf(out, "\"%s\": %s, ", states[i], t->scene >> i & 1u ? "true" : "false");
+    (void)fprintf(out, "\"frames\": %" PRIu64 ", \"tracked\": %" PRIu64 ", \"detected\": %" PRIu64, t->frames,
+                  t->tracked, t->detected);
+    for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
+        (void)fprintf(out, ", \"lost_%s\": %" PRIu64, reasons[i], t->lost_by[i]);
+    (void)fprintf(out, ", \"age_median\": %u, \"quality_median\": %u, \"static_blocks\": %u},\n", t->age_median,
+                  t->quality_median, t->static_blocks);
 }
 
 static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store)
@@ -102,6 +120,7 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
                   s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
                   store->refused);
+    print_tracking(out, &s->tracking);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
                   ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64

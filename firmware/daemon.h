@@ -37,6 +37,7 @@ typedef struct pf_counters {
     uint64_t capture_ns, stage_ns[PF_STAGES], keyframe_ns, frame_max_ns; /* sums; the slowest frame */
     uint64_t first_ns, last_ns; /* when capture began, when the last frame was done */
     pf_msg_telemetry telemetry;
+    pf_msg_tracking tracking;
     bool link_up;
     pf_link_stats link;
     bool has_clock;

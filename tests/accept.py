@@ -91,6 +91,22 @@ def check_daemon_kills() -> list[dict]:
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 
 
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "c6921309"
+
+
+def check_golden_replay() -> list[dict]:
+    """The hash of a long replay through the tracker, on x86 and (emulated) on aarch64."""
+    rows = []
+    for target, folder, emulator in (
+        ("x86", "debug", ()),
+        ("aarch64", "aarch64", ("qemu-aarch64-static", "-L", "/usr/aarch64-linux-gnu")),
+    ):
+        done = run(*emulator, BUILD / folder / "tests/unit/golden_replay", str(GOLDEN_FRAMES))
+        differs = done.returncode != 0 or done.stdout.split()[:1] != [GOLDEN_HASH]
+        rows.append(exactly(f"track.golden_{GOLDEN_FRAMES}_{target}_differs", int(differs), 0))
+    return rows
+
+
 def check_fuzz() -> list[dict]:
     """Every fuzz target for two million inputs."""
     folder = BUILD / "clang/tests/fuzz"
@@ -124,6 +140,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
+    "golden_replay": check_golden_replay,
     "fuzz": check_fuzz,
     "demo": check_demo,
 }

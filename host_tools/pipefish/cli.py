@@ -144,6 +144,10 @@ def info_text(info: dict[str, Any]) -> str:
                 f"frames; median {tracks['length_keyframes_median']:.0f} keyframes",
             ),
         ]
+    if info["states"]:
+        rows.append(("states", ", ".join(f"{state} at {count} keyframes" for state, count in info["states"].items())))
+    if info["lost_tracks"]:
+        rows.append(("tracks lost", losses_text(info["lost_tracks"])))
     rows.append(("ended", info["end_reason"]))
     if info["object_bytes"]:
         rows.append(("received", size_text(info["object_bytes"])))
@@ -154,11 +158,23 @@ def info_text(info: dict[str, Any]) -> str:
     return table(rows)
 
 
+def losses_text(losses: dict[str, int]) -> str:
+    """Lost tracks by reason, most first."""
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(losses.items(), key=lambda item: -item[1]))
+
+
 def run_show(args: argparse.Namespace) -> Result:
+    from pipefish.page import write_statistics
     from pipefish.show import show
     from pipefish.survey import Survey
 
-    written = show(Survey.open(args.survey), Path(args.output), args.keyframe, quiet=args.json)
+    survey, out = Survey.open(args.survey), Path(args.output)
+    if args.stats:
+        if out.suffix.lower() not in (".html", ".htm"):
+            raise PipefishError(f"{out}: --stats writes a .html page")
+        size = write_statistics(survey, out)
+        return {"file": str(out), "kind": "statistics", "bytes": size}, f"{out} (statistics, {size_text(size)})"
+    written = show(survey, out, args.keyframe, quiet=args.json, colour=args.colour)
     return written, f"{written['file']} ({written['kind']}, {size_text(float(str(written['bytes'])))})"
 
 
@@ -167,6 +183,7 @@ def run_status(args: argparse.Namespace) -> Result:
 
     from pipefish import pipefish_pb2 as pb
     from pipefish.client import Client, Handlers
+    from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
     client = Client(open_transport(args.device, args.baud), Handlers(), wants_objects=False)
@@ -193,6 +210,8 @@ def run_status(args: argparse.Namespace) -> Result:
             f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped",
         ),
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
+        ("scene", ", ".join(states_of(status.tracking)) or "nothing special"),
+        ("lost so far", losses_text(losses_of(status.tracking)) or "none"),
         ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
         ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"),
         (
@@ -203,6 +222,33 @@ def run_status(args: argparse.Namespace) -> Result:
         ("frame time", f"{stage.pyramid + stage.track + stage.detect:.0f} us, slowest {stage.frame_max:.0f} us"),
     ]
     return document, table(rows)
+
+
+def run_evaluate(args: argparse.Namespace) -> Result:
+    from pipefish.evaluate import compare_with_opencv, evaluate, verdict
+    from pipefish.simulate import Scene
+    from pipefish.survey import Survey
+
+    stem = Path(args.recording)
+    truth = Scene.from_truth(stem.with_name(stem.name + ".truth.json"))
+    survey = Survey.open(args.survey)
+    ours = evaluate(survey, truth)
+    if ours is None:
+        raise PipefishError(f"{survey.path}: no track was seen in two keyframes")
+    peer = compare_with_opencv(survey, truth, stem.with_name(stem.name + ".y4m")) if args.opencv else None
+    bars = verdict(ours, peer, smooth=args.smooth)
+    rows: list[tuple[str, object]] = [("", "device" + (", OpenCV's recipe" if peer else ""))]
+    for name, what in (
+        ("within_1px", "within 1 px"),
+        ("survival", "kept of those visible"),
+        ("median_px", "median error, px"),
+        ("length_median", "median length, frames"),
+    ):
+        values = [side[name] for side in (ours, peer) if side is not None]
+        rows.append((what, ", ".join("-" if v is None else f"{v:.4g}" for v in values)))
+    failed = [name for name, row in bars.items() if not row["holds"]]
+    rows.append(("bars", "all hold" if not failed else "missed: " + ", ".join(failed)))
+    return {"device": ours, "opencv": peer, "bars": bars}, table(rows)
 
 
 def run_simulate(args: argparse.Namespace) -> Result:
@@ -397,6 +443,20 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="picture to write")
     p.add_argument("--keyframe", type=int, metavar="N", help="index of the keyframe [the middle one]")
+    p.add_argument("--colour", choices=("age", "quality"), default="age", help="what the tracks' colour tells [age]")
+    p.add_argument("--stats", action="store_true", help="a .html page instead: what became of the tracks, and why")
+
+    p = add_command(
+        commands,
+        "evaluate",
+        run_evaluate,
+        "Compare the tracks of a survey of a simulated pipe with the truth, and with OpenCV's.",
+        "pipefish evaluate survey.mcap --recording /tmp/pipe --opencv",
+    )
+    p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
+    p.add_argument("--recording", required=True, metavar="STEM", help="of pipefish simulate: STEM.truth.json, STEM.y4m")
+    p.add_argument("--opencv", action="store_true", help="also run OpenCV's usual chain over the recording's frames")
+    p.add_argument("--smooth", action="store_true", help="the bars for smooth plastic")
 
     p = add_command(
         commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"

@@ -187,9 +187,35 @@ static pipefish_v1_Profile profile_message(const pf_msg_profile *in)
     return out;
 }
 
+static void set_tracking(pipefish_v1_Tracking *out, const pf_msg_tracking *in)
+{
+    *out = (pipefish_v1_Tracking){.standing = (in->scene & PF_SCENE_STANDING) != 0,
+                                  .reversing = (in->scene & PF_SCENE_REVERSING) != 0,
+                                  .dark = (in->scene & PF_SCENE_DARK) != 0,
+                                  .covered = (in->scene & PF_SCENE_COVERED) != 0,
+                                  .over_exposed = (in->scene & PF_SCENE_OVEREXPOSED) != 0,
+                                  .weak_texture = (in->scene & PF_SCENE_WEAK_TEXTURE) != 0,
+                                  .frames = in->frames,
+                                  .tracked = in->tracked,
+                                  .detected = in->detected,
+                                  .lost_left = in->lost_by[PF_TRACK_LEFT],
+                                  .lost_flat = in->lost_by[PF_TRACK_FLAT],
+                                  .lost_diverged = in->lost_by[PF_TRACK_DIVERGED],
+                                  .lost_residual = in->lost_by[PF_TRACK_RESIDUAL],
+                                  .lost_backward = in->lost_by[PF_TRACK_BACKWARD],
+                                  .lost_crowded = in->lost_by[PF_TRACK_CROWDED],
+                                  .lost_drift = in->lost_by[PF_TRACK_DRIFT],
+                                  .lost_masked = in->lost_by[PF_TRACK_MASKED],
+                                  .lost_static = in->lost_by[PF_TRACK_STATIC],
+                                  .lost_saturated = in->lost_by[PF_TRACK_SATURATED],
+                                  .age_median = in->age_median,
+                                  .quality_median = in->quality_median,
+                                  .static_blocks = in->static_blocks};
+}
+
 static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
 {
-    out->has_time = out->has_stage = out->has_spool = out->has_link = out->has_telemetry = true;
+    out->has_time = out->has_stage = out->has_spool = out->has_link = out->has_telemetry = out->has_tracking = true;
     out->time = device_time(&in->time);
     memcpy(out->survey_id, in->survey_id, sizeof out->survey_id);
     out->state = text(in->state);
@@ -225,6 +251,7 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     out->has_profile = in->has_profile;
     if (in->has_profile)
         out->profile = profile_message(&in->profile);
+    set_tracking(&out->tracking, &in->tracking);
 }
 
 /* The library fails on a full buffer only: the callbacks here never do, and texts are not checked. */
@@ -267,6 +294,8 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     m.has_observations = true;
     set_observations(&m.observations, columns, k->tracks, k->n_tracks);
     m.common_tracks = k->common_tracks;
+    m.has_tracking = true;
+    set_tracking(&m.tracking, &k->tracking);
     return encode(pipefish_v1_Keyframe_fields, &m, out, capacity, n);
 }
 

@@ -95,10 +95,37 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
 /* Variance of the position against the template; gain as the fit gave it. Fills the three fields of `track`. */
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
 
-/* Detection. */
-#define CORNER_REACH                                                                                                   \
-    6 /* from the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients                    \
-       */
+/* --- bearings (rotation.c) --- */
+
+#define PF_ROTATION_LEAST 8u /* fewer pairs of bearings say nothing */
+
+static inline bool pf_ray_valid(const pf_ray_q30 *ray)
+{
+    return ray->x != 0 || ray->y != 0 || ray->z != 0;
+}
+
+/* Row-major Q30 rotation times a ray, each coordinate within 1 LSB. */
+void pf_ray_rotate(const int32_t r[9], const pf_ray_q30 *v, pf_ray_q30 *out);
+
+/* Squared chord between two unit rays, Q2.30, at most 3 LSB too low, saturating just below 4. */
+uint32_t pf_ray_chord2(const pf_ray_q30 *a, const pf_ray_q30 *b);
+
+/* r <- C(w) r with Cayley's map of the small rotation w, Q30 rad: for |w| << 1 the rotation by w. */
+void pf_rotation_turn(const int32_t w[3], int32_t r[9]);
+
+/* The rotation (row-major, Q30) that takes the rays a[n] to b[n], n <= 2048, with Cauchy weights of 0.05 rad: what
+ * moved with the others counts, near walls that did not count little. From 30 degrees apart and less it converges.
+ * Invalid rays (0, 0, 0) are left out. Returns the pairs used; with fewer than PF_ROTATION_LEAST, or where they do not
+ * determine a rotation, r is what was found so far (first the identity). Exact data: within 1e-7 rad. */
+uint32_t pf_rotation_fit(const pf_ray_q30 *a, const pf_ray_q30 *b, uint32_t n, int32_t r[9]);
+
+/* Value of rank k (0 = least, k < n) by bisection over the bits: the array stays, no order of ties matters. */
+uint32_t pf_value_of_rank(const uint32_t *value, uint32_t n, uint32_t k);
+
+/* --- detection (corners.c) --- */
+
+/* From the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients. */
+#define CORNER_REACH 6
 
 typedef struct pf_corner {
     int32_t x, y;

@@ -150,6 +150,20 @@ static pf_msg_telemetry sample_telemetry(void)
                               .emergency_stop = true};
 }
 
+static pf_msg_tracking sample_tracking(void)
+{
+    pf_msg_tracking t = {.scene = PF_SCENE_REVERSING | PF_SCENE_OVEREXPOSED,
+                         .frames = 7,
+                         .tracked = 8,
+                         .detected = 9,
+                         .age_median = 20,
+                         .quality_median = 21,
+                         .static_blocks = 22};
+    for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
+        t.lost_by[i] = 9 + i;
+    return t;
+}
+
 static pf_msg_status sample_status(void)
 {
     pf_msg_status s = {.time = {7, 8},
@@ -168,7 +182,8 @@ static pf_msg_status sample_status(void)
                        .telemetry = sample_telemetry(),
                        .uptime_ns = 99,
                        .has_clock = true,
-                       .clock = {7, -123456789, 1000}};
+                       .clock = {7, -123456789, 1000},
+                       .tracking = sample_tracking()};
     s.link.bytes_out = 21;
     s.link.bytes_in = 22;
     s.link.frames_out = 23;
@@ -217,7 +232,8 @@ static pf_msg_keyframe sample_keyframe(const pf_track *tracks)
                          .telemetry = sample_telemetry(),
                          .tracks = tracks,
                          .n_tracks = TRACKS,
-                         .common_tracks = 44};
+                         .common_tracks = 44,
+                         .tracking = sample_tracking()};
     memcpy(k.survey_id, survey_id, 16);
     memset(k.frame_sha256, 0xAB, 32);
     return k;
@@ -282,6 +298,15 @@ static void check_telemetry(view t)
     TEST_ASSERT_EQUAL_UINT64(1, number(t, 10));
 }
 
+/* Of sample_tracking: field i is i, but for the states. */
+static void check_tracking(view t)
+{
+    for (uint32_t i = 1; i <= 6; i++)
+        TEST_ASSERT_EQUAL_UINT64(i == 2 || i == 5, number(t, i));
+    for (uint32_t i = 7; i <= 22; i++)
+        TEST_ASSERT_EQUAL_UINT64(i, number(t, i));
+}
+
 static void check_status(view s)
 {
     static const uint32_t plain[][2] = {{4, 1000}, {5, 2}, {7, 400}, {8, 5}, {9, 6}, {10, 70}, {11, 8}, {17, 99}};
@@ -299,6 +324,7 @@ static void check_status(view s)
     for (uint32_t i = 2; i <= 12; i++)
         TEST_ASSERT_EQUAL_UINT64(19 + i, number(bytes(s, 15), i));
     check_telemetry(bytes(s, 16));
+    check_tracking(bytes(s, 20));
     TEST_ASSERT_EQUAL_INT64(-123456789, zigzag(number(bytes(s, 18), 2)));
     TEST_ASSERT_EQUAL_UINT64(1000, number(bytes(s, 18), 3));
 }
@@ -342,6 +368,7 @@ static void test_keyframe_round_trip(void)
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_append_break("restart", out, n + 10, &n));
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break("restart", out, n + 11, &n));
     m = (view){out, n};
+    check_tracking(bytes(m, 17));
     TEST_ASSERT_EQUAL_MEMORY(survey_id, bytes(m, 1).data, 16);
     TEST_ASSERT_EQUAL_UINT64(12, number(m, 2));
     TEST_ASSERT_EQUAL_UINT64(7, number(bytes(m, 3), 1));

@@ -33,6 +33,13 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     bool emergency_stop;
 } pf_msg_telemetry;
 
+typedef struct pf_msg_tracking {
+    uint32_t scene; /* pf_scene_flag */
+    uint64_t frames, tracked, detected;
+    uint64_t lost_by[PF_TRACK_REASONS];
+    uint32_t age_median, quality_median, static_blocks;
+} pf_msg_tracking;
+
 typedef struct pf_msg_keyframe {
     uint8_t survey_id[16];
     uint32_t index;
@@ -49,6 +56,7 @@ typedef struct pf_msg_keyframe {
     const pf_track *tracks; /* n_tracks, ids ascending; lost ones are left out */
     uint32_t n_tracks;
     uint32_t common_tracks;
+    pf_msg_tracking tracking;
 } pf_msg_keyframe;
 
 /* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break reason at most 256 bytes: 10
@@ -110,6 +118,7 @@ typedef struct pf_msg_status {
     pf_msg_clock_sync clock;
     bool has_profile;
     pf_msg_profile profile; /* in use */
+    pf_msg_tracking tracking;
 } pf_msg_status;
 
 typedef struct pf_msg_survey_end {
