@@ -8,7 +8,7 @@
 
 #include "track_private.h"
 
-#define SETTLED       2621 /* 0.04 px: the next step would be a tenth of it */
+#define SETTLED       1311 /* 0.02 px: the next step would be a tenth of it */
 #define SETTLED_WARP  8000 /* Q16, times half the window: 0.12 px at the window's edge */
 #define STEP_MAX      (2 << 16)
 #define WARP_STEP_MAX (1 << 14)

@@ -1,8 +1,7 @@
 /* Where new tracks come from. */
 #include "tracker_private.h"
 
-#define INNER     8  /* polar cells: nothing new in this fraction of the radius */
-#define SATURATED 16 /* a new window may have this fraction of its pixels saturated */
+#define INNER 8 /* polar cells: nothing new in this fraction of the radius */
 
 static bool weaker(const pf_corner *a, const pf_corner *b)
 {

@@ -18,7 +18,6 @@
 #define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
-#define SATURATED    4         /* at most this fraction of a window may be saturated */
 #define NEIGHBOURS   3
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)

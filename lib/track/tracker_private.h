@@ -9,6 +9,7 @@
 #define SECTORS    12u /* detection in polar cells: sectors of 30 degrees */
 #define RINGS      6u
 #define CANDIDATES 4u /* for corners, times the tracks there may be: most stand too near a stronger one */
+#define SATURATED  4u /* at most this fraction of a window may be saturated */
 
 typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x6C290D95u
+#define GOLDEN 0x8626E5DEu
 
 void setUp(void) {}
 void tearDown(void) {}
