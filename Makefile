@@ -38,7 +38,12 @@ native: packages-build
 
 # The virtual environment; made anew when what goes into it changes.
 $(STAMP)/venv: pyproject.toml tools/requirements.txt tools/make-venv | packages-build
-	@tools/make-venv $(VENV)
+	@tools/make-venv $(VENV) tools/requirements.txt
+	@mkdir -p $(STAMP) && touch $@
+
+# What the benchmarks compare with: never a part of the product.
+$(STAMP)/venv-peers: tools/requirements-peers.txt tools/make-venv | packages-build
+	@tools/make-venv build/venv-peers $<
 	@mkdir -p $(STAMP) && touch $@
 
 # The package is installed in place: only a change of C, C++ or CMake builds it again.
@@ -72,7 +77,8 @@ cross: packages-test $(STAMP)/venv
 pytest: build
 	@$(PY) -m pytest -q
 
-bench: build
+bench: build $(STAMP)/venv-peers
+	@tools/install-packages bench
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
 accept: build unit fuzz-build

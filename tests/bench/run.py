@@ -18,11 +18,15 @@ ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ROOT / "build" / "release" / "tests" / "bench"
 
 
-def run_program(path: Path) -> list[dict]:
+# Debian's Python has Debian's OpenCV and mrcal; the other has what pip brings.
+PEER_PYTHONS = (Path("/usr/bin/python3"), ROOT / "build" / "venv-peers" / "bin" / "python")
+
+
+def run_program(*command: Path) -> list[dict]:
     """Runs one benchmark program and returns its figures."""
-    done = subprocess.run([path], capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise SystemExit(f"{path.name} failed with exit code {done.returncode}: {done.stderr.strip()}")
+        raise SystemExit(f"{command[-1].name} failed with exit code {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
 
@@ -39,7 +43,14 @@ def bench_sim() -> list[dict]:
     return [{"name": "sim.fps", "value": count / (time.perf_counter() - start), "unit": "frames/s"}]
 
 
-PYTHON_ROOMS = {"sim": bench_sim}
+def bench_camera() -> list[dict]:
+    """camera.project, camera.unproject against every peer that is installed."""
+    library = PROGRAMS / "libbench_camera_core.so"
+    script = ROOT / "tests" / "bench" / "camera_peers.py"
+    return [figure for python in PEER_PYTHONS if python.exists() for figure in run_program(python, script, library)]
+
+
+PYTHON_ROOMS = {"camera": bench_camera, "sim": bench_sim}
 
 
 def cpu_name() -> str:

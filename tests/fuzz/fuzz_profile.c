@@ -30,7 +30,10 @@ static void repair(uint8_t *bytes, size_t n)
 static void use_camera(const pf_camera *camera)
 {
     for (int i = 0; i <= 16; i++) {
-        double theta = camera->theta_max * i / 16, xyz[3] = {0.6 * sin(theta), -0.8 * sin(theta), cos(theta)};
+        /* 100 m along the ray: clear of where rays of a moving pupil cross */
+        double theta = camera->theta_max * i / 16, length = 100;
+        double xyz[3] = {0.6 * length * sin(theta), -0.8 * length * sin(theta),
+                         length * cos(theta) + camera->pupil_e1 * theta * theta};
         double uv[2], d_xyz[6], d_param[2 * PF_CAMERA_PARAMS], ray[3], d_uv[6];
         require(pf_camera_project(camera, xyz, uv, d_xyz, d_param) == PF_OK);
         require(pf_camera_unproject(camera, uv, ray, NULL, d_uv) == PF_OK);

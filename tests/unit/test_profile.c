@@ -271,7 +271,7 @@ static void test_bad_fields_are_refused_and_named(void)
         {104, 1, 0x7F, PF_ERR_FORMAT, "serial"},
         {168, 2, 0, PF_ERR_FORMAT, "width"},
         {175, 1, 1, PF_ERR_FORMAT, "height"},
-        {176, 1, 1, PF_ERR_UNSUPPORTED, "radial"},
+        {176, 1, 1, PF_ERR_FORMAT, "k2"},
         {176, 1, 7, PF_ERR_FORMAT, "radial"},
         {180, 1, 41, PF_ERR_FORMAT, "free_count"},
         {180, 4, 0xFF, PF_ERR_FORMAT, "free_count"},
@@ -280,16 +280,16 @@ static void test_bad_fields_are_refused_and_named(void)
         {180, 1, 0, PF_ERR_FORMAT, "length"},
         {184, 8, 0, PF_ERR_FORMAT, "f_u"},
         {192, 8, 0xFF, PF_ERR_FORMAT, "f_v"},
-        {224, 1, 1, PF_ERR_UNSUPPORTED, "tilt"},
+        {224 + 7, 1, 0x40, PF_ERR_FORMAT, "tilt[0]"},
         {240 + 7, 1, 0xFF, PF_ERR_FORMAT, "k2"},
         {248 + 7, 1, 0xBF, PF_ERR_DOMAIN, "theta_max"}, /* k3 = -0.0039, doubled below */
-        {272, 1, 1, PF_ERR_UNSUPPORTED, "asym_radial_theta"},
-        {296, 1, 1, PF_ERR_UNSUPPORTED, "asym_radial_phi"},
-        {328, 1, 1, PF_ERR_UNSUPPORTED, "asym_tangential_theta"},
-        {352, 1, 1, PF_ERR_UNSUPPORTED, "asym_tangential_phi"},
-        {384 + 8 * 13, 1, 1, PF_ERR_UNSUPPORTED, "cpoly"},
-        {496, 1, 1, PF_ERR_UNSUPPORTED, "mirror"},
-        {504, 1, 1, PF_ERR_UNSUPPORTED, "pupil_e1"},
+        {272 + 7, 1, 0x7F, PF_ERR_FORMAT, "asym_radial_theta"},
+        {296 + 7, 1, 0x7F, PF_ERR_FORMAT, "asym_radial_phi"},
+        {328 + 7, 1, 0x7F, PF_ERR_FORMAT, "asym_tangential_theta"},
+        {352 + 7, 1, 0x7F, PF_ERR_FORMAT, "asym_tangential_phi"},
+        {384 + 8 * 13 + 7, 1, 0x7F, PF_ERR_FORMAT, "cpoly"},
+        {496 + 7, 1, 0x3F, PF_ERR_FORMAT, "mirror"},
+        {504 + 7, 1, 0x40, PF_ERR_FORMAT, "pupil_e1"},
         {512, 8, 0, PF_ERR_FORMAT, "theta_max"},
         {536, 8, 0xBF, PF_ERR_FORMAT, "circle_radius"},
         {544, 1, 8, PF_ERR_FORMAT, "free_param"},
@@ -384,8 +384,8 @@ static void test_encode_refuses(void)
     profile.camera.f_u = (double)NAN;
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, NULL));
     profile = sample();
-    profile.camera.pupil_e1 = 1e-3;
-    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    profile.camera.pupil_e1 = 2;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
     TEST_ASSERT_EQUAL_STRING_LEN("pupil_e1:", why, 9);
     profile = sample();
     profile.camera.k2 = -1;

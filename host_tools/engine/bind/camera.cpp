@@ -167,6 +167,10 @@ void bind_camera(nb::module_ &m)
             nb::arg("xyz").noconvert(), "(N,3) float64 -> (N,2) float64, (N,) bool; the profile must be valid.")
         .def(
             "unproject",
-            [](const pf_profile &p, const Rows<2> &uv) { return run_batch<2, 3>(p, uv, pf_camera_unproject_n); },
+            [](const pf_profile &p, const Rows<2> &uv) {
+                return run_batch<2, 3>(p, uv,
+                                       [](const pf_camera *camera, size_t n, const double *in, double *out,
+                                          uint8_t *ok) { pf_camera_unproject_n(camera, n, in, out, nullptr, ok); });
+            },
             nb::arg("uv").noconvert(), "(N,2) float64 -> (N,3) float64, (N,) bool; the profile must be valid.");
 }

@@ -1,0 +1,160 @@
+/* Back-projection of single pixels. */
+#include "real.h"
+
+#include <float.h>
+
+/* The plane point's direction and the angle that a ray makes there. */
+typedef struct plane_angle {
+    double theta, c, s;
+} plane_angle;
+
+static plane_angle symmetric_inverse(const pf_camera *camera, double x, double y)
+{
+    double rd = sqrt(x * x + y * y), inverse = rd > 0 ? 1 / rd : 0, none;
+    double rd_max = camera->theta_max * pf_camera_radial(camera, camera->theta_max, &none);
+    plane_angle at = {rd >= rd_max ? camera->theta_max : pf_camera_radial_solve(camera, rd), rd > 0 ? x * inverse : 1,
+                      y * inverse};
+    return at;
+}
+
+/* Plane point minus target, in the frame (u_r, u_phi) of `at`; returns its squared length. */
+static double residual(const lens_point *lens, plane_angle at, double x, double y, double out[2])
+{
+    out[0] = at.theta * lens->r - (x * at.c + y * at.s);
+    out[1] = at.theta * lens->t - (y * at.c - x * at.s);
+    return out[0] * out[0] + out[1] * out[1];
+}
+
+/* Paper II, eq. 14-16: with the symmetric inverse Phi of the target x and S the asymmetric part there,
+ * s = (I + dS/dPhi (dF/dPhi)^-1)^-1 S and the start is the symmetric inverse of x - s. Done in the plane, where the
+ * rim's small r' cannot throw the start away. */
+static plane_angle first_order_start(const pf_camera *camera, camera_kind kind, double x, double y)
+{
+    plane_angle at = symmetric_inverse(camera, x, y);
+    lens_point lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s);
+    double slope, over = pf_camera_radial(camera, at.theta, &slope);
+    double f[2] = {1 / slope, 1 / over};
+    double m[4] = {1 + (lens.r_t - slope) * f[0], lens.r_p * f[1], lens.t_t * f[0], 1 + (lens.t_p - over) * f[1]};
+    double S[2] = {at.theta * (lens.r - over), at.theta * lens.t};
+    double det = m[0] * m[3] - m[1] * m[2];
+    if (!(det > 0.1 && det < 10)) /* the rule's own linearisation does not hold: Newton starts from Phi */
+        return at;
+    double radial = (m[3] * S[0] - m[1] * S[1]) / det, tangential = (m[0] * S[1] - m[2] * S[0]) / det;
+    return symmetric_inverse(camera, x - (at.c * radial - at.s * tangential), y - (at.s * radial + at.c * tangential));
+}
+
+/* at + (radial, tangential) in the chart (X, Y) = theta (cos phi, sin phi), kept within theta_max. */
+static plane_angle moved(const pf_camera *camera, plane_angle at, double radial, double tangential)
+{
+    double along = at.theta + radial;
+    double theta = sqrt(along * along + tangential * tangential);
+    plane_angle next = at;
+    if (theta > 0) {
+        double inverse = 1 / theta, c = along * inverse, s = tangential * inverse;
+        next.c = at.c * c - at.s * s;
+        next.s = at.s * c + at.c * s;
+        double norm = 1 / sqrt(next.c * next.c + next.s * next.s);
+        next.c *= norm;
+        next.s *= norm;
+    }
+    next.theta = theta < camera->theta_max ? theta : camera->theta_max;
+    return next;
+}
+
+/* Newton on the whole map in the chart (X, Y), where the axis is an ordinary point; a step that does not come closer is
+ * halved. pf_camera_check has proved the map one-to-one on the disc, so what stops with a residual lies outside. */
+static bool asymmetric_inverse(const pf_camera *camera, camera_kind kind, double x, double y, double slack,
+                               plane_angle *out)
+{
+    plane_angle at = first_order_start(camera, kind, x, y);
+    lens_point lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s);
+    double e[2], cost = residual(&lens, at, x, y, e);
+    for (int i = 0; i < 100 && cost > 0; i++) {
+        double det = lens.r_t * lens.t_p - lens.r_p * lens.t_t;
+        double radial = -(lens.t_p * e[0] - lens.r_p * e[1]) / det;
+        double tangential = -(lens.r_t * e[1] - lens.t_t * e[0]) / det;
+        double step = sqrt(radial * radial + tangential * tangential);
+        if (step <= DBL_EPSILON * at.theta)
+            break;
+        /* A step of this size that does not come closer is rounding, not the wrong way. */
+        int halvings = step <= 1e-12 * at.theta ? 1 : 40;
+        plane_angle next = at;
+        double next_cost = cost, length = 1, next_e[2];
+        for (int halving = 0; halving < halvings; halving++, length *= 0.5) {
+            next = moved(camera, at, length * radial, length * tangential);
+            lens = pf_camera_lens(camera, kind, next.theta, next.c, next.s);
+            next_cost = residual(&lens, next, x, y, next_e);
+            if (next_cost < cost)
+                break;
+        }
+        if (!(next_cost < cost))
+            break; /* rounding, or the rim */
+        at = next;
+        cost = next_cost;
+        e[0] = next_e[0];
+        e[1] = next_e[1];
+    }
+    *out = at;
+    return cost <= slack * slack;
+}
+
+/* Derivative of the ray by the pixel: through the inverse of the lens's Jacobian at the result. */
+static void by_pixel(const pf_camera *camera, camera_kind kind, plane_angle at, const double ray[3], sensor_tilt tilt,
+                     double x_d, double y_d, double d, double *out)
+{
+    lens_point lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s);
+    double det = lens.r_t * lens.t_p - lens.r_p * lens.t_t;
+    double sine_over = at.theta > 0 ? (ray[0] * at.c + ray[1] * at.s) / at.theta : 1;
+    double sine = ray[0] * at.c + ray[1] * at.s;
+    for (int i = 0; i < 2; i++) {
+        double dx = i == 0 ? 1 / camera->f_u : -camera->skew / camera->f_u / camera->f_v;
+        double dy = i == 0 ? 0 : 1 / camera->f_v;
+        double dd = d * d * (tilt.along_x * dx + tilt.along_y * dy); /* X = d x_d, d = 1 / (1 - along . x_d) */
+        double dX = d * dx + dd * x_d, dY = d * dy + dd * y_d;
+        double radial = dX * at.c + dY * at.s, tangential = dY * at.c - dX * at.s;
+        double by_theta = (lens.t_p * radial - lens.r_p * tangential) / det;
+        double turn = sine_over * (lens.r_t * tangential - lens.t_t * radial) / det;
+        out[i] = ray[2] * by_theta * at.c - turn * at.s;
+        out[2 + i] = ray[2] * by_theta * at.s + turn * at.c;
+        out[4 + i] = -sine * by_theta;
+    }
+}
+
+pf_status pf_camera_unproject(const pf_camera *camera, const double uv[2], double ray[3], double origin[3],
+                              double *d_ray_d_uv)
+{
+    camera_kind kind = pf_camera_kind(camera);
+    sensor_tilt tilt = {0, 0};
+    if (kind.tilted)
+        tilt = pf_camera_sensor_tilt(camera);
+    double y_d = (uv[1] - camera->c_v) / camera->f_v;
+    double x_d = (uv[0] - camera->c_u - camera->skew * y_d) / camera->f_u;
+    double inverse_d = 1 - tilt.along_x * x_d - tilt.along_y * y_d;
+    double d = 1 / inverse_d, x = x_d * d, y = y_d * d;
+    if (!(inverse_d > 0 && x * x + y * y <= POINT_MAX))
+        return PF_ERR_DOMAIN;
+
+    double coarsest = (camera->f_u > camera->f_v ? camera->f_u : camera->f_v) + fabs(camera->skew);
+    double slack = RIM_SLACK_PX / coarsest;
+    plane_angle at;
+    if (kind.asymmetric || kind.cpoly) {
+        if (!asymmetric_inverse(camera, kind, x, y, slack, &at))
+            return PF_ERR_DOMAIN;
+    } else {
+        if (!(sqrt(x * x + y * y) <= pf_camera_radius(camera, camera->theta_max, NULL) + slack))
+            return PF_ERR_DOMAIN;
+        at = symmetric_inverse(camera, x, y);
+    }
+    double sine, cosine;
+    sine_cosine(at.theta, &sine, &cosine);
+    ray[0] = sine * at.c;
+    ray[1] = sine * at.s;
+    ray[2] = cosine;
+    if (origin) {
+        origin[0] = origin[1] = 0;
+        origin[2] = camera->pupil_e1 * at.theta * at.theta;
+    }
+    if (d_ray_d_uv)
+        by_pixel(camera, kind, at, ray, tilt, x_d, y_d, d, d_ray_d_uv);
+    return PF_OK;
+}
