@@ -51,6 +51,8 @@ enum Stream : uint64_t {
     STREAM_DROP = 24,
     STREAM_SLIP_EVENT = 25,
     STREAM_PATTERN = 26,
+    STREAM_STUDIO = 60,
+    STREAM_PRINT = 100,    // to 163: one an octave of a pattern, and its blots
     STREAM_SURFACE = 1000, // and up: one a layer of the surface
 };
 
