@@ -66,21 +66,22 @@ def target_poses(
     studio: Studio,
     count: int,
     seed: int = 1,
-    near: float = 0.8,
-    far: float = 2.0,
+    span: tuple[float, float] = (0.3, 0.9),
     tilt: float = 0.6,
     reach: float = 0.75,
 ) -> list[np.ndarray]:
     """Poses cam_from_target (3, 4) that cover the lens's field: the target's middle anywhere up to `reach` times the field's
-    edge, `near` to `far` of its width away, turned towards the camera but for up to `tilt` radians, rolled anyhow. A sleeve:
+    edge, so far away that the target's longer side would span that share of the picture's shorter one on the axis, turned towards the camera but for up to `tilt` radians, rolled anyhow. A sleeve:
     the camera somewhere near its axis, looking along it."""
     rng = random(seed, 2)
     poses = []
-    lens = studio.spec["lens"]
+    lens, table = studio.spec["lens"], studio.lens_table()
     for _ in range(count):
         share, azimuth = np.sqrt(rng.uniform(0, 1)), rng.uniform(0, 2 * np.pi)
         turn = tilt * np.sqrt(rng.uniform(0, 1)) * np.array([np.cos(a := rng.uniform(0, 2 * np.pi)), np.sin(a), 0])
-        distance, roll = rng.uniform(near, far) * target.size_m[0], rng.uniform(-np.pi, np.pi)
+        focal = table["radius_px"][1] / table["theta"][1]
+        side = rng.uniform(*span) * min(studio.width, studio.height)
+        distance, roll = focal * max(target.size_m) / side, rng.uniform(-np.pi, np.pi)
         if target.kind == "sleeve":
             radius = target.diameter_m / 2
             back = rng.uniform(-0.4, 0.9) * radius + (target.size_m[1] / 2 if studio.theta_max < 1.3 else 0)

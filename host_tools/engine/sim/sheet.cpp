@@ -276,6 +276,7 @@ bool Sheet::cast_relief(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Shee
     }
     const double run = std::abs(ku * d.x()) + std::abs(kv * d.y()), bound = curved_ * run * run;
     const double least = 1e-15 * (o.norm() + spec_.width) / scale, past = 1e-7 * spec_.width / scale;
+    double side = 0.0; // of the sheet on which the march is
     for (int k = 0; k < 400 && t <= last; k++) {
         double s[2];
         const double x = o.x() + t * d.x(), y = o.y() + t * d.y();
@@ -285,15 +286,17 @@ bool Sheet::cast_relief(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Shee
         const double root = std::sqrt(fall * fall + 2.0 * bound * height);
         const double step =
             fall > 0.0 ? 2.0 * height / (root + fall) : (bound > 0.0 ? (root - fall) / bound : INFINITY);
-        if (step <= least || height <= 1e-16) {
+        if (step <= least || f * side < 0.0) { // no step crosses, but by rounding
             hit.t = t;
             hit.back = slope < 0.0;
             if (t > 0.0 && accept(x, y, hit)) {
                 return true;
             }
             t += past; // a hit beside the outline
+            side = 0.0;
             continue;
         }
+        side = f > 0.0 ? 1.0 : -1.0;
         t += step;
     }
     return false;
