@@ -29,8 +29,29 @@ SEEDED = ("texture", "sensor", "motion", "telemetry")  # the parts that have a s
 
 
 def scenarios() -> dict[str, str]:
-    """The built-in scenes: name -> what it is, in one line. docs/scenarios.md shows them."""
+    """The built-in pipes: name -> what it is, in one line. docs/scenarios.md shows them."""
     return {path.stem: read_scene(path)[1] for path in sorted(SCENARIOS.glob("*.toml"))}
+
+
+def studio_scenarios() -> dict[str, str]:
+    """The built-in scenes that are no pipes (targets, pairs, objects), likewise."""
+    from pipefish.studio_files import scenarios as known
+
+    return {name: read_scene(path)[1] for name, path in known().items()}
+
+
+def studio_scene(scene: str | os.PathLike[str] | dict[str, Any]) -> tuple[dict[str, Any], Path | None] | None:
+    """A scene that is no pipe (it has a `kind`) and its file, by name, file or description; None if it is a pipe or not
+    there. Raises FormatError, OSError."""
+    from pipefish.studio_files import scenarios as known
+
+    if isinstance(scene, dict):
+        return (scene, None) if "kind" in scene else None
+    path = known().get(str(scene), Path(scene))
+    if (SCENARIOS / f"{scene}.toml").exists() or not path.is_file():
+        return None
+    described = read_scene(path)[0]
+    return (described, path) if "kind" in described else None
 
 
 def read_json(path: Path) -> Any:
@@ -125,7 +146,8 @@ class Scene:
         if Path(name_or_path).name != str(name_or_path) or not path.exists():
             path = Path(name_or_path)
         if not path.exists():
-            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {', '.join(scenarios())}")
+            known = ", ".join([*scenarios(), *studio_scenarios()])
+            raise PipefishError(f"there is no scene '{name_or_path}': a file, or one of {known}")
         return Scene(read_scene(path)[0], path)
 
     @staticmethod
@@ -355,11 +377,17 @@ def simulate(
     threads: int | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all.
+    """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all; of a scene that is
+    no pipe the folder STEM.
 
     scene: a scenario's name, a TOML or JSON file, or the description itself. frames: stop after so many. seed: of all
     that is random. Returns what was written. Raises FormatError, PipefishError, OSError.
     """
+    if (studio := studio_scene(scene)) is not None:
+        from pipefish.studio_files import simulate_studio
+
+        more = {"count": frames, "seed": seed, "threads": threads, "quiet": quiet}
+        return simulate_studio(studio[0], Path(stem), path=studio[1], **more)
     made = Scene(scene) if isinstance(scene, dict) else Scene.load(scene)
     if frames is not None or seed is not None:
         spec = copy.deepcopy(made.spec)
@@ -423,6 +451,11 @@ def _write_csv(scene: Scene, path: Path) -> None:
 def picture(scene: str | os.PathLike[str], path: Path, frame: int | None = None, width: int = 480) -> None:
     """Writes one frame of a scene [at three quarters of the drive] as a small picture; what kind, the name's end says.
     Raises FormatError, PipefishError, OSError."""
+    if (studio := studio_scene(scene)) is not None:
+        from pipefish.studio_files import thumbnail
+
+        _save(_shrunk(thumbnail(*studio, frame or 0), width), Path(path))
+        return
     made = Scene.load(scene)
     frame = made.frames * 3 // 4 if frame is None else frame
     if not 0 <= frame < made.frames:
@@ -451,10 +484,14 @@ def contact_sheet(path: Path, names: list[str] | None = None, width: int = 400, 
 
 
 def _thumbnail(scene: Scene, frame: int, width: int) -> Any:
+    grey = scene.render(frame)
+    return _shrunk(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8), width)
+
+
+def _shrunk(grey: np.ndarray, width: int) -> Any:
     from PIL import Image
 
-    grey = scene.render(frame)
-    image = Image.fromarray(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8))
+    image = Image.fromarray(grey)
     width = min(width, image.width)
     return image.resize((width, round(image.height * width / image.width)), Image.Resampling.BOX)
 

@@ -62,8 +62,8 @@ class Studio:
         self.theta_max: float = self.spec["lens"]["theta_max"]
 
     def render(self, picture: Picture, samples: int = 89, threads: int | None = None) -> np.ndarray:
-        """(H, W) uint8, or uint16 of 10 bits; the same bits for any number of threads [all cores]. samples: rays in a pixel
-        that an edge runs through: 34, 55, 89, 144 or 233."""
+        """(H, W) uint8, or uint16 of 10 bits; the same bits for any number of threads [all cores]. samples: rays in a
+        pixel that an edge runs through: 34, 55, 89, 144 or 233."""
         try:
             return self._studio.render(picture._picture, samples, threads or os.cpu_count() or 1)
         except ValueError as error:
@@ -95,11 +95,12 @@ class Studio:
     def flow(
         self, first: Picture, second: Picture, pixels: np.ndarray, other: Studio | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where `second` (seen by `other` [the same camera]) has what `first` has at the pixels. The pictures have the same
-        sheets, somewhere else, otherwise bent.
+        """Where `second` (seen by `other` [the same camera]) has what `first` has at the pixels. The pictures have the
+        same sheets, somewhere else, otherwise bent.
 
-        (N, 2) -> pixels (N, 2), NaN where nothing or nothing of the field; visible (N,): on the sensor, the same face, and
-        nothing in front; gain (N,): of the light on it from the first to the second, NaN where it is not visible."""
+        (N, 2) -> pixels (N, 2), NaN where nothing or nothing of the field; visible (N,): on the sensor, the same face,
+        and nothing in front; gain (N,): of the light on it from the first to the second, NaN where it is not
+        visible."""
         other = other or self
         seen = self.look(first, pixels)
         moved, ok = other.project(second.place(seen.sheet, seen.at))
@@ -120,22 +121,22 @@ def _made(make: Any, source: str | None, *args: Any) -> Any:
 
 
 def pattern(seed: int, rows: int = 512, columns: int = 512, **more: float) -> np.ndarray:
-    """A procedural texture, (rows, columns) float32 albedos of 0.05 to 0.95: smooth noise in octaves from the wavelength
-    `coarse` [a quarter of the rows] to `fine` [6] texels, each `fall` [0.85] times as strong as the next coarser, standard
-    deviation `contrast` [0.18], and soft-edged blots that cover the share `blots` [0.6]."""
+    """A procedural texture, (rows, columns) float32 albedos of 0.05 to 0.95: smooth noise in octaves from the
+    wavelength `coarse` [a quarter of the rows] to `fine` [6] texels, each `fall` [0.85] times as strong as the next
+    coarser, standard deviation `contrast` [0.18], and soft-edged blots that cover the share `blots` [0.6]."""
     spec = {"seed": int(seed), "rows": rows, "columns": columns, "coarse": max(rows // 4, 8), **more}
     return _made(_engine.draw_pattern, None, spec)
 
 
 def raster(albedo: np.ndarray) -> Texture:
-    """A texture from albedos (H, W) of 0 to 1, or from an image (H, W) or (H, W, 3) uint8, as it is stretched over a sheet.
-    Raises ArgumentError."""
+    """A texture from albedos (H, W) of 0 to 1, or from an image (H, W) or (H, W, 3) uint8, as it is stretched over a
+    sheet. Raises ArgumentError."""
     image = np.asarray(albedo)
     if image.ndim == 3:
         image = image[..., :3] @ np.array([0.299, 0.587, 0.114])
     if image.dtype.kind in "ui" or (image.size and np.nanmax(image) > 1.5):
         image = image / 255.0
-    if image.ndim != 2 or min(image.shape) < 2 or not (np.isfinite(image).all() and 0 <= image.min()):
+    if image.ndim != 2 or min(image.shape) < 2 or not (np.isfinite(image).all() and image.min() >= 0):
         raise ArgumentError(f"a texture must be an image of at least 2 x 2 pixels, not {np.shape(albedo)}")
     return Texture.raster(np.ascontiguousarray(image, dtype=np.float32))
 
@@ -151,8 +152,8 @@ def rotation(vector: np.ndarray | tuple[float, float, float] | list[float]) -> n
 
 
 def facing(direction: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """Rotation cam_from_sheet (3, 3) of a sheet in that direction that faces the camera, its right side turned by `roll` from
-    the camera's."""
+    """Rotation cam_from_sheet (3, 3) of a sheet in that direction that faces the camera, its right side turned by
+    `roll` from the camera's."""
     z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     # The shortest turn of the optical axis to z; behind, by way of the x axis.
     axis, cosine = np.cross([0.0, 0.0, 1.0], z), z[2]
@@ -190,8 +191,8 @@ def random(seed: int, stream: int) -> np.random.Generator:
 
 
 def room(half: float, first_texture: int, world: np.ndarray) -> list[dict[str, Any]]:
-    """Six walls around the point (0, 0, 0) of a world that the camera sees with the pose cam_from_world, `half` metres away,
-    with the textures first_texture .. + 5."""
+    """Six walls around the point (0, 0, 0) of a world that the camera sees with the pose cam_from_world, `half` metres
+    away, with the textures first_texture .. + 5."""
     turns = [(0, 0, 0), (0, np.pi / 2, 0), (0, np.pi, 0), (0, -np.pi / 2, 0), (np.pi / 2, 0, 0), (-np.pi / 2, 0, 0)]
     made = []
     for k, turn in enumerate(turns):

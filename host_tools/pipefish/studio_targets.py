@@ -45,8 +45,8 @@ class TargetView:
 
 
 def warp(target: Target, seed: int, metres: float, degree: int = 4) -> dict[str, Any]:
-    """How a board is bent: keys for `board`. A polynomial height up to that degree, the quadratic terms largest, of about
-    `metres` at the edges; the print 3e-4 too wide and sheared by as much, give or take."""
+    """How a board is bent: keys for `board`. A polynomial height up to that degree, the quadratic terms largest, of
+    about `metres` at the edges; the print 3e-4 too wide and sheared by as much, give or take."""
     rng = random(seed, 1)
     powers = []
     for total in range(2, degree + 1):
@@ -70,9 +70,10 @@ def target_poses(
     tilt: float = 0.6,
     reach: float = 0.75,
 ) -> list[np.ndarray]:
-    """Poses cam_from_target (3, 4) that cover the lens's field: the target's middle anywhere up to `reach` times the field's
-    edge, so far away that the target's longer side would span that share of the picture's shorter one on the axis, turned towards the camera but for up to `tilt` radians, rolled anyhow. A sleeve:
-    the camera somewhere near its axis, looking along it."""
+    """Poses cam_from_target (3, 4) that cover the lens's field: the target's middle anywhere up to `reach` times the
+    field's edge, so far away that the target's longer side would span that share of the picture's shorter one on the
+    axis, turned towards the camera but for up to `tilt` radians, rolled anyhow. A sleeve: the camera somewhere near its
+    axis, looking along it."""
     rng = random(seed, 2)
     poses = []
     lens, table = studio.spec["lens"], studio.lens_table()
@@ -86,7 +87,9 @@ def target_poses(
             radius = target.diameter_m / 2
             back = rng.uniform(-0.4, 0.9) * radius + (target.size_m[1] / 2 if studio.theta_max < 1.3 else 0)
             off = 0.35 * radius * share * np.array([np.cos(azimuth), np.sin(azimuth)])
-            poses.append(chain(pose(rotation(0.4 * turn) @ rotation((0, 0, roll)), (0, 0, 0)), pose(np.eye(3), (*off, back))))
+            poses.append(
+                chain(pose(rotation(0.4 * turn) @ rotation((0, 0, roll)), (0, 0, 0)), pose(np.eye(3), (*off, back)))
+            )
             continue
         edge = min(lens["theta_max"], _corner_angle(studio))
         theta = max(reach * share * edge, lens["theta_min"] + 0.15 if lens["theta_min"] > 0 else 0)
@@ -119,8 +122,8 @@ def target_texture(target: Target) -> Texture:
 
 
 def disc_centroids(studio: Studio, picture: Picture, sheet: int, centres: np.ndarray, radius: float) -> np.ndarray:
-    """Area-weighted centroids (N, 2) of the images of discs on a sheet, centres (N, 2) in texture coordinates; NaN where a
-    disc is not wholly in the lens's field.
+    """Area-weighted centroids (N, 2) of the images of discs on a sheet, centres (N, 2) in texture coordinates; NaN
+    where a disc is not wholly in the lens's field.
 
     Green's theorem on the image of the rim: 128 points and their derivatives by Fourier series, exact to rounding."""
     count = 128
@@ -157,9 +160,9 @@ def simulate_target_views(
 
     lens, sensor: keys as in docs/simulator.md. poses: cam_from_target (3, 4) each, or how many target_poses() to take.
     board: how it is bent and lit: keys of a sheet, as warp() gives. light: keys of a picture (`ambient`, `lamps` in the
-    camera's frame, `gamma`, ...) [ambient 100 and a lamp above the camera]. level: grey level of a white sheet at the target's
-    middle, by exposure; None: as the light is. clutter: a room around it, for a sleeve a pipe. seed: of poses, clutter and
-    noise. Raises FormatError, ArgumentError.
+    camera's frame, `gamma`, ...) [ambient 100 and a lamp above the camera]. level: grey level of a white sheet at the
+    target's middle, by exposure; None: as the light is. clutter: a room around it, for a sleeve a pipe. seed: of poses,
+    clutter and noise. Raises FormatError, ArgumentError.
     """
     studio = Studio(lens, {"seed": seed, **(sensor or {})}, source)
     if isinstance(poses, int):
@@ -188,7 +191,12 @@ def simulate_target_views(
 def _surroundings(target: Target, p: np.ndarray, first: np.ndarray, seed: int) -> list[dict[str, Any]]:
     if target.kind == "sleeve":
         radius = target.diameter_m / 2 + 0.001  # the sleeve is laid into it
-        pipe = {"width": 2 * np.pi * radius * (1 - 1e-13), "height": 20 * radius, "curvature": -1 / radius, "texture": 1}
+        pipe = {
+            "width": 2 * np.pi * radius * (1 - 1e-13),
+            "height": 20 * radius,
+            "curvature": -1 / radius,
+            "texture": 1,
+        }
         return [{**pipe, "pose": listed(chain(p, pose(_TURN, (0, -radius, 0))))}]
     # The board is carried around in a room that stands still, its walls well behind any board.
     half = 4 * max(*target.size_m) + float(np.linalg.norm(first[:, 3]))
@@ -203,8 +211,8 @@ def _exposure(picture: Picture, studio: Studio, target: Target, level: float) ->
         half = spec["sheets"][0]["width"] / 2
         at = np.column_stack([np.linspace(-half, half, 9)[:-1], np.zeros(8)])
     points = picture.place(0, at)
-    ahead = picture.place(0, at + [0, 1e-5]) - points
-    side = picture.place(0, at + [1e-5, 0]) - points
+    ahead = picture.place(0, at + np.array([0, 1e-5])) - points
+    side = picture.place(0, at + np.array([1e-5, 0])) - points
     normal = np.cross(side, ahead)
     normal /= -np.linalg.norm(normal, axis=1, keepdims=True)  # the face looks along -z
     light = np.full(len(at), spec["ambient"])
@@ -233,9 +241,7 @@ def _rounded(values: np.ndarray) -> list[Any]:
     return [[None if np.isnan(x) else round(float(x), 9) for x in row] for row in values]
 
 
-def _truth(
-    studio: Studio, target: Target, board: dict[str, Any] | None, views: list[TargetView]
-) -> dict[str, Any]:
+def _truth(studio: Studio, target: Target, board: dict[str, Any] | None, views: list[TargetView]) -> dict[str, Any]:
     made = []
     for view in views:
         entry = {

@@ -1,8 +1,8 @@
-"""Calibration targets: one description for what is printed, simulated, detected and calibrated with (docs/targets.md).
+"""Calibration targets: one description for what is printed, simulated, detected and calibrated with (docs/simulator.md).
 
-Target coordinates: metres, X to the right and Y down on the face, Z away from a viewer in front of it, the origin in the
-middle of the target. On a sleeve, which goes around the inside of a pipe, X is the arc length from clock angle 0 and Y the
-place along the pipe.
+Target coordinates: metres, X to the right and Y down on the face, Z away from a viewer in front of it, the origin in
+the middle of the target. On a sleeve, which goes around the inside of a pipe, X is the arc length from clock angle 0
+and Y the place along the pipe.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ WHITE, BLACK = 0.85, 0.05  # albedo of paper and of toner
 class Target:
     """A calibration target.
 
-    kind: one of KINDS. rows, cols: of squares (checkerboard, charuco), else of circles; asymmetric circles have `cols` in
-    each row, every other row half a step to the right. spacing_m: of a square's side, else of neighbouring centres in a row
-    and between rows; asymmetric circles: of a column, rows are half of it apart. radius_m: of circles and of a sleeve's
-    discs [0.3 spacing; asymmetric 0.2; sleeve 0.25]. margin_m: white around it all [one spacing; sleeve half]. marker_share:
-    a charuco marker's side to a square's. marker_bits: of a marker's side without its black border. first_marker: number of
-    the first one. diameter_m: of the pipe that a sleeve goes around the inside of; it decides the spacing around it.
-    Raises ArgumentError that names the field.
+    kind: one of KINDS. rows, cols: of squares (checkerboard, charuco), else of circles; asymmetric circles have `cols`
+    in each row, every other row half a step to the right. spacing_m: of a square's side, else of neighbouring centres
+    in a row and between rows; asymmetric circles: of a column, rows are half of it apart. radius_m: of circles and of a
+    sleeve's discs [0.3 spacing; asymmetric 0.2; sleeve 0.25]. margin_m: white around it all [one spacing; sleeve half].
+    marker_share: a charuco marker's side to a square's. marker_bits: of a marker's side without its black border.
+    first_marker: number of the first one. diameter_m: of the pipe that a sleeve goes around the inside of; it decides
+    the spacing around it. Raises ArgumentError that names the field.
     """
 
     kind: str
@@ -129,7 +129,9 @@ class Target:
         if self.has_circles:
             row, col = np.mgrid[: self.rows, : self.cols].reshape(2, -1).astype(float)
             if self.kind == "sleeve":
-                return np.column_stack([(col - self.cols / 2 + 0.5) * self.spacing_x, (row - (self.rows - 1) / 2) * step])
+                return np.column_stack(
+                    [(col - self.cols / 2 + 0.5) * self.spacing_x, (row - (self.rows - 1) / 2) * step]
+                )
             if self.kind == "asymmetric-circles":
                 x = (col + 0.5 * (row % 2) - (self.cols - 0.5) / 2) * step
                 return np.column_stack([x, (row - (self.rows - 1) / 2) * step / 2])
@@ -138,8 +140,8 @@ class Target:
         return np.column_stack([(col - self.cols / 2) * step, (row - self.rows / 2) * step])
 
     def points(self) -> np.ndarray:
-        """Corners or centres (N, 3), row by row. A sleeve's in the pipe's frame: Z along it, X to the right, Y down, the
-        axis through the origin; clock angle 0 is up, positive clockwise seen along Z."""
+        """Corners or centres (N, 3), row by row. A sleeve's in the pipe's frame: Z along it, X to the right, Y down,
+        the axis through the origin; clock angle 0 is up, positive clockwise seen along Z."""
         flat = self.flat_points()
         if self.kind != "sleeve":
             return np.column_stack([flat, np.zeros(len(flat))])
@@ -148,8 +150,8 @@ class Target:
         return np.column_stack([radius * np.sin(clock), -radius * np.cos(clock), flat[:, 1]])
 
     def figures(self) -> np.ndarray:
-        """All that is black or white on the white sheet, to be laid on in this order: (N, 6) rows round (1: an ellipse, 0: a
-        rectangle), x, y of the middle, half sizes along x and y, albedo."""
+        """All that is black or white on the white sheet, to be laid on in this order: (N, 6) rows round (1: an ellipse,
+        0: a rectangle), x, y of the middle, half sizes along x and y, albedo."""
         made: list[tuple[float, ...]] = []
         if self.has_circles:
             bits = self.sleeve_bits().ravel() if self.kind == "sleeve" else np.zeros(self.rows * self.cols, dtype=int)
@@ -182,8 +184,8 @@ class Target:
         return made
 
     def sleeve_bits(self) -> np.ndarray:
-        """(rows, cols) of a sleeve: 1 where the disc has a white hole of half its radius. Any 4 x 4 marks, around the seam
-        too, occur once: they tell where on the sleeve they are."""
+        """(rows, cols) of a sleeve: 1 where the disc has a white hole of half its radius. Any 4 x 4 marks, around the
+        seam too, occur once: they tell where on the sleeve they are."""
         return _sleeve_bits(self.rows, self.cols)
 
 
@@ -226,9 +228,10 @@ def _search(side: int) -> list[int]:
 def marker_bits(number: int, side: int) -> np.ndarray:
     """The inner bits of a marker, (side, side), 1 = white.
 
-    The rule: the words SplitMix64(0), SplitMix64(1), ... give side^2 bits each, row by row from the lowest; a word is taken
-    if it differs from each one taken before, in all four rotations, and from its own rotations, in at least 3 (4 x 4 bits), 6
-    (5 x 5) or 10 (6 x 6) bits. Markers are numbered in the order they are taken. Raises ArgumentError when there are no more.
+    The rule: the words SplitMix64(0), SplitMix64(1), ... give side^2 bits each, row by row from the lowest; a word is
+    taken if it differs from each one taken before, in all four rotations, and from its own rotations, in at least 3 (4
+    x 4 bits), 6 (5 x 5) or 10 (6 x 6) bits. Markers are numbered in the order they are taken. Raises ArgumentError when
+    there are no more.
     """
     made, at = _dictionary(side), _search(side)
     while len(made) <= number:
