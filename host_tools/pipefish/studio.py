@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -63,7 +64,7 @@ class Studio:
 
     def render(self, picture: Picture, samples: int = 89, threads: int | None = None) -> np.ndarray:
         """(H, W) uint8, or uint16 of 10 bits; the same bits for any number of threads [all cores]. samples: rays in a
-        pixel that an edge runs through: 34, 55, 89, 144 or 233."""
+        pixel that an edge runs through: a Fibonacci number from 34 to 987."""
         try:
             return self._studio.render(picture._picture, samples, threads or os.cpu_count() or 1)
         except ValueError as error:
@@ -202,6 +203,11 @@ def room(half: float, first_texture: int, world: np.ndarray) -> list[dict[str, A
     return made
 
 
-def room_textures(seed: int, texels: int = 1024) -> list[Texture]:
-    """Six textures for room()."""
-    return [raster(pattern(seed * 64 + k, texels, texels, contrast=0.15)) for k in range(6)]
+@lru_cache(maxsize=12)
+def _pattern(seed: int, texels: int) -> Texture:
+    return raster(pattern(seed, texels, texels, contrast=0.15))
+
+
+def room_textures(seed: int) -> list[Texture]:
+    """Six textures for room(): of three patterns, opposite walls alike."""
+    return [_pattern(seed * 64 + k % 3, 1024) for k in range(6)]

@@ -108,7 +108,7 @@ def simulate_objects(
             made.append(raster(own))
         solids.append(solid)
     ground = len(made)
-    made += [*room_textures(seed, 512), *(raster(pattern(seed * 9000 + k, 384, 384)) for k in range(12))]
+    made += [*room_textures(seed), *(raster(pattern(seed * 9000 + k, 384, 384)) for k in range(12))]
     made.append(Texture.print(np.zeros((0, 6)), 0.35))
     world = _Stage(studio, solids, made, ground, threads, samples, source)
     models = []

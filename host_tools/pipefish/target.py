@@ -1,4 +1,4 @@
-"""Calibration targets: one description for what is printed, simulated, detected and calibrated with (docs/simulator.md).
+"""Calibration targets: one description for what is printed, simulated, detected and calibrated with.
 
 Target coordinates: metres, X to the right and Y down on the face, Z away from a viewer in front of it, the origin in
 the middle of the target. On a sleeve, which goes around the inside of a pipe, X is the arc length from clock angle 0

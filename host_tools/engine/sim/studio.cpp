@@ -261,8 +261,8 @@ void Studio::render(const Picture &picture, int samples, int threads, void *out)
         next += step;
         step = next - step;
     }
-    if (next != samples || samples > 233) {
-        throw std::invalid_argument("samples: must be 34, 55, 89, 144 or 233");
+    if (next != samples || samples > 987) {
+        throw std::invalid_argument("samples: must be 34, 55, 89, 144, 233, 377, 610 or 987");
     }
     std::call_once(rays_made_, [&] { make_rays(threads); });
     const int width = lens_spec_.width, height = lens_spec_.height;

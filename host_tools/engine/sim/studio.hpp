@@ -71,7 +71,7 @@ public:
     const Lens &lens() const { return lens_; }
 
     // out[height * width] as Film::develop. Pixels that edges run through are the mean of `samples` rays, a Fibonacci
-    // number from 34 to 233.
+    // number from 34 to 987: of the coverage the error is 0.007 at 89, less with the power -3/4.
     void render(const Picture &picture, int samples, int threads, void *out) const;
     // What a pixel's ray meets; false outside the lens's field.
     bool look(const Picture &picture, const double px[2], Sighting &seen, Eigen::Vector3d &point) const;
