@@ -371,14 +371,14 @@ def test_flow_and_gain_turn_one_view_into_the_other(preset: str) -> None:
 
 
 def test_what_is_hidden_is_behind_something_else() -> None:
-    pair = simulate_two_views(4, {"preset": "narrow-60", **VGA}, seed=5, samples=34)
+    pair = simulate_two_views(4, {"preset": "narrow-60", "width": 320, "height": 240}, seed=5, samples=34)
     moved, visible, gain = pair.flow(0)
     first, second = pair.labels(0), pair.labels(1)
-    on = (np.nan_to_num(moved, nan=-9) > 0).all(-1) & (moved[..., 0] < 639) & (moved[..., 1] < 479)
+    on = (np.nan_to_num(moved, nan=-9) > 0).all(-1) & (moved[..., 0] < 319) & (moved[..., 1] < 239)
     u, v = np.round(moved[on]).astype(int).T
     same = second[v, u] == first[on]
-    assert same[visible[on]].mean() > 0.99
-    assert (~visible & on).sum() > 500
+    assert same[visible[on]].mean() > 0.98  # but for pixels on outlines
+    assert (~visible & on).sum() > 150
     assert same[~visible[on]].mean() < 0.1
     assert np.isnan(gain[~visible]).all()
     again, ok, other = pair.flow_at(moved[visible], 1)
