@@ -5,6 +5,7 @@
 #   make build    pipefishd and friends in build/release, the `pipefish` command in build/venv/bin
 #   make bench    figures into build/bench.json (ONLY=track for some of them)
 #   make accept   the long tests, resumable, into build/accept.json
+#   make size     flash, RAM and stack of the core's rooms on Cortex-M
 #   make format   lays the code out;  make clean   removes build/
 
 SHELL := /bin/sh
@@ -14,9 +15,10 @@ PY := $(VENV)/bin/python
 STAMP := build/stamp
 UNITY_DIR = $(abspath $(wildcard $(VENV)/lib/python3*/site-packages/vyperling/c))
 ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type f)
+CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross pytest
+.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross size pytest
 
 build: native $(STAMP)/python
 
@@ -69,10 +71,17 @@ fuzz-smoke: fuzz-build
 	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
 	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
 
-cross: packages-test $(STAMP)/venv
-	@for p in aarch64 cortex-m; do \
+# The same bits everywhere: one hash per room, under every compiler, set of flags and target (docs/targets.md).
+cross: unit fuzz-build
+	@build/clang/tests/hashes/hashes >/dev/null || { build/clang/tests/hashes/hashes; exit 1; }
+	@cmake --build build/debug --target run_hashes_O0 run_hashes_O2 run_hashes_O3
+	@for p in $(CROSS); do \
 	    test -f build/$$p/build.ninja || cmake --preset $$p -DUNITY_DIR=$(UNITY_DIR) || exit 1; \
-	    cmake --build --preset $$p || exit 1; ctest --preset $$p || exit 1; done
+	    cmake --build build/$$p || exit 1; ctest --preset $$p || exit 1; done
+
+# Flash, RAM and stack of each room on the Cortex-M boards, as a table.
+size: cross
+	@tools/size-table $(filter cortex-%,$(CROSS))
 
 pytest: build
 	@$(PY) -m pytest -q
@@ -81,7 +90,7 @@ bench: build $(STAMP)/venv-peers
 	@tools/install-packages bench
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-accept: build unit fuzz-build
+accept: build unit fuzz-build cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv

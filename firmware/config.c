@@ -41,6 +41,10 @@ static const setting settings[] = {
      "of a recording without times; 0 = 10"},
     {"camera", "profile", TEXT, AT(camera.profile), "", "", 0, 0, NULL,
      "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
+    {"camera", "profile_store", TEXT, AT(camera.profile_store), "", "", 0, 0, NULL,
+     "instead of profile: file that keeps profiles which the host sends (pipefish flash); made at the first start"},
+    {"camera", "trial_starts", INTEGER, AT(camera.trial_starts), "", "1", 0, 255, NULL,
+     "starts with a new profile that nobody confirmed before the one before comes back"},
 
     {"tracker", "max_tracks", INTEGER, AT(tracker.max_tracks), "", "400", 8, 2048, NULL, "tracks alive at once"},
     {"tracker", "levels", INTEGER, AT(tracker.levels), "", "4", 1, 6, NULL, "pyramid levels; more = faster motion"},
@@ -62,6 +66,14 @@ static const setting settings[] = {
      "radius of the image circle; 0 = the profile's; without one the whole image is used"},
     {"tracker", "reset_gap", INTEGER, AT(tracker.reset_gap), "frames", "5", 0, 1000000, NULL,
      "after a gap of more missing frames than this all tracks begin anew: a marked break"},
+    {"tracker", "mask", TEXT, AT(tracker.mask), "", "", 0, 0, NULL,
+     "picture of the frame's size (PGM, PNG), black where nothing is to be tracked; empty = none"},
+    {"tracker", "static_mask", SWITCH, AT(tracker.static_mask), "", "true", 0, 0, NULL,
+     "find by itself what stands still in the picture while the rest moves, and mask it"},
+    {"tracker", "cells", CHOICE, AT(tracker.cells), "", "grid", 0, 0, "grid|polar",
+     "how new tracks are spread: over the picture, or over rings and sectors of the image circle"},
+    {"tracker", "prediction", SWITCH, AT(tracker.prediction), "", "true", 0, 0, NULL,
+     "look for tracks where the last motion, the encoder and the roll put them; needs a profile"},
 
     {"keyframe", "step_mm", NUMBER, AT(keyframe.step_mm), "mm", "0", 0, 100000, NULL,
      "distance between keyframes by the encoder; 0 = a quarter of the nominal radius"},
@@ -114,6 +126,8 @@ static const setting settings[] = {
      "false = after the survey the daemon goes on serving the host until SIGTERM"},
     {"daemon", "status_file", TEXT, AT(daemon.status_file), "", "", 0, 0, NULL,
      "JSON file with the status message's figures, replaced at intervals and at the end; empty = none"},
+    {"daemon", "threads", INTEGER, AT(daemon.threads), "", "2", 1, 2, NULL,
+     "2 = while a frame is tracked the next one is taken and the last one's keyframe made; the results are the same"},
     {"daemon", "log_level", CHOICE, AT(daemon.log_level), "", "info", 0, 0, "error|warning|info|debug",
      "what goes to standard error"},
 };
@@ -326,6 +340,8 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
     const char *why = NULL;
     if (c->camera.path[0] == '\0')
         why = "camera.path: must be set: the recording to play";
+    else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')
+        why = "camera.profile_store: not together with camera.profile";
     else if (c->link.transport == PF_TRANSPORT_SERIAL && c->link.device[0] == '\0')
         why = "link.device: must be set for link.transport = serial";
     else if (c->link.transport == PF_TRANSPORT_TCP && c->link.address[0] == '\0')

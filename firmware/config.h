@@ -15,6 +15,7 @@
 
 enum { PF_CAMERA_REPLAY = 0 };
 enum { PF_SPEED_RECORDED = 0, PF_SPEED_FAST = 1 };
+enum { PF_CELLS_GRID = 0, PF_CELLS_POLAR = 1 };
 enum { PF_TRANSPORT_SERIAL = 0, PF_TRANSPORT_TCP = 1 };
 enum { PF_LOG_ERROR = 0, PF_LOG_WARNING = 1, PF_LOG_INFO = 2, PF_LOG_DEBUG = 3 };
 
@@ -27,15 +28,17 @@ typedef struct pf_config {
     } survey;
     struct {
         uint32_t driver, speed;
-        pf_config_text path, csv, profile;
-        uint32_t loops;
+        pf_config_text path, csv, profile, profile_store;
+        uint32_t loops, trial_starts;
         double frame_rate;
     } camera;
     struct {
         uint32_t max_tracks, levels, window, iterations, cell, min_eigen;
         double fb_px, min_zncc, noise;
         double circle_u, circle_v, circle_radius;
-        uint32_t reset_gap;
+        uint32_t reset_gap, cells;
+        pf_config_text mask;
+        bool static_mask, prediction;
     } tracker;
     struct {
         double step_mm, parallax_deg;
@@ -62,7 +65,7 @@ typedef struct pf_config {
         uint32_t drain_s;
         bool exit_when_done;
         pf_config_text status_file;
-        uint32_t log_level;
+        uint32_t log_level, threads;
     } daemon;
     unsigned line[PF_CONFIG_KEYS_MAX]; /* where each key of the table was set; 0 = its default */
 } pf_config;

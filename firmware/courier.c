@@ -11,7 +11,9 @@
 #include <unistd.h>
 
 #include "clock.h"
+#include "keeper.h"
 #include "log.h"
+#include "pipefish/drivers/sha256.h"
 
 #define MS          UINT64_C(1000000) /* ns */
 #define PUBLISH_NS  (50 * MS)         /* the link's counters go to the status at most so often */
@@ -30,7 +32,9 @@ struct pf_courier {
     uint8_t out[16384]; /* frames that the transport has not taken yet: out[out_at .. out_n) */
     size_t out_at, out_n;
     uint64_t status_due, publish_due;
-    uint8_t message[CONTROL_MAX]; /* status and replies */
+    pf_link_event profile;              /* one that the host has sent; its bytes are the link's until it is answered */
+    bool has_profile, is_profile_asked; /* it waits for the keeper; the keeper has it */
+    uint8_t message[CONTROL_MAX];       /* status and replies */
     pthread_mutex_t preview_mutex;
     uint8_t preview[PF_PREVIEW_MAX];
     size_t preview_n; /* 0 = none waits */
@@ -78,6 +82,89 @@ static void sync_clock(pf_courier *c, const pf_msg_clock_sync *sync, pf_msg_repl
            sync->error_ns);
 }
 
+static void send_reply(pf_courier *c, const pf_msg_reply *reply)
+{
+    size_t n;
+    pf_status sent;
+    if (pf_msg_encode_reply(reply, c->message, sizeof c->message, &n) != PF_OK)
+        return;
+    sent = pf_link_send_control(c->link, c->message, n);
+    if (sent != PF_OK)
+        pf_log(PF_LOG_WARNING, "reply %u: %s", reply->id, pf_status_text(sent));
+}
+
+/* ---- profiles: the keeper does the work, and the answer follows */
+
+static void reply_profile(pf_courier *c, pf_msg_reply *reply, bool has_failed)
+{
+    pf_keeper_texts texts;
+    pf_msg_profile_state state;
+    pf_keeper_state(c->daemon->keeper, &state, &texts);
+    reply->profile = &state;
+    if (has_failed)
+        reply->error = state.problem;
+    send_reply(c, reply);
+}
+
+/* False: the keeper's answer follows. */
+static bool ask_keeper(pf_courier *c, const pf_msg_request *request, pf_msg_reply *reply)
+{
+    pf_keeper *keeper = c->daemon->keeper;
+    pf_keeper_job job = {.what = PF_KEEPER_REVERT, .id = request->id};
+    if (keeper == NULL) {
+        reply->error = "this device keeps no profiles: camera.profile_store is not set";
+        return true;
+    }
+    if (request->what == PF_REQUEST_GET_PROFILE) {
+        reply_profile(c, reply, false);
+        return false;
+    }
+    if (request->what == PF_REQUEST_CONFIRM_PROFILE) {
+        job.what = PF_KEEPER_CONFIRM;
+        memcpy(job.sha256, request->profile_sha256, sizeof job.sha256);
+    }
+    if (pf_keeper_ask(keeper, &job, NULL, 0))
+        return false;
+    reply->error = "another profile is being stored: try again";
+    return true;
+}
+
+static void take_profile(pf_courier *c, const pf_link_event *e)
+{
+    uint8_t sha256[32];
+    bool is_whole = pf_sha256(e->data, e->size, sha256) == PF_OK && memcmp(sha256, e->name, sizeof sha256) == 0;
+    if (!is_whole) {
+        (void)pf_link_answer_object(c->link, e->slot, PF_ANSWER_AGAIN);
+        return;
+    }
+    c->profile = *e;
+    c->has_profile = true;
+    c->is_profile_asked = false;
+}
+
+static void serve_keeper(pf_courier *c)
+{
+    pf_keeper *keeper = c->daemon->keeper;
+    pf_keeper_job job;
+    if (keeper == NULL)
+        return;
+    if (pf_keeper_done(keeper, &job)) {
+        if (job.what == PF_KEEPER_STORE) {
+            (void)pf_link_answer_object(c->link, c->profile.slot, job.has_failed ? PF_ANSWER_REFUSE : PF_ANSWER_STORED);
+            c->has_profile = false;
+        } else {
+            reply_profile(c, &(pf_msg_reply){.id = job.id, .error = ""}, job.has_failed);
+        }
+    }
+    if (c->has_profile && !c->is_profile_asked) {
+        job = (pf_keeper_job){.what = PF_KEEPER_STORE};
+        memcpy(job.sha256, c->profile.name, sizeof job.sha256);
+        c->is_profile_asked = pf_keeper_ask(keeper, &job, c->profile.data, c->profile.size);
+    }
+}
+
+/* ---- requests */
+
 static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t now)
 {
     pf_daemon *d = c->daemon;
@@ -86,8 +173,7 @@ static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t no
     pf_msg_status status;
     pf_msg_info info = {
         .software = PF_SOFTWARE, .source = d->source, .boot_id = d->boot_id, .schema = PF_SCHEMA_VERSION};
-    size_t n;
-    pf_status sent;
+    bool is_answered = true;
 
     if (pf_msg_decode_request(bytes, size, &request) != PF_OK) {
         pf_log(PF_LOG_WARNING, "a request of %zu bytes is damaged", size);
@@ -119,15 +205,17 @@ static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t no
     case PF_REQUEST_CLOCK_SYNC:
         sync_clock(c, &request.clock, &reply);
         break;
+    case PF_REQUEST_GET_PROFILE:
+    case PF_REQUEST_CONFIRM_PROFILE:
+    case PF_REQUEST_REVERT_PROFILE:
+        is_answered = ask_keeper(c, &request, &reply);
+        break;
     case PF_REQUEST_UNKNOWN:
         reply.error = "unknown request";
         break;
     }
-    if (pf_msg_encode_reply(&reply, c->message, sizeof c->message, &n) != PF_OK)
-        return;
-    sent = pf_link_send_control(c->link, c->message, n);
-    if (sent != PF_OK)
-        pf_log(PF_LOG_WARNING, "reply %u: %s", request.id, pf_status_text(sent));
+    if (is_answered)
+        send_reply(c, &reply);
 }
 
 /* ---- events */
@@ -154,8 +242,12 @@ static void take_event(pf_courier *c, const pf_link_event *e, uint64_t now)
     case PF_LINK_LATEST: /* the host has none to send */
         break;
     case PF_LINK_OFFER:
+        (void)pf_link_answer_object(c->link, e->slot,
+                                    e->kind == PF_OBJECT_PROFILE && c->daemon->keeper != NULL ? PF_ANSWER_ACCEPT
+                                                                                              : PF_ANSWER_REFUSE);
+        break;
     case PF_LINK_OBJECT:
-        (void)pf_link_answer_object(c->link, e->slot, PF_ANSWER_REFUSE);
+        take_profile(c, e);
         break;
     case PF_LINK_SENT:
         pf_store_release_slot(c->daemon->store, e->name, false);
@@ -341,6 +433,7 @@ static void *run(void *argument)
         read_stream(c, now);
         (void)pf_link_input(c->link, NULL, 0, now); /* a full line gets no output, and silence must be noticed */
         take_events(c, now);
+        serve_keeper(c);
         if (pf_link_is_up(c->link)) {
             if (now >= c->status_due)
                 send_status(c, now);
@@ -390,6 +483,8 @@ bool pf_courier_open(pf_courier **courier, pf_daemon *daemon, char *error, size_
                          .schema = PF_SCHEMA_VERSION,
                          .max_fragment = config->link.max_fragment,
                          .send_slots = config->link.send_slots,
+                         .receive_slots = daemon->keeper != NULL ? 1 : 0,
+                         .max_object = daemon->keeper != NULL ? PF_PROFILE_BINARY_MAX : 0,
                          .max_latest = PF_PREVIEW_MAX,
                          .max_control = CONTROL_MAX,
                          .window = config->link.window,

@@ -6,6 +6,7 @@
 #include <unistd.h>
 
 #include "clock.h"
+#include "keeper.h"
 
 void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 {
@@ -21,6 +22,17 @@ void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 static float mean_us(uint64_t sum_ns, uint64_t n)
 {
     return n ? (float)((double)sum_ns / (double)n / 1e3) : 0.0f;
+}
+
+pf_msg_profile pf_daemon_profile(pf_daemon *d)
+{
+    pf_msg_profile profile = {.name = d->profile.name, .serial = d->profile.serial};
+    memcpy(profile.sha256, d->profile_sha256, sizeof profile.sha256);
+    for (size_t i = 0; i < 4; i++)
+        profile.crc32c |= (uint32_t)d->profile_bytes[d->profile_size - 4 + i] << (8 * i);
+    if (d->keeper != NULL)
+        profile.is_trial = pf_keeper_trial(d->keeper, profile.sha256, &profile.starts_left);
+    return profile;
 }
 
 void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
@@ -57,11 +69,32 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
         .uptime_ns = now - d->started_ns,
         .has_clock = c->has_clock,
         .clock = c->clock,
+        .tracking = c->tracking,
     };
     if (c->last_ns > c->first_ns)
         status->fps = (double)c->frames_tracked * 1e9 / (double)(c->last_ns - c->first_ns);
     pthread_mutex_unlock(&c->mutex);
     memcpy(status->survey_id, d->survey_id, sizeof status->survey_id);
+    status->has_profile = d->has_profile;
+    if (d->has_profile)
+        status->profile = pf_daemon_profile(d);
+}
+
+static void print_tracking(FILE *out, const pf_msg_tracking *t)
+{
+    static const char *const states[PF_SCENE_FLAGS] = {"standing", "reversing",    "dark",
+                                                       "covered",  "over_exposed", "weak_texture"};
+    static const char *const reasons[PF_TRACK_REASONS] = {
+        "", "left", "flat", "diverged", "residual", "backward", "crowded", "drift", "masked", "static", "saturated"};
+    (void)fputs("  \"tracking\": {", out);
+    for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
+        (void)fprintf(out, "\"%s\": %s, ", states[i], t->scene >> i & 1u ? "true" : "false");
+    (void)fprintf(out, "\"frames\": %" PRIu64 ", \"tracked\": %" PRIu64 ", \"detected\": %" PRIu64, t->frames,
+                  t->tracked, t->detected);
+    for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
+        (void)fprintf(out, ", \"lost_%s\": %" PRIu64, reasons[i], t->lost_by[i]);
+    (void)fprintf(out, ", \"age_median\": %u, \"quality_median\": %u, \"static_blocks\": %u},\n", t->age_median,
+                  t->quality_median, t->static_blocks);
 }
 
 static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store)
@@ -87,6 +120,7 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
                   s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
                   store->refused);
+    print_tracking(out, &s->tracking);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
                   ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64
@@ -97,6 +131,13 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us);
     if (s->telemetry.has_encoder)
         (void)fprintf(out, ",\n  \"encoder_count\": %" PRId64, s->telemetry.encoder_count);
+    if (s->has_profile) {
+        (void)fprintf(out, ",\n  \"profile\": {\"sha256\": \"");
+        for (size_t i = 0; i < sizeof s->profile.sha256; i++)
+            (void)fprintf(out, "%02x", s->profile.sha256[i]);
+        (void)fprintf(out, "\", \"crc32c\": \"%08" PRIx32 "\", \"trial\": %s}", s->profile.crc32c,
+                      s->profile.is_trial ? "true" : "false");
+    }
     if (s->has_clock)
         (void)fprintf(out, ",\n  \"clock\": {\"offset_ns\": %" PRId64 ", \"error_ns\": %" PRIu64 "}",
                       s->clock.offset_ns, s->clock.error_ns);

@@ -37,11 +37,14 @@ typedef struct pf_counters {
     uint64_t capture_ns, stage_ns[PF_STAGES], keyframe_ns, frame_max_ns; /* sums; the slowest frame */
     uint64_t first_ns, last_ns; /* when capture began, when the last frame was done */
     pf_msg_telemetry telemetry;
+    pf_msg_tracking tracking;
     bool link_up;
     pf_link_stats link;
     bool has_clock;
     pf_msg_clock_sync clock;
 } pf_counters;
+
+typedef struct pf_keeper pf_keeper;
 
 typedef struct pf_daemon {
     pf_config config;
@@ -57,6 +60,7 @@ typedef struct pf_daemon {
     uint8_t profile_bytes[PF_PROFILE_BINARY_MAX];
     size_t profile_size;
     uint8_t profile_sha256[32];
+    pf_keeper *keeper; /* of camera.profile_store; NULL = there is none */
     pf_store *store;
     int wake_fd;       /* eventfd: wakes the courier */
     _Atomic int stop;  /* pf_stop; set once, by pf_daemon_stop */
@@ -66,6 +70,9 @@ typedef struct pf_daemon {
 
 /* Asks for the end of the survey; the first reason counts, but a shutdown also follows a stop by the operator. */
 void pf_daemon_stop(pf_daemon *daemon, pf_stop stop);
+
+/* The profile in use, of a daemon that has one. The texts are the daemon's. Any thread. */
+pf_msg_profile pf_daemon_profile(pf_daemon *daemon);
 
 /* The status message as of now. Any thread. */
 void pf_daemon_status(pf_daemon *daemon, pf_msg_status *status);

@@ -12,6 +12,7 @@
 
 #include "clock.h"
 #include "courier.h"
+#include "keeper.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
@@ -99,12 +100,14 @@ static bool load_config(const options *o, pf_config *config, char *error, size_t
     return pf_config_check(config, o->config, error, n);
 }
 
-static bool load_profile(pf_daemon *d, char *error, size_t n)
+static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
 {
     const char *path = d->config.camera.profile, *why = NULL;
     uint8_t bytes[PF_PROFILE_BINARY_MAX + 1];
     FILE *in;
     bool is_read;
+    if (d->config.camera.profile_store[0] != '\0')
+        return is_check ? pf_keeper_check(d, error, n) : pf_keeper_open(d, error, n);
     if (path[0] == '\0')
         return true;
     in = fopen(path, "rb");
@@ -144,6 +147,8 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
     info = d->camera.ops->info(d->camera.self);
     (void)snprintf(d->source, sizeof d->source, "%s", info->source);
     pf_utf8_clean(d->source);
+    if (d->keeper != NULL)
+        pf_keeper_set_size(d->keeper, info->width, info->height);
     if (d->has_profile && (d->profile.camera.width != info->width || d->profile.camera.height != info->height)) {
         (void)snprintf(error, n, "%s: the profile is for %u x %u, the camera gives %u x %u", c->camera.profile,
                        d->profile.camera.width, d->profile.camera.height, info->width, info->height);
@@ -233,6 +238,8 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         note_status(d, &status_due, false);
+        if (d->keeper != NULL)
+            pf_keeper_work(d->keeper);
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
             continue;
         must_exit = is_terminated || atomic_load(&d->stop) == PF_STOP_SHUTDOWN;
@@ -348,7 +355,7 @@ int main(int argc, char **argv)
     if (code >= 0)
         return code;
     d.started_ns = pf_now();
-    if (!load_config(&o, &d.config, error, sizeof error) || !load_profile(&d, error, sizeof error)) {
+    if (!load_config(&o, &d.config, error, sizeof error) || !load_profile(&d, o.check, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
@@ -369,6 +376,8 @@ int main(int argc, char **argv)
         return FAILED;
     }
     code = open_and_run(&d, signals);
+    if (d.keeper != NULL)
+        pf_keeper_close(d.keeper);
     (void)close(signals);
     return code;
 }

@@ -1,6 +1,5 @@
 #include "pipeline.h"
 
-#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -8,11 +7,15 @@
 #include "log.h"
 #include "pipefish/drivers/jpeg.h"
 #include "pipefish/drivers/sha256.h"
+#include "tracking.h"
 #include "utf8.h"
+#include "worker.h"
 
 #define PREVIEW_OVERHEAD 128u /* most bytes of a preview message without its JPEG: six numbers and their tags */
 #define NEXT_TIMEOUT_MS  100u /* how long a stop may go unnoticed while the camera is silent */
 #define START_MAX        (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
+
+#define SHOTS 3u /* the tracker's reference, the frame being tracked, the one that is being taken */
 
 struct pf_pipeline {
     pf_daemon *daemon;
@@ -20,11 +23,10 @@ struct pf_pipeline {
     pthread_t thread;
     bool is_started;
     _Atomic bool is_done;
-    pf_tracker *tracker;
-    void *workspace;
-    pf_ray_q30 *rays; /* of the whole table: live and just lost tracks */
-    pf_keyframe_config choice;
-    pf_keyframe_state choice_state;
+    pf_shot shot[SHOTS];
+    bool has_failed;
+    pf_worker *worker; /* who tracks; NULL = the capture thread */
+    pf_tracking *tracking;
     pf_jpeg *jpeg;
     uint8_t preview[PF_PREVIEW_MAX];
     uint64_t preview_due;
@@ -32,23 +34,7 @@ struct pf_pipeline {
     uint32_t next_index;
     uint32_t boots;
     char break_reason[PF_BREAK_REASON_MAX]; /* "" = tracks go on */
-    pf_frame previous;                      /* the tracker's reference */
-    bool has_previous;
-    bool has_failed;
 };
-
-static double circle_radius(const pf_daemon *d, double *u, double *v)
-{
-    const pf_config *c = &d->config;
-    if (c->tracker.circle_radius > 0) {
-        *u = c->tracker.circle_u;
-        *v = c->tracker.circle_v;
-        return c->tracker.circle_radius;
-    }
-    *u = d->profile.camera.circle_u;
-    *v = d->profile.camera.circle_v;
-    return d->has_profile ? d->profile.camera.circle_radius : 0.0;
-}
 
 /* ---- opening */
 
@@ -65,64 +51,18 @@ size_t pf_pipeline_object_max(const pf_daemon *d)
     return keyframe > START_MAX ? keyframe : START_MAX;
 }
 
-static bool open_tracker(pf_pipeline *p, char *error, size_t n)
+static bool open_shots(pf_pipeline *p, char *error, size_t n)
 {
-    const pf_daemon *d = p->daemon;
-    const pf_config *c = &d->config;
-    const pf_camera_info *info = d->camera.ops->info(d->camera.self);
-    double u, v, radius = circle_radius(d, &u, &v);
-    /* A circle further out than this has no border in any image, and would not fit into Q16.16. */
-    if (!(radius <= 2.0 * PF_IMAGE_SIZE_MAX && fabs(u) <= PF_IMAGE_SIZE_MAX && fabs(v) <= PF_IMAGE_SIZE_MAX)) {
-        (void)snprintf(error, n, "image circle (%g, %g), radius %g: must be within %u px, the radius within %u", u, v,
-                       radius, PF_IMAGE_SIZE_MAX, 2 * PF_IMAGE_SIZE_MAX);
-        return false;
-    }
-    pf_tracker_config t = {.width = info->width,
-                           .height = info->height,
-                           .max_tracks = c->tracker.max_tracks,
-                           .levels = c->tracker.levels,
-                           .window = c->tracker.window,
-                           .iterations = c->tracker.iterations,
-                           .cell = c->tracker.cell,
-                           .min_eigen = c->tracker.min_eigen,
-                           .fb_q16 = (uint32_t)lround(c->tracker.fb_px * 65536.0),
-                           .min_zncc_q15 = (uint32_t)lround(c->tracker.min_zncc * 32768.0),
-                           .noise_q8 = (uint32_t)lround(c->tracker.noise * 256.0),
-                           .circle = {(int32_t)lround(u * 65536.0), (int32_t)lround(v * 65536.0)},
-                           .circle_radius_q16 = (uint32_t)lround(radius * 65536.0)};
-    size_t size = pf_tracker_workspace_size(&t);
-    if (size == 0) {
-        (void)snprintf(error, n, "the tracker cannot work with frames of %u x %u and these settings of [tracker]",
-                       info->width, info->height);
-        return false;
-    }
-    p->workspace = aligned_alloc(16, (size + 15) / 16 * 16);
-    p->rays = calloc(2 * (size_t)t.max_tracks, sizeof *p->rays);
-    if (p->workspace == NULL || p->rays == NULL || pf_tracker_init(&p->tracker, &t, p->workspace, size) != PF_OK) {
-        (void)snprintf(error, n, "no memory for the tracker");
-        return false;
+    const pf_camera_info *info = p->daemon->camera.ops->info(p->daemon->camera.self);
+    for (uint32_t i = 0; i < SHOTS; i++) {
+        p->shot[i].pixels = malloc((size_t)info->width * info->height);
+        p->shot[i].tracks = calloc(2 * (size_t)p->daemon->config.tracker.max_tracks, sizeof *p->shot[i].tracks);
+        if (p->shot[i].pixels == NULL || p->shot[i].tracks == NULL) {
+            (void)snprintf(error, n, "no memory for frames");
+            return false;
+        }
     }
     return true;
-}
-
-static void open_choice(pf_pipeline *p)
-{
-    const pf_config *c = &p->daemon->config;
-    double step_mm = c->keyframe.step_mm > 0 ? c->keyframe.step_mm : 0.25 * c->survey.nominal_diameter_mm / 2;
-    double per_count_mm = fabs(c->encoder.metres_per_count) * 1e3;
-    p->choice.parallax_urad = (uint32_t)lround(c->keyframe.parallax_deg * (3.14159265358979323846 / 180.0) * 1e6);
-    p->choice.min_common = c->keyframe.min_common;
-    p->choice.min_interval = c->keyframe.min_interval;
-    if (per_count_mm > 0 && step_mm > 0) {
-        double counts = round(step_mm / per_count_mm);
-        p->choice.step_counts = counts < 1 ? 1 : counts > 4e9 ? 4000000000u : (uint32_t)counts;
-        pf_log(PF_LOG_INFO, "a keyframe every %u encoder counts (%.3g mm)", p->choice.step_counts,
-               p->choice.step_counts * per_count_mm);
-    } else if (p->daemon->has_profile) {
-        pf_log(PF_LOG_INFO, "a keyframe every %.3g degrees of parallax", c->keyframe.parallax_deg);
-    } else {
-        pf_log(PF_LOG_WARNING, "neither encoder nor profile: keyframes by common tracks only");
-    }
 }
 
 static bool open_jpeg(pf_pipeline *p, char *error, size_t n)
@@ -133,7 +73,7 @@ static bool open_jpeg(pf_pipeline *p, char *error, size_t n)
                         .height = info->height,
                         .quality = d->config.keyframe.jpeg_quality,
                         .preview_quality = d->config.status.preview_quality};
-    j.circle_radius = circle_radius(d, &j.circle_u, &j.circle_v);
+    j.circle_radius = pf_tracking_circle(d, &j.circle_u, &j.circle_v);
     return pf_jpeg_open(&p->jpeg, &j, error, n) == PF_OK;
 }
 
@@ -213,9 +153,13 @@ static bool store_end_of(pf_pipeline *p, const pf_survey *before, char *error, s
 
 static void release(pf_pipeline *p)
 {
+    pf_worker_close(p->worker);
     pf_jpeg_close(p->jpeg);
-    free(p->rays);
-    free(p->workspace);
+    for (uint32_t i = 0; i < SHOTS; i++) {
+        free(p->shot[i].pixels);
+        free(p->shot[i].tracks);
+    }
+    pf_tracking_close(p->tracking);
     free(p);
 }
 
@@ -235,12 +179,12 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!open_tracker(p, error, n) || !open_jpeg(p, error, n) ||
+    if (!pf_tracking_open(&p->tracking, daemon, error, n) || !open_shots(p, error, n) || !open_jpeg(p, error, n) ||
+        (daemon->config.daemon.threads > 1 && !pf_worker_open(&p->worker, pf_tracking_shot, p->tracking, error, n)) ||
         (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
         release(p);
         return false;
     }
-    open_choice(p);
     *pipeline = p;
     return true;
 }
@@ -277,10 +221,10 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
 }
 
 /* Makes and queues a keyframe; false if it is lost. */
-static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_telemetry *telemetry,
-                          pf_keyframe_cause cause, uint32_t common)
+static bool make_keyframe(pf_pipeline *p, const pf_shot *shot)
 {
     pf_daemon *d = p->daemon;
+    const pf_frame *frame = &shot->frame;
     pf_status status;
     pf_msg_keyframe k = {.index = p->next_index,
                          .time = {d->boot_id, frame->time_ns},
@@ -289,16 +233,18 @@ static bool make_keyframe(pf_pipeline *p, const pf_frame *frame, const pf_msg_te
                          .width = frame->image.width,
                          .height = frame->image.height,
                          .jpeg_quality = d->config.keyframe.jpeg_quality,
-                         .cause = cause,
-                         .telemetry = *telemetry,
-                         .common_tracks = common};
+                         .cause = shot->cause,
+                         .telemetry = shot->telemetry,
+                         .tracks = shot->tracks,
+                         .n_tracks = shot->n_tracks,
+                         .common_tracks = shot->common,
+                         .tracking = shot->tracking};
     pf_job *job = pf_store_take(d->store);
     if (job == NULL) {
         pf_log(PF_LOG_WARNING, "the disk is too slow: keyframe %u is dropped", k.index);
         return false;
     }
     memcpy(k.survey_id, d->survey_id, sizeof k.survey_id);
-    k.tracks = pf_tracker_tracks(p->tracker, &k.n_tracks);
     status = pf_jpeg_encode(p->jpeg, &frame->image, &k.jpeg, &k.jpeg_size);
     if (status != PF_OK)
         pf_log(PF_LOG_ERROR, "keyframe %u: %s", k.index, pf_jpeg_error(p->jpeg));
@@ -355,134 +301,125 @@ static void make_preview(pf_pipeline *p, const pf_frame *frame)
         pf_courier_preview(p->courier, p->preview, n);
 }
 
-static void release_previous(pf_pipeline *p)
+/* ---- before and after: by the capture thread */
+
+/* Takes the driver's frame over and gives its buffer back at once. */
+static void take_shot(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
 {
-    if (p->has_previous)
-        p->daemon->camera.ops->release(p->daemon->camera.self, &p->previous);
-    p->has_previous = false;
+    const pf_image *image = &frame->image;
+    shot->telemetry = read_telemetry(p, frame);
+    for (uint32_t y = 0; y < image->height; y++)
+        memcpy(shot->pixels + (size_t)y * image->width, image->data + (size_t)y * image->stride, image->width);
+    shot->frame = *frame;
+    shot->frame.image = (pf_image){shot->pixels, image->width, image->height, image->width};
+    p->daemon->camera.ops->release(p->daemon->camera.self, frame);
 }
 
-/* A gap in the sequence is dropped frames; after a long one nothing can be found again. Returns the frames missing. */
-static uint64_t check_gap(pf_pipeline *p, const pf_frame *frame)
-{
-    uint64_t missing = 0;
-    if (!p->has_previous)
-        return 0;
-    if (frame->sequence > p->previous.sequence)
-        missing = frame->sequence - p->previous.sequence - 1;
-    if (missing > p->daemon->config.tracker.reset_gap || frame->sequence <= p->previous.sequence) {
-        pf_tracker_reset(p->tracker);
-        memset(&p->choice_state, 0, sizeof p->choice_state);
-        (void)snprintf(p->break_reason, sizeof p->break_reason, "gap of %llu frames", (unsigned long long)missing);
-        pf_log(PF_LOG_WARNING, "%s before frame %llu: tracks begin anew", p->break_reason,
-               (unsigned long long)frame->sequence);
-    }
-    return missing;
-}
-
-static void count_frame(pf_pipeline *p, const pf_msg_telemetry *telemetry, const uint64_t *stage_ns, uint64_t done_ns,
-                        uint64_t frame_ns)
+static void count_shot(pf_pipeline *p, const pf_shot *shot, uint64_t keyframe_ns)
 {
     pf_counters *c = &p->daemon->counters;
-    const pf_tracker_stats *s = pf_tracker_last_stats(p->tracker);
     pthread_mutex_lock(&c->mutex);
+    c->frames_dropped += shot->missing;
     c->frames_tracked++;
-    c->tracks_live = s->live;
-    c->tracks_new = s->detected;
-    c->tracks_lost = s->lost;
+    c->tracks_live = shot->stats.live;
+    c->tracks_new = shot->stats.detected;
+    c->tracks_lost = shot->stats.lost;
+    pf_tracking_count(&c->tracking, &shot->stats, shot->tracking.scene);
     for (int i = 0; i < PF_STAGES; i++)
-        c->stage_ns[i] += stage_ns[i];
-    if (frame_ns > c->frame_max_ns)
-        c->frame_max_ns = frame_ns;
-    c->last_ns = done_ns;
-    c->telemetry = *telemetry;
+        c->stage_ns[i] += shot->stage_ns[i];
+    if (shot->track_ns + keyframe_ns > c->frame_max_ns)
+        c->frame_max_ns = shot->track_ns + keyframe_ns;
+    if (shot->cause != PF_KEYFRAME_NO) {
+        c->keyframes++;
+        c->keyframe_ns += keyframe_ns;
+    }
+    c->last_ns = pf_now();
+    c->telemetry = shot->telemetry;
     pthread_mutex_unlock(&c->mutex);
 }
 
-/* Tracks one frame, and makes a keyframe of it if it is time. The frame before is released: nobody borrows it any more.
- */
-static void take_frame(pf_pipeline *p, const pf_frame *frame)
+/* Makes a keyframe of a tracked frame if it is one, counts it and shows it. */
+static void finish_shot(pf_pipeline *p, const pf_shot *shot)
 {
-    pf_daemon *d = p->daemon;
-    pf_counters *c = &d->counters;
-    pf_msg_telemetry telemetry = read_telemetry(p, frame);
-    uint64_t stage_ns[PF_STAGES] = {0}, start = pf_now(), chosen, end;
-    uint64_t missing = check_gap(p, frame);
-    const pf_track *tracks;
-    uint32_t n, common = 0;
-    pf_keyframe_cause cause;
-
-    (void)pf_tracker_frame(p->tracker, &frame->image, pf_now, stage_ns);
-    release_previous(p);
-    p->previous = *frame;
-    p->has_previous = true;
-    tracks = pf_tracker_tracks(p->tracker, &n);
-    if (d->has_profile)
-        pf_track_bearings(&d->profile.camera, tracks, n, p->rays);
-    cause = pf_keyframe_decide(&p->choice_state, &p->choice, tracks, p->rays, n,
-                               telemetry.has_encoder ? &telemetry.encoder_count : NULL, &common);
-    chosen = end = pf_now();
-    if (cause != PF_KEYFRAME_NO) {
-        if (make_keyframe(p, frame, &telemetry, cause, common))
+    const uint64_t start = pf_now();
+    if (shot->break_reason[0] != '\0')
+        memcpy(p->break_reason, shot->break_reason, sizeof p->break_reason);
+    if (shot->cause != PF_KEYFRAME_NO) {
+        if (make_keyframe(p, shot))
             p->break_reason[0] = '\0';
         else
-            pf_store_lose(d->store, p->next_index);
+            pf_store_lose(p->daemon->store, p->next_index);
         p->next_index++;
-        end = pf_now();
     }
-    pthread_mutex_lock(&c->mutex);
-    c->frames_dropped += missing;
-    if (cause != PF_KEYFRAME_NO) {
-        c->keyframes++;
-        c->keyframe_ns += end - chosen;
-    }
-    pthread_mutex_unlock(&c->mutex);
-    count_frame(p, &telemetry, stage_ns, end, end - start);
-    make_preview(p, frame);
+    count_shot(p, shot, pf_now() - start);
+    make_preview(p, &shot->frame);
 }
 
 /* ---- the survey */
 
+/* Two steps overlap: while shot k is tracked, k - 1 is finished and k + 1 taken; one waits for the other before the
+ * next step, so nothing queues up. Without a worker the same steps come one after the other. */
 static void capture(pf_pipeline *p, char *reason, size_t reason_n)
 {
     pf_daemon *d = p->daemon;
     const pf_camera_info *info = d->camera.ops->info(d->camera.self);
     pf_counters *c = &d->counters;
     uint64_t waited = pf_now();
+    pf_shot *pending = NULL; /* being tracked */
+    uint32_t next = 0;
     pf_status status = d->camera.ops->start(d->camera.self);
 
     pthread_mutex_lock(&c->mutex);
     c->first_ns = c->last_ns = waited;
     pthread_mutex_unlock(&c->mutex);
+    (void)snprintf(reason, reason_n, "end of recording");
     while (status == PF_OK || status == PF_ERR_AGAIN) {
         pf_frame frame;
         if (atomic_load(&d->stop) != PF_STOP_NO) {
             (void)snprintf(reason, reason_n, "%s",
                            atomic_load(&d->stop) == PF_STOP_TERMINATED ? "terminated" : "stopped by the operator");
-            return;
+            break;
         }
         status = d->camera.ops->next(d->camera.self, NEXT_TIMEOUT_MS, &frame);
-        if (status != PF_OK)
-            continue;
-        pthread_mutex_lock(&c->mutex);
-        c->frames++;
-        c->capture_ns += pf_now() - waited;
-        pthread_mutex_unlock(&c->mutex);
-        if (frame.image.width != info->width || frame.image.height != info->height) {
-            d->camera.ops->release(d->camera.self, &frame);
-            (void)snprintf(reason, reason_n, "camera failed: a frame of another size");
-            p->has_failed = true;
-            return;
+        pf_shot *shot = &p->shot[next], *tracked = pending;
+        if (status == PF_OK) {
+            pthread_mutex_lock(&c->mutex);
+            c->frames++;
+            c->capture_ns += pf_now() - waited;
+            pthread_mutex_unlock(&c->mutex);
+            if (frame.image.width != info->width || frame.image.height != info->height) {
+                d->camera.ops->release(d->camera.self, &frame);
+                (void)snprintf(reason, reason_n, "camera failed: a frame of another size");
+                p->has_failed = true;
+                break;
+            }
+            take_shot(p, shot, &frame);
         }
-        take_frame(p, &frame);
+        if (tracked && p->worker)
+            pf_worker_wait(p->worker);
+        pending = NULL;
+        if (status == PF_OK) {
+            next = (next + 1) % SHOTS;
+            if (p->worker) {
+                pf_worker_give(p->worker, shot);
+                pending = shot;
+            } else {
+                pf_tracking_shot(p->tracking, shot);
+                tracked = shot;
+            }
+        }
+        if (tracked)
+            finish_shot(p, tracked);
         waited = pf_now();
     }
-    if (status == PF_ERR_END) {
-        (void)snprintf(reason, reason_n, "end of recording");
-        return;
+    if (pending) {
+        pf_worker_wait(p->worker);
+        finish_shot(p, pending);
     }
-    p->has_failed = true;
-    (void)snprintf(reason, reason_n, "camera failed: %s", d->camera.ops->error(d->camera.self));
+    if (status != PF_OK && status != PF_ERR_AGAIN && status != PF_ERR_END) {
+        p->has_failed = true;
+        (void)snprintf(reason, reason_n, "camera failed: %s", d->camera.ops->error(d->camera.self));
+    }
 }
 
 /* The survey's end, after all its keyframes. */
@@ -524,7 +461,6 @@ static void *run(void *argument)
     char reason[512];
 
     capture(p, reason, sizeof reason);
-    release_previous(p);
     (void)d->camera.ops->stop(d->camera.self);
     pf_utf8_clean(reason);
     atomic_store(&d->state, PF_STATE_DRAINING);

@@ -1,5 +1,6 @@
-/* The capture thread: camera -> tracker -> keyframe choice -> JPEG -> message -> store. One thread: the frame rate is
- * what one core can do, and nothing else of the daemon can stall it.
+/* The capture thread: camera -> tracker -> keyframe choice -> JPEG -> message -> store. With daemon.threads = 2 a
+ * worker tracks while this thread takes the next frame and makes the last one's keyframe; nothing else of the daemon
+ * can stall either.
  */
 #ifndef PIPEFISHD_PIPELINE_H
 #define PIPEFISHD_PIPELINE_H

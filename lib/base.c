@@ -29,6 +29,8 @@ const char *pf_status_text(pf_status status)
         return "end of stream";
     case PF_ERR_CLOSED:
         return "closed by the other side";
+    case PF_ERR_SELF_TEST:
+        return "self-test failed";
     }
     return "unknown status";
 }

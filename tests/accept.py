@@ -7,6 +7,7 @@ commit measures only what is missing. --fresh forgets them.
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -33,6 +34,11 @@ def at_least(name: str, value: float, bound: float) -> dict:
     return figure(name, value, f">= {bound}", value >= bound)
 
 
+def at_most(name: str, value: float, bound: float) -> dict:
+    """A row that holds up to `bound`."""
+    return figure(name, value, f"<= {bound}", value <= bound)
+
+
 def exactly(name: str, value: float, bound: float) -> dict:
     """A row that holds at `bound` only."""
     return figure(name, value, f"= {bound}", value == bound)
@@ -48,6 +54,16 @@ def check_link_goodput() -> list[dict]:
     ]
 
 
+def check_track() -> list[dict]:
+    """The tracker's accuracy on closed-form images; the benchmark's OpenCV beside it if `make bench` got one."""
+    peers = BUILD / "venv-peers/bin/python"
+    done = run(peers if peers.exists() else sys.executable, "tests/accept_track.py")
+    if done.returncode != 0:
+        raise SystemExit(f"accept_track.py failed: {done.stderr.strip()}")
+    print(done.stderr, file=sys.stderr)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -55,11 +71,40 @@ def check_link_seeds() -> list[dict]:
     return [exactly("link.seeds_failed_of_20", failures, 0)]
 
 
+def check_profile_store() -> list[dict]:
+    """The profile store under every pair of power cuts, and a million times with flipped bits."""
+    done = run(BUILD / "debug/tests/unit/test_profile_store", PIPEFISH_TEST_LONG="1")
+    cuts, seconds = re.search(r"^power cuts: (\d+) in ([\d.]+) s", done.stdout, re.MULTILINE).groups()
+    flips = re.search(r"^flipped bits: (\d+)", done.stdout, re.MULTILINE).group(1)
+    return [
+        exactly("profile_store.failed", done.returncode, 0),
+        at_least("profile_store.cuts", int(cuts), 100000),
+        at_most("profile_store.cuts_cpu_s", float(seconds), 60),
+        at_least("profile_store.flips", int(flips), 1000000),
+    ]
+
+
 def check_daemon_kills() -> list[dict]:
     """kill -9 at 10 times as many moments: nothing acknowledged is lost, nothing arrives twice."""
     command = (sys.executable, "-m", "pytest", "-q", "tests/python/test_daemon.py", "-k", "kill")
     failures = sum(run(*command, PIPEFISH_TEST_SEED=str(i + 1)).returncode != 0 for i in range(10))
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
+
+
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "5b3a999d"
+
+
+def check_golden_replay() -> list[dict]:
+    """The hash of a long replay through the tracker, on x86 and (emulated) on aarch64."""
+    rows = []
+    for target, folder, emulator in (
+        ("x86", "debug", ()),
+        ("aarch64", "aarch64", ("qemu-aarch64-static", "-L", "/usr/aarch64-linux-gnu")),
+    ):
+        done = run(*emulator, BUILD / folder / "tests/unit/golden_replay", str(GOLDEN_FRAMES))
+        differs = done.returncode != 0 or done.stdout.split()[:1] != [GOLDEN_HASH]
+        rows.append(exactly(f"track.golden_{GOLDEN_FRAMES}_{target}_differs", int(differs), 0))
+    return rows
 
 
 def check_fuzz() -> list[dict]:
@@ -91,8 +136,11 @@ def check_demo() -> list[dict]:
 
 CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_goodput": check_link_goodput,
+    "track": check_track,
     "link_seeds": check_link_seeds,
+    "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
+    "golden_replay": check_golden_replay,
     "fuzz": check_fuzz,
     "demo": check_demo,
 }

@@ -22,6 +22,7 @@ _LAZY = {
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
     "PARAMETERS": "pipefish.camera",
+    "Provenance": "pipefish.camera",
     "ArgumentError": "pipefish.errors",
     "PipefishError": "pipefish.errors",
     "FormatError": "pipefish.errors",

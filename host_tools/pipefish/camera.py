@@ -1,6 +1,6 @@
 """The camera: Kannala and Brandt's generic model, evaluated by the C core, and its profile as JSON and as binary.
 
-docs/profile.md describes the parameters, the JSON form and the binary form.
+docs/profile.md describes the parameters and the JSON form, lib/profile/SPEC.md the binary form.
 """
 
 from __future__ import annotations
@@ -8,45 +8,43 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
-import json
 import math
-import numbers
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from . import _engine
+from . import _engine, profile_json
+from .camera_sources import Sources
 from .errors import ArgumentError, ProfileError
-
-_FORMAT = "pipefish-profile"
-_VERSION = 1
-_BYTES_MAX = 1 << 20  # a full profile is about 25 kB of JSON
+from .profile_json import (
+    ARRAYS,
+    CIRCLE,
+    INTEGERS,
+    PROVENANCE,
+    RESIDUALS,
+    SCALARS,
+    TEXTS,
+    integer,
+    number,
+    number_list,
+    text,
+)
 
 # In the order of pf_radial and pf_profile_source.
 _RADIAL = ("generic", "perspective", "stereographic", "equidistant", "equisolid", "orthographic", "unified")
 _SOURCE = ("unknown", "target", "selfcal", "imported", "simulated")
 
-_INTEGERS = ("width", "height")
-_SCALARS = ("f_u", "f_v", "skew", "c_u", "c_v", "k2", "k3", "k4", "k5", "mirror", "pupil_e1", "theta_max")
-_CIRCLE = ("circle_u", "circle_v", "circle_radius")
-_ARRAYS = {
-    "tilt": 2,
-    "asym_radial_theta": 3,
-    "asym_radial_phi": 4,
-    "asym_tangential_theta": 3,
-    "asym_tangential_phi": 4,
-    "cpoly": 14,
-}
-_TEXTS = ("name", "serial")
-_JSON_REQUIRED = ("width", "height", "f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "theta_max")
+
+#: What the core calls the keys of `provenance`.
+_PLACES = {place: f"provenance.{key}" for key, place in PROVENANCE.items()}
 
 
 def _indexed(name: str) -> list[str]:
-    return [f"{name}[{i}]" for i in range(_ARRAYS[name])]
+    return [f"{name}[{i}]" for i in range(ARRAYS[name])]
 
 
 #: Names of the parameters that may be free, at their number in the binary form.
@@ -62,46 +60,10 @@ PARAMETERS: tuple[str, ...] = (
 )
 
 
-def _number(key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise ProfileError(None, key, f"not a number: {value!r:.60}")
-    try:
-        result = float(value)
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result):
-        raise ProfileError(None, key, "not finite")
-    return result
-
-
-def _integer(key: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise ProfileError(None, key, f"not a whole number: {value!r:.60}")
-    if not 0 <= value < 1 << 32:
-        raise ProfileError(None, key, "out of range")
-    return int(value)
-
-
-def _numbers(key: str, value: object, count: int) -> tuple[float, ...]:
-    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str | bytes) or len(value) != count:
-        raise ProfileError(None, key, f"not a list of {count} numbers")
-    return tuple(_number(f"{key}[{i}]", item) for i, item in enumerate(value))
-
-
 def _choice(key: str, value: object, choices: Sequence[str]) -> int:
     if not isinstance(value, str) or value not in choices:
         raise ProfileError(None, key, f"{value!r:.60} is none of {', '.join(choices)}")
     return choices.index(value)
-
-
-def _text(key: str, value: object) -> str:
-    if not isinstance(value, str):
-        raise ProfileError(None, key, "not a text")
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        raise ProfileError(None, key, "not UTF-8 text") from None
-    return value
 
 
 def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float64]:
@@ -120,11 +82,23 @@ def _rows(what: str, array: npt.ArrayLike, columns: int) -> npt.NDArray[np.float
 def _split(error: ValueError) -> ProfileError:
     """The core says 'field: reason'."""
     key, _, reason = str(error).partition(": ")
-    return ProfileError(None, key, reason)
+    return ProfileError(None, _PLACES.get(key, key), reason)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a calibration comes from. Texts "" and counts 0: unknown."""
+
+    tool: str = ""  #: program that made it, at most 31 bytes
+    version: str = ""  #: of the tool, at most 31 bytes
+    model_choice: str = ""  #: how the model was chosen, at most 63 bytes
+    views: int = 0  #: images that were used
+    points: int = 0  #: measured points in them
+    held_out_views: int = 0  #: images that held_out_rms_px is of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Camera:
+class Camera(Sources):
     """One calibrated camera. Immutable; use dataclasses.replace() for a changed copy.
 
     Pixels: the centre of the top-left pixel is (0, 0), u right, v down. Camera frame: x right, y down, z along the
@@ -160,10 +134,13 @@ class Camera:
     circle_radius: float = 0.0
     name: str = ""
     serial: str = ""
+    lens: str = ""
     source: str = "unknown"
     created: datetime.datetime | None = None
     rms_px: float | None = None
+    held_out_rms_px: float | None = None
     theta_covered: float | None = None
+    provenance: Provenance = Provenance()
     covariance_parameters: tuple[str, ...] = ()
     covariance: npt.NDArray[np.float64] | None = None
 
@@ -175,23 +152,25 @@ class Camera:
             setattr(profile, key, value)
 
         try:
-            for key in _INTEGERS:
-                put(key, _integer(key, getattr(self, key)))
-            for key in _SCALARS + _CIRCLE:
-                put(key, _number(key, getattr(self, key)))
-            for key, count in _ARRAYS.items():
-                put(key, _numbers(key, getattr(self, key), count))
-            for key in _TEXTS:
-                put(key, _text(key, getattr(self, key)))
+            for key in INTEGERS:
+                put(key, integer(key, getattr(self, key)))
+            for key in SCALARS + CIRCLE:
+                put(key, number(key, getattr(self, key)))
+            for key, count in ARRAYS.items():
+                put(key, number_list(key, getattr(self, key), count))
+            for key in TEXTS:
+                put(key, text(key, getattr(self, key)))
             profile.radial = _choice("radial", self.radial, _RADIAL)
             profile.source = _choice("source", self.source, _SOURCE)
             profile.created_unix_s = self._created_unix_s()
-            profile.rms_px = math.nan
-            if self.rms_px is not None:
-                put("rms_px", _number("rms_px", self.rms_px))
+            for key in RESIDUALS:
+                setattr(profile, key, math.nan)
+                if getattr(self, key) is not None:
+                    put(key, number(key, getattr(self, key)))
             if self.theta_covered is not None:
-                put("theta_covered", _number("theta_covered", self.theta_covered))
+                put("theta_covered", number("theta_covered", self.theta_covered))
                 object.__setattr__(self, "theta_covered", self.theta_covered or None)
+            self._set_provenance(profile)
             self._set_covariance(profile)
             profile.encode()
         except ValueError as error:
@@ -208,6 +187,13 @@ class Camera:
         if seconds <= 0:
             raise ProfileError(None, "created", "not after 1970")
         return seconds
+
+    def _set_provenance(self, profile: Any) -> None:
+        if not isinstance(self.provenance, Provenance):
+            raise ProfileError(None, "provenance", "not a Provenance")
+        for key, place in PROVENANCE.items():
+            check = integer if place in ("views", "points", "held_out_views") else text
+            setattr(profile, place, check(f"provenance.{key}", getattr(self.provenance, key)))
 
     def _set_covariance(self, profile: Any) -> None:
         names = self.covariance_parameters
@@ -259,8 +245,39 @@ class Camera:
         return self._profile.unproject(_rows("pixels", pixels, 2))
 
     def origins(self, pixels: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera."""
-        return np.zeros((_rows("pixels", pixels, 2).shape[0], 3))
+        """Where the rays of pixels (N, 2) start, (N, 3) metres in the camera frame: zero for a central camera, else NaN
+        where there is no ray."""
+        given = _rows("pixels", pixels, 2)
+        return self._profile.origins(given) if self.pupil_e1 else np.zeros((len(given), 3))
+
+    def in_image(self, pixels: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether pixels (N, 2) lie on the sensor and inside the image circle, (N,)."""
+        return self._profile.in_image(_rows("pixels", pixels, 2))
+
+    def project_jacobian(
+        self, points: npt.ArrayLike
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """As project, with derivatives: pixels (N, 2), ok (N,), by the point (N, 2, 3), by PARAMETERS (N, 2, 41).
+
+        Everything is NaN where ok is False. Derivatives by a parameter are there also where it is zero now.
+        """
+        return self._profile.project_jacobian(_rows("points", points, 3))
+
+    @classmethod
+    def fit(
+        cls, rays: npt.ArrayLike, pixels: npt.ArrayLike, size: tuple[int, int], model: str = "p9", **more: Any
+    ) -> tuple[Camera, Any]:
+        """The generic camera that sees `rays` (N, 3) at `pixels` (N, 2), and how well; see pipefish.fit.fit_camera."""
+        from .fit import fit_camera
+
+        return fit_camera(rays, pixels, size, model, **more)
+
+    def to_generic(self, model: str = "p9", *, max_theta: float | None = None) -> tuple[Camera, Any]:
+        """This camera with the radial polynomial (and with model "p23" or "cpoly" its asymmetric terms) fitted over the
+        image, and how well it fits: pipefish.fit.Fit."""
+        from .formats.convert import generic
+
+        return generic(self, model, max_theta)
 
     # ------------------------------------------------------------------ files
 
@@ -275,7 +292,8 @@ class Camera:
             profile = _engine.Profile.decode(bytes(data))
         except ValueError as error:
             raise _split(error) from None
-        values = {key: getattr(profile, key) for key in (*_INTEGERS, *_SCALARS, *_CIRCLE, *_ARRAYS, *_TEXTS)}
+        values = {key: getattr(profile, key) for key in (*INTEGERS, *SCALARS, *CIRCLE, *ARRAYS, *TEXTS)}
+        values |= {key: getattr(profile, key) for key in RESIDUALS if not math.isnan(getattr(profile, key))}
         names = tuple(PARAMETERS[i] for i in profile.free_param)
         if names:
             covariance = np.zeros((len(names), len(names)))
@@ -287,16 +305,29 @@ class Camera:
         return cls(
             radial=_RADIAL[profile.radial],
             source=_SOURCE[profile.source],
-            rms_px=None if math.isnan(profile.rms_px) else profile.rms_px,
+            provenance=Provenance(**{key: getattr(profile, place) for key, place in PROVENANCE.items()}),
             theta_covered=profile.theta_covered or None,
             **values,
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Camera:
+    def load(cls, path: str | os.PathLike[str], **options: Any) -> Camera:
+        """Reads a profile, JSON or binary, or the calibration file of another program, whatever its name.
+
+        Other programs' models become ours exactly or by a fit; docs/formats.md lists them, pipefish.formats.load also
+        tells how well it fits and takes the same options: camera, size, max_error, max_theta, form.
+        Raises ProfileError with the file, the key and the reason.
+        """
+        from .formats import load
+
+        return load(path, **options).camera
+
+    @classmethod
+    def load_json(cls, path: str | os.PathLike[str]) -> Camera:
         """Reads a profile in JSON. Raises ProfileError with the file, the key and the reason."""
         try:
-            return cls._from_document(_parse(Path(path)))
+            values = profile_json.read(path)
+            return cls(**values | {"provenance": Provenance(**values.get("provenance", {}))})
         except ProfileError as error:
             key = "covariance.parameters" if error.key == "covariance_parameters" else error.key
             raise ProfileError(path, key, error.reason) from None
@@ -316,42 +347,9 @@ class Camera:
                 temporary.unlink()
             raise
 
-    @classmethod
-    def _from_document(cls, document: Mapping[str, Any]) -> Camera:
-        if document.get("format") != _FORMAT:
-            raise ProfileError(None, "format", f"not {_FORMAT!r}: this is not a profile")
-        if document.get("version") is True or document.get("version") != _VERSION:
-            raise ProfileError(None, "version", f"this version reads {_VERSION}")
-        values = {key: value for key, value in document.items() if key not in ("format", "version")}
-        known = {field.name for field in dataclasses.fields(cls)} - {"covariance_parameters"}
-        for key in values:
-            if key not in known:
-                raise ProfileError(None, key, "no such key in a profile")
-        for key in _JSON_REQUIRED:
-            if key not in values:
-                raise ProfileError(None, key, "missing")
-        if values.get("created") is not None:
-            values["created"] = _parse_time(values["created"])
-        if values.get("covariance") is not None:
-            values |= _parse_covariance(values["covariance"])
-        return cls(**values)
-
     def to_json(self) -> str:
         """The JSON form that people read, as `save` writes it."""
-        document: dict[str, Any] = {"format": _FORMAT, "version": _VERSION}
-        for key in (*_TEXTS, "source"):
-            document[key] = getattr(self, key)
-        document["created"] = None if self.created is None else self.created.strftime("%Y-%m-%dT%H:%M:%SZ")
-        for key in ("rms_px", "theta_covered", *_INTEGERS, "radial", *_SCALARS, *_CIRCLE, *_ARRAYS):
-            document[key] = getattr(self, key)
-        document["covariance"] = None
-        lines = [f"  {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in document.items()]
-        if self.covariance is not None:
-            rows = [json.dumps(row[: i + 1]) for i, row in enumerate(self.covariance.tolist())]
-            names = json.dumps(self.covariance_parameters)
-            lower = ",\n      ".join(rows)
-            lines[-1] = f'  "covariance": {{\n    "parameters": {names},\n    "lower": [\n      {lower}\n    ]\n  }}'
-        return "{\n" + ",\n".join(lines) + "\n}\n"
+        return profile_json.write(self)
 
     # ------------------------------------------------------------------ object
 
@@ -375,51 +373,3 @@ class Camera:
 
     def __reduce__(self) -> tuple[Any, tuple[bytes]]:
         return Camera.from_binary, (self.to_binary(),)
-
-
-def _parse(path: Path) -> Mapping[str, Any]:
-    def without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        result: dict[str, Any] = {}
-        for key, value in pairs:
-            if key in result:
-                raise ProfileError(None, key, "appears twice")
-            result[key] = value
-        return result
-
-    try:
-        with open(path, "rb") as file:
-            data = file.read(_BYTES_MAX + 1)
-    except OSError as error:
-        raise ProfileError(None, None, error.strerror or str(error)) from None
-    if len(data) > _BYTES_MAX:
-        raise ProfileError(None, None, f"longer than {_BYTES_MAX} bytes: this is not a profile")
-    try:
-        document = json.loads(data.decode("utf-8"), object_pairs_hook=without_twins)
-    except UnicodeDecodeError as error:
-        raise ProfileError(None, f"byte {error.start}", "not UTF-8 text: this is not a profile in JSON") from None
-    except json.JSONDecodeError as error:
-        raise ProfileError(None, f"line {error.lineno} column {error.colno}", error.msg) from None
-    except (RecursionError, ValueError) as error:
-        raise ProfileError(None, None, f"not a profile in JSON: {error}") from None
-    if not isinstance(document, dict):
-        raise ProfileError(None, None, "not a JSON object: this is not a profile")
-    return document
-
-
-def _parse_time(value: object) -> datetime.datetime:
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            return datetime.datetime.strptime(value, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=datetime.UTC)
-    raise ProfileError(None, "created", f"not a time like 2026-01-31T12:00:00Z: {value!r:.60}")
-
-
-def _parse_covariance(value: object) -> dict[str, Any]:
-    if not isinstance(value, dict) or set(value) != {"parameters", "lower"}:
-        raise ProfileError(None, "covariance", "not an object of 'parameters' and 'lower'")
-    names, lower = value["parameters"], value["lower"]
-    if not isinstance(names, list) or not isinstance(lower, list) or not names or len(lower) != len(names):
-        raise ProfileError(None, "covariance", "'parameters' and 'lower' are not lists of one length")
-    matrix = np.zeros((len(names), len(names)))
-    for i, row in enumerate(lower):
-        matrix[i, : i + 1] = matrix[: i + 1, i] = _numbers(f"covariance.lower[{i}]", row, i + 1)
-    return {"covariance_parameters": names, "covariance": matrix}

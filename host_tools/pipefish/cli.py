@@ -15,6 +15,11 @@ from pipefish.errors import PipefishError
 DONE, FAILED, USAGE = 0, 1, 2
 DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
 
+
+class UsageError(PipefishError):
+    """Arguments that do not go together."""
+
+
 DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud) or tcp://host:port"
 
 
@@ -139,6 +144,10 @@ def info_text(info: dict[str, Any]) -> str:
                 f"frames; median {tracks['length_keyframes_median']:.0f} keyframes",
             ),
         ]
+    if info["states"]:
+        rows.append(("states", ", ".join(f"{state} at {count} keyframes" for state, count in info["states"].items())))
+    if info["lost_tracks"]:
+        rows.append(("tracks lost", losses_text(info["lost_tracks"])))
     rows.append(("ended", info["end_reason"]))
     if info["object_bytes"]:
         rows.append(("received", size_text(info["object_bytes"])))
@@ -149,11 +158,23 @@ def info_text(info: dict[str, Any]) -> str:
     return table(rows)
 
 
+def losses_text(losses: dict[str, int]) -> str:
+    """Lost tracks by reason, most first."""
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(losses.items(), key=lambda item: -item[1]))
+
+
 def run_show(args: argparse.Namespace) -> Result:
+    from pipefish.page import write_statistics
     from pipefish.show import show
     from pipefish.survey import Survey
 
-    written = show(Survey.open(args.survey), Path(args.output), args.keyframe, quiet=args.json)
+    survey, out = Survey.open(args.survey), Path(args.output)
+    if args.stats:
+        if out.suffix.lower() not in (".html", ".htm"):
+            raise PipefishError(f"{out}: --stats writes a .html page")
+        size = write_statistics(survey, out)
+        return {"file": str(out), "kind": "statistics", "bytes": size}, f"{out} (statistics, {size_text(size)})"
+    written = show(survey, out, args.keyframe, quiet=args.json, colour=args.colour)
     return written, f"{written['file']} ({written['kind']}, {size_text(float(str(written['bytes'])))})"
 
 
@@ -162,6 +183,7 @@ def run_status(args: argparse.Namespace) -> Result:
 
     from pipefish import pipefish_pb2 as pb
     from pipefish.client import Client, Handlers
+    from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
     client = Client(open_transport(args.device, args.baud), Handlers(), wants_objects=False)
@@ -179,6 +201,7 @@ def run_status(args: argparse.Namespace) -> Result:
     rows = [
         ("device", info.software),
         ("source", info.source),
+        ("profile", stored_text(status.profile) if status.HasField("profile") else "none"),
         ("survey", info.survey_id.hex()),
         ("state", status.state),
         ("up for", seconds_text(status.uptime_ns / 1e9)),
@@ -187,6 +210,8 @@ def run_status(args: argparse.Namespace) -> Result:
             f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped",
         ),
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
+        ("scene", ", ".join(states_of(status.tracking)) or "nothing special"),
+        ("lost so far", losses_text(losses_of(status.tracking)) or "none"),
         ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
         ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"),
         (
@@ -197,6 +222,33 @@ def run_status(args: argparse.Namespace) -> Result:
         ("frame time", f"{stage.pyramid + stage.track + stage.detect:.0f} us, slowest {stage.frame_max:.0f} us"),
     ]
     return document, table(rows)
+
+
+def run_evaluate(args: argparse.Namespace) -> Result:
+    from pipefish.evaluate import compare_with_opencv, evaluate, verdict
+    from pipefish.simulate import Scene
+    from pipefish.survey import Survey
+
+    stem = Path(args.recording)
+    truth = Scene.from_truth(stem.with_name(stem.name + ".truth.json"))
+    survey = Survey.open(args.survey)
+    ours = evaluate(survey, truth)
+    if ours is None:
+        raise PipefishError(f"{survey.path}: no track was seen in two keyframes")
+    peer = compare_with_opencv(survey, truth, stem.with_name(stem.name + ".y4m")) if args.opencv else None
+    bars = verdict(ours, peer, smooth=args.smooth)
+    rows: list[tuple[str, object]] = [("", "device" + (", OpenCV's recipe" if peer else ""))]
+    for name, what in (
+        ("within_1px", "within 1 px"),
+        ("survival", "kept of those visible"),
+        ("median_px", "median error, px"),
+        ("length_median", "median length, frames"),
+    ):
+        values = [side[name] for side in (ours, peer) if side is not None]
+        rows.append((what, ", ".join("-" if v is None else f"{v:.4g}" for v in values)))
+    failed = [name for name, row in bars.items() if not row["holds"]]
+    rows.append(("bars", "all hold" if not failed else "missed: " + ", ".join(failed)))
+    return {"device": ours, "opencv": peer, "bars": bars}, table(rows)
 
 
 def run_simulate(args: argparse.Namespace) -> Result:
@@ -221,63 +273,50 @@ def run_simulate(args: argparse.Namespace) -> Result:
     return document, table(rows)
 
 
-def load_profile(path: Path) -> Any:
-    """A Camera from a JSON or binary profile; the content decides. Raises ProfileError, OSError."""
-    from pipefish.camera import Camera
-    from pipefish.errors import ProfileError
-
-    with open(path, "rb") as stream:
-        data = stream.read(65536)
-    if data.lstrip()[:1] in (b"{", b""):
-        return Camera.load(path)
-    try:
-        return Camera.from_binary(data)
-    except ProfileError as error:
-        raise ProfileError(path, error.position, error.reason) from None
+def stored_text(profile: Any) -> str:
+    """A pb.Profile for people."""
+    trial = f", on trial, {profile.starts_left} more starts" if profile.trial else ""
+    serial = f", serial {profile.serial}" if profile.serial else ""
+    return f"{profile.name or 'unnamed'}{serial} ({profile.crc32c:08x}){trial}"
 
 
-def run_profile_show(args: argparse.Namespace) -> Result:
-    import math
+def run_flash(args: argparse.Namespace) -> Result:
+    from google.protobuf.json_format import MessageToDict
 
-    camera = load_profile(Path(args.profile))
-    covered = f"{math.degrees(camera.theta_covered):.1f} deg" if camera.theta_covered else "unknown"
-    circle = f"({camera.circle_u:.1f}, {camera.circle_v:.1f}) radius {camera.circle_radius:.1f} px"
+    from pipefish.cli_profile import load_profile
+    from pipefish.flash import Flasher
+    from pipefish.transport import open_transport
+
+    if args.revert and (args.profile or args.confirm is not None):
+        raise UsageError("flash: --revert goes with neither a profile nor --confirm")
+    if not args.profile and not args.revert and not args.confirm:
+        raise UsageError("flash: give a profile, or --confirm or --revert")
+    data = load_profile(args).camera.to_binary() if args.profile else None
+    with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
+        if args.revert:
+            state = device.revert()
+        else:
+            state = device.send(data) if data else device.state()
+            if not state.HasField("stored"):
+                raise PipefishError("the device has no profile that could be confirmed")
+            if args.confirm is not False:
+                state = device.confirm(state.stored.sha256)
+    document = {
+        name: MessageToDict(profile, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        | {"sha256": profile.sha256.hex(), "crc32c": f"{profile.crc32c:08x}"}
+        if state.HasField(name)
+        else None
+        for name, profile in (("in_use", state.in_use), ("stored", state.stored))
+    }
+    document["slot_erases"] = [state.slot_erases_a, state.slot_erases_b]
+    stored = stored_text(state.stored) if state.HasField("stored") else "none"
+    in_use = stored_text(state.in_use) if state.HasField("in_use") else "none"
     rows = [
-        ("name", camera.name or "unnamed"),
-        ("serial", camera.serial),
-        ("source", camera.source),
-        ("created", camera.created.isoformat() if camera.created else None),
-        ("picture", f"{camera.width} x {camera.height}"),
-        ("model", camera.radial),
-        ("f_u, f_v", f"{camera.f_u:.4f}, {camera.f_v:.4f} px/rad"),
-        ("c_u, c_v", f"{camera.c_u:.4f}, {camera.c_v:.4f} px"),
-        ("skew", f"{camera.skew:.6g}" if camera.skew else None),
-        ("k2 .. k5", ", ".join(f"{k:.6g}" for k in (camera.k2, camera.k3, camera.k4, camera.k5))),
-        ("field of view", f"{2 * math.degrees(camera.theta_max):.1f} deg (data covered half of it up to {covered})"),
-        ("image circle", circle if camera.circle_radius else "the whole picture"),
-        ("residual", f"{camera.rms_px:.4f} px rms" if camera.rms_px is not None else "unknown"),
-        (
-            "covariance",
-            f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
-        ),
+        ("in use", in_use),
+        ("stored", stored + ("" if in_use == stored else "; the next start of the device takes it")),
+        ("written", f"{state.slot_erases_a + state.slot_erases_b} times"),
     ]
-    return json.loads(camera.to_json()), table(rows)
-
-
-def run_profile_check(args: argparse.Namespace) -> Result:
-    camera = load_profile(Path(args.profile))
-    document = {"file": args.profile, "valid": True, "name": camera.name}
-    return document, f"{args.profile}: valid ({camera.name or 'unnamed'}, {camera.width} x {camera.height})"
-
-
-def run_profile_convert(args: argparse.Namespace) -> Result:
-    from pipefish.show import write_atomically
-
-    camera, out = load_profile(Path(args.profile)), Path(args.out)
-    form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
-    data = camera.to_json().encode() if form == "json" else camera.to_binary()
-    write_atomically(out, data)
-    return {"file": str(out), "form": form, "bytes": len(data)}, f"{out}: {form}, {len(data)} bytes"
+    return document, table(rows)
 
 
 # ---- the parser
@@ -405,6 +444,20 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="picture to write")
     p.add_argument("--keyframe", type=int, metavar="N", help="index of the keyframe [the middle one]")
+    p.add_argument("--colour", choices=("age", "quality"), default="age", help="what the tracks' colour tells [age]")
+    p.add_argument("--stats", action="store_true", help="a .html page instead: what became of the tracks, and why")
+
+    p = add_command(
+        commands,
+        "evaluate",
+        run_evaluate,
+        "Compare the tracks of a survey of a simulated pipe with the truth, and with OpenCV's.",
+        "pipefish evaluate survey.mcap --recording /tmp/pipe --opencv",
+    )
+    p.add_argument("survey", metavar="FILE", help="survey file, complete or .partial")
+    p.add_argument("--recording", required=True, metavar="STEM", help="of pipefish simulate: STEM.truth.json, STEM.y4m")
+    p.add_argument("--opencv", action="store_true", help="also run OpenCV's usual chain over the recording's frames")
+    p.add_argument("--smooth", action="store_true", help="the bars for smooth plastic")
 
     p = add_command(
         commands, "status", run_status, "Ask a device how it is.", "pipefish status tcp://127.0.0.1:7447 --json"
@@ -414,36 +467,32 @@ def build_parser() -> argparse.ArgumentParser:
         "--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]; 0: wait for ever"
     )
 
+    from pipefish.cli_profile import add_profile, add_profile_input  # they need what stands above
+
     add_profile(commands)
+
+    p = add_command(
+        commands,
+        "flash",
+        run_flash,
+        "Put a camera profile on a device. It is stored on trial, read back, tested and confirmed; the device's next "
+        "start takes it.",
+        "pipefish flash tcp://127.0.0.1:7447 camera.json",
+    )
+    add_device(p)
+    p.add_argument("profile", metavar="PROFILE", nargs="?", help="a profile, or another program's calibration")
+    p.add_argument(
+        "--confirm",
+        action=argparse.BooleanOptionalAction,
+        help="without PROFILE: confirm the one on trial; --no-confirm with one: leave it on trial, and the device goes "
+        "back to the one before unless it is confirmed in time",
+    )
+    p.add_argument("--revert", action="store_true", help="drop the profile on trial, or go back to the one before")
+    add_profile_input(p)
+    p.add_argument(
+        "--timeout", type=not_negative, default=10.0, metavar="S", help="give up after S silent seconds [10]; 0: never"
+    )
     return parser
-
-
-def add_profile(commands: Any) -> None:
-    """`pipefish profile show|check|convert`."""
-    parser = commands.add_parser(
-        "profile", help="look at, check and convert camera profiles", description="Camera profiles."
-    )
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    p = add_command(actions, "show", run_profile_show, "Tell what a profile says.", "pipefish profile show camera.json")
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p = add_command(
-        actions,
-        "check",
-        run_profile_check,
-        "Check a profile; exit code 1 if it is not valid.",
-        "pipefish profile check camera.json",
-    )
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p = add_command(
-        actions,
-        "convert",
-        run_profile_convert,
-        "Convert a profile between JSON (for people) and binary (for devices).",
-        "pipefish profile convert camera.json camera.profile",
-    )
-    p.add_argument("profile", metavar="PROFILE", help="JSON or binary profile")
-    p.add_argument("out", metavar="OUT", help="file to write; .json: JSON, anything else: binary")
-    p.add_argument("--to", choices=("json", "binary"), help="form to write, whatever the name")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -465,7 +514,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.debug:
             raise
         print(f"pipefish: {message_of(error)}", file=sys.stderr)
-        return FAILED
+        return USAGE if isinstance(error, UsageError) else FAILED
 
 
 def message_of(error: BaseException) -> str:

@@ -52,6 +52,12 @@ class Handlers:
         """Answer (STORED, AGAIN, REFUSE) to an object that is all here; None: not yet, ask again on the next turn."""
         raise NotImplementedError
 
+    def on_sent(self, name: bytes) -> None:
+        """The device has this object durably."""
+
+    def on_refused(self, name: bytes) -> None:
+        """The device will never take this object."""
+
     def on_status(self, status: pb.Status) -> None:
         """Newest counters of the device."""
 
@@ -191,6 +197,10 @@ class Client:
                 self._latest(event.topic, event.data)
             case x if x == OFFER:
                 self.link.answer_object(event.slot, self.handlers.on_offer(event.name, event.kind, event.size))
+            case x if x == SENT:
+                self.handlers.on_sent(event.name)
+            case x if x == REFUSED:
+                self.handlers.on_refused(event.name)
             case x if x == OBJECT:
                 self._pending.append((event.slot, event.name, event.kind, event.data))
 

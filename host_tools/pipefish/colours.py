@@ -21,6 +21,8 @@ STOPS = np.array(
 )
 AGE_MAX = 60  # frames; older tracks share the last colour. In a narrow pipe a point is in view for about 30.
 
+QUALITY_LOW = 0.8  # the tracker's default limit: nothing less is reported
+
 
 def age_position(age: np.ndarray) -> np.ndarray:
     """(N,) ages in frames -> (N,) positions on the scale, 0..1."""
@@ -38,3 +40,8 @@ def scale_colours(position: np.ndarray) -> np.ndarray:
 def age_colours(age: np.ndarray) -> np.ndarray:
     """(N,) ages in frames -> (N,3) uint8 RGB."""
     return scale_colours(age_position(age))
+
+
+def quality_position(quality: np.ndarray) -> np.ndarray:
+    """(N,) similarities with the frame before -> (N,) positions on the scale: from QUALITY_LOW, least violet, to 1."""
+    return np.clip((np.asarray(quality, dtype=float) - QUALITY_LOW) / (1 - QUALITY_LOW), 0.0, 1.0)

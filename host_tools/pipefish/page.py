@@ -14,8 +14,10 @@ import numpy as np
 
 from pipefish import __version__
 from pipefish.colours import AGE_MAX, scale_colours
+from pipefish.errors import PipefishError
 from pipefish.show import Painter, Style, animation, spread, write_atomically
 from pipefish.survey import Survey
+from pipefish.trackstats import charts as statistics_charts
 
 GALLERY = 16  # keyframes
 GALLERY_WIDTH = 900  # pixels
@@ -50,6 +52,14 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
     return {"title": {"text": title}, **more}
 
 
+def along_of(survey: Survey) -> tuple[bool, np.ndarray, str]:
+    """(whether it is chainage, (N,) where each keyframe lies along the survey, title of that axis)."""
+    chainage = survey.chainage()
+    if len(chainage) and np.isfinite(chainage).all():
+        return True, chainage, "chainage by the encoder, m"
+    return False, np.array([k.index for k in survey.keyframes], dtype=float), "keyframe"
+
+
 class Page:
     """Collects the parts of the page. Use `write_page`."""
 
@@ -60,10 +70,7 @@ class Page:
         self.tracks = self.painter.tracks
         self.evaluation = evaluation
         self.extra = extra
-        chainage = survey.chainage()
-        self.has_chainage = bool(np.isfinite(chainage).all())
-        self.along = chainage if self.has_chainage else np.array([k.index for k in survey.keyframes], dtype=float)
-        self.along_title = "chainage by the encoder, m" if self.has_chainage else "keyframe"
+        self.has_chainage, self.along, self.along_title = along_of(survey)
 
     # ---- charts: (title, what one should see, data, layout)
 
@@ -116,6 +123,7 @@ class Page:
                 "layout": {"xaxis": _axis(self.along_title), "yaxis": _axis("tracks", rangemode="tozero")},
             }
         )
+        charts += statistics_charts(self.survey, self.along, self.along_title)
         if self.evaluation and self.evaluation["by_age"]:
             charts.append(self._chart_accuracy(self.evaluation["by_age"]))
         return charts
@@ -374,12 +382,43 @@ def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
         "data": _for_script({"gallery": gallery, "charts": [*tracks, *device]}),
         "script": (ASSETS / "page.js").read_text(encoding="utf-8"),
     }
-    parts = (ASSETS / "page.html").read_text(encoding="utf-8").split("{{")
+    return _fill("page.html", values)
+
+
+def _fill(template: str, values: dict[str, str]) -> str:
+    """A template of page_assets with its {{names}} replaced."""
+    parts = (ASSETS / template).read_text(encoding="utf-8").split("{{")
     text = [parts[0]]
     for part in parts[1:]:
         name, _, rest = part.partition("}}")
         text += [values[name.strip()], rest]
     return "".join(text)
+
+
+def write_statistics(survey: Survey, out: Path) -> int:
+    """Writes a page with the track statistics along a survey; returns its size in bytes.
+
+    Raises PipefishError if the device counted nothing; OSError."""
+    from plotly.offline import get_plotlyjs
+
+    _, along, title = along_of(survey)
+    charts = statistics_charts(survey, along, title)
+    if not charts:
+        raise PipefishError(f"{survey.path}: no track statistics: recorded by an older device, or no keyframes")
+    name = survey.info["name"] or survey.info["survey_id"]
+    values = {
+        "title": html.escape(name),
+        "lead": html.escape(f"What became of the tracks, over {len(survey.keyframes)} keyframes."),
+        "css": (ASSETS / "page.css").read_text(encoding="utf-8"),
+        "tracks": "".join(map(_chart, charts)),
+        "version": __version__,
+        "plotly": get_plotlyjs(),
+        "data": _for_script({"charts": charts}),
+        "script": (ASSETS / "page.js").read_text(encoding="utf-8"),
+    }
+    data = _fill("stats.html", values).encode()
+    write_atomically(out, data)
+    return len(data)
 
 
 def write_page(

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from pipefish.colours import AGE_MAX, age_colours, age_position, scale_colours
+from pipefish.colours import AGE_MAX, QUALITY_LOW, age_position, quality_position, scale_colours
 from pipefish.errors import PipefishError, file_error
 from pipefish.progress import track as progress_over
+from pipefish.scene import states_of
 from pipefish.survey import Keyframe, Survey, Tracks
 
 SUPERSAMPLE = 2  # lines are drawn so much larger and then reduced: smooth edges
@@ -25,6 +26,7 @@ ANIMATION_WIDTH = 560  # pixels
 FRAME_MS = 120
 
 BACKGROUND, TEXT, MUTED = (17, 19, 24), (236, 238, 242), (150, 156, 168)
+ALERT = (255, 190, 90)
 
 
 @dataclass
@@ -35,6 +37,7 @@ class Style:
     legend: bool = True
     line: float = 1.8
     dot: float = 2.6
+    colour: str = "age"  # or "quality"
 
 
 class Painter:
@@ -51,14 +54,19 @@ class Painter:
         self._order = order
         self._frames = self.tracks.frame[order]
 
-    def _trails(self, frame: Keyframe) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """(pixels (M,2), age (M,)) of each track seen in `frame`, oldest first, as far back as a trail reaches."""
+    def _trails(self, frame: Keyframe, colour: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """(pixels (M,2), colours (M,3)) of each track seen in `frame`, oldest first, as far back as a trail reaches."""
         low, high = np.searchsorted(self._frames, [frame.index - TRAIL, frame.index + 1])
         items = np.sort(self._order[low:high])
         track = self.tracks.track[items]
         for part in np.split(items, np.flatnonzero(np.diff(track)) + 1):
             if len(part) and self.tracks.frame[part[-1]] == frame.index:
-                yield self.tracks.pixels[part], self.tracks.age[part]
+                position = age_position(self.tracks.age[part])
+                if colour == "quality":  # a new track has none yet
+                    position = np.where(
+                        self.tracks.age[part] > 0, quality_position(self.tracks.quality[part]), position
+                    )
+                yield self.tracks.pixels[part], scale_colours(position)
 
     def draw(self, position: int, style: Style) -> Image.Image:
         """The keyframe at `position` of survey.keyframes with its tracks: trails of the last few, coloured by age."""
@@ -72,9 +80,8 @@ class Painter:
         layer = Image.new("RGBA", (size[0] * SUPERSAMPLE, size[1] * SUPERSAMPLE), (0, 0, 0, 0))
         pen = ImageDraw.Draw(layer)
         dots = []
-        for pixels, age in self._trails(frame):
+        for pixels, colours in self._trails(frame, style.colour):
             points = (pixels + 0.5) * factor
-            colours = age_colours(age)
             for i in range(1, len(points)):
                 alpha = int(255 * (0.25 + 0.65 * i / (len(points) - 1)))
                 line = [tuple(points[i - 1]), tuple(points[i])]
@@ -86,7 +93,21 @@ class Painter:
                 pen.ellipse((x - r, y - r, x + r, y + r), fill=fill)
         layer = layer.reduce(SUPERSAMPLE)
         base.paste(layer, (0, 0), layer)
-        return self._with_legend(base, position) if style.legend else base
+        self._write_states(base, states_of(frame.message.tracking))
+        return self._with_legend(base, position, style.colour) if style.legend else base
+
+    def _write_states(self, picture: Image.Image, states: list[str]) -> None:
+        """The states of the scene in the upper left corner, on a dark ground."""
+        if not states:
+            return
+        unit = max(10, picture.width // 48)
+        font = ImageFont.load_default(unit)
+        pen = ImageDraw.Draw(picture, "RGBA")
+        text = ", ".join(states)
+        left, top, right, bottom = pen.textbbox((unit, unit), text, font=font)
+        pad = unit // 3
+        pen.rectangle((left - pad, top - pad, right + pad, bottom + pad), fill=(*BACKGROUND, 200))
+        pen.text((unit, unit), text, font=font, fill=ALERT)
 
     def caption(self, position: int) -> str:
         """One line about a keyframe."""
@@ -97,8 +118,8 @@ class Painter:
         parts.append(f"{len(frame.observations.id)} tracks")
         return "   ".join(parts)
 
-    def _with_legend(self, picture: Image.Image, position: int) -> Image.Image:
-        """Adds a strip below: what it is, and the scale of ages."""
+    def _with_legend(self, picture: Image.Image, position: int, colour: str) -> Image.Image:
+        """Adds a strip below: what it is, and the scale of ages or qualities."""
         unit = max(10, picture.width // 56)  # text height
         strip = Image.new("RGB", (picture.width, unit * 4), BACKGROUND)
         pen = ImageDraw.Draw(strip)
@@ -108,11 +129,15 @@ class Painter:
         ramp = scale_colours(np.linspace(0, 1, length))
         bar = Image.fromarray(np.broadcast_to(ramp, (unit * 6 // 10, length, 3)).copy(), "RGB")
         strip.paste(bar, (left, unit * 15 // 10))
-        for age in (0, 1, 3, 10, 30, AGE_MAX):
-            x = left + float(age_position(np.array([age]))[0]) * (length - 1)
-            label = f"{age}+" if age == AGE_MAX else str(age)
-            pen.text((x, unit * 2.4), label, font=small, fill=MUTED, anchor="mt")
-        pen.text((left, unit * 1.25), "age of a track in camera frames", font=small, fill=MUTED, anchor="ls")
+        if colour == "quality":
+            marks = [(v, f"{v:g}") for v in (QUALITY_LOW, 0.85, 0.9, 0.95, 1.0)]
+            places, what = quality_position(np.array([v for v, _ in marks])), "similarity with the frame before"
+        else:
+            marks = [(v, f"{v}+" if v == AGE_MAX else str(v)) for v in (0, 1, 3, 10, 30, AGE_MAX)]
+            places, what = age_position(np.array([v for v, _ in marks])), "age of a track in camera frames"
+        for (_, label), place in zip(marks, places, strict=True):
+            pen.text((left + float(place) * (length - 1), unit * 2.4), label, font=small, fill=MUTED, anchor="mt")
+        pen.text((left, unit * 1.25), what, font=small, fill=MUTED, anchor="ls")
         whole = Image.new("RGB", (picture.width, picture.height + strip.height))
         whole.paste(picture, (0, 0))
         whole.paste(strip, (0, picture.height))
@@ -161,10 +186,11 @@ def animation(
     frames: int = ANIMATION_FRAMES,
     legend: bool = True,
     quiet: bool = True,
+    colour: str = "age",
 ) -> bytes:
     """The keyframes one after the other, tracks drawn: at most `frames`, spread evenly over all, and `limit` bytes."""
     count = len(painter.survey.keyframes)
-    style = Style(width, legend, line=1.1, dot=1.6)
+    style = Style(width, legend, line=1.1, dot=1.6, colour=colour)
     positions = spread(count, frames)
     pictures = [painter.draw(p, style) for p in progress_over(positions, "drawing", len(positions), quiet)]
     quality = 60
@@ -194,18 +220,22 @@ def write_atomically(path: Path, data: bytes) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def show(survey: Survey, out: Path, keyframe: int | None = None, quiet: bool = False) -> dict[str, object]:
+def show(
+    survey: Survey, out: Path, keyframe: int | None = None, quiet: bool = False, colour: str = "age"
+) -> dict[str, object]:
     """Writes an overlay (.png, .jpg, .webp with a keyframe named) or an animation (.gif, .webp). Returns what it wrote.
+
+    colour: "age" or "quality" (similarity with the frame before), of the tracks.
 
     Raises PipefishError for another suffix or a keyframe that is not there; OSError.
     """
     suffix = out.suffix.lower()
     painter = Painter(survey)
     if suffix == ".gif" or (suffix == ".webp" and keyframe is None):
-        data = animation(painter, suffix, quiet=quiet)
+        data = animation(painter, suffix, quiet=quiet, colour=colour)
         kind = "animation"
     elif suffix in (".png", ".jpg", ".jpeg", ".webp"):
-        picture = painter.draw(position_of(survey, keyframe), Style(natural_width(survey)))
+        picture = painter.draw(position_of(survey, keyframe), Style(natural_width(survey), colour=colour))
         buffer = io.BytesIO()
         picture.save(buffer, {".png": "PNG", ".webp": "WEBP"}.get(suffix, "JPEG"), quality=88)
         data, kind = buffer.getvalue(), "overlay"

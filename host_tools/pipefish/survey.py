@@ -17,6 +17,7 @@ from mcap.records import Channel, Message, Metadata
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError
 from pipefish.mcapscan import Damage, McapScan, read_chunk
+from pipefish.scene import STATES, losses_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -163,6 +164,7 @@ class Tracks:
     pixels      (N,2) float64
     covariance  (N,2,2) float64 px^2
     age         (N,) int64 frames since detection, at this observation
+    quality     (N,) float64 similarity with the frame before, 0..1; 0 when new
     boot, id    (K,) uint64 boot id and (K,) int64 id on the device, of each track
     """
 
@@ -171,6 +173,7 @@ class Tracks:
     pixels: np.ndarray
     covariance: np.ndarray
     age: np.ndarray
+    quality: np.ndarray
     boot: np.ndarray
     id: np.ndarray
 
@@ -372,6 +375,7 @@ class Survey:
             pixels=joined("xy", (2,), np.float64)[order],
             covariance=joined("covariance", (2, 2), np.float64)[order],
             age=joined("age", (), np.int64)[order],
+            quality=joined("quality", (), np.float64)[order],
             boot=boots[first],
             id=ids[first],
         )
@@ -390,6 +394,9 @@ class Survey:
         if self.end is not None and self.end.HasField("last_status"):
             return self.end.last_status
         return self.statuses[-1][1] if self.statuses else None
+
+    def _count_state(self, name: str) -> int:
+        return sum(getattr(k.message.tracking, name) for k in self.keyframes)
 
     @cached_property
     def info(self) -> dict[str, Any]:
@@ -431,6 +438,8 @@ class Survey:
             "length_m": length,
             "first_time_unix_ns": self.keyframes[0].time_ns if self.keyframes else None,
             "tracks": lengths,
+            "states": {words: n for name, words in STATES if (n := self._count_state(name))},
+            "lost_tracks": losses_of(status.tracking) if status else {},
             "object_bytes": sum(r.size for r in self.receipts),
             "receive_s": (max(received) - min(received)) / 1e9 if received else None,
             "end_reason": self.end.reason if self.end else None,

@@ -1,6 +1,7 @@
 #include "pipefish/image.h"
+#include "reduce.h"
 
-/* Rows of every stored level start on a multiple of this many bytes, for the vector kernels to come. */
+/* Rows of every stored level start on a multiple of this many bytes: the length of a vector. */
 #define ROW_ALIGN 16u
 
 static size_t align_up(size_t n)
@@ -14,10 +15,9 @@ static bool arguments_ok(uint32_t width, uint32_t height, uint32_t levels)
            levels <= PF_PYRAMID_LEVELS_MAX;
 }
 
-/* The row buffer holds one vertically filtered row, two mirrored pixels on either side. */
 static size_t row_bytes(uint32_t width)
 {
-    return align_up((size_t)(width + 4u) * sizeof(uint16_t));
+    return align_up(PF_REDUCE_ROW(width) * sizeof(uint16_t));
 }
 
 size_t pf_pyramid_workspace_size(uint32_t width, uint32_t height, uint32_t levels)
@@ -55,36 +55,14 @@ pf_status pf_pyramid_init(pf_pyramid *pyramid, uint32_t width, uint32_t height, 
     return PF_OK;
 }
 
-/* Mirrors an index about the first and last sample, neither repeated: ... 2 1 | 0 1 2. */
-static uint32_t mirror(int32_t i, uint32_t n)
+/* One level from the one above it. */
+static void reduce_level(const pf_image *from, const pf_image *to, uint8_t *store, uint16_t *row)
 {
-    if (n == 1u)
-        return 0;
-    const int32_t last = (int32_t)n - 1;
-    while (i < 0 || i > last)
-        i = i < 0 ? -i : 2 * last - i;
-    return (uint32_t)i;
-}
-
-/* One level from the one above it. Sums stay below 255 * 256, so 16 bits hold them until the one rounding. */
-static void reduce(const pf_image *from, const pf_image *to, uint8_t *store, uint16_t *row)
-{
-    uint16_t *v = row + 2;
     for (uint32_t y = 0; y < to->height; y++) {
         const uint8_t *r[5];
         for (int32_t k = 0; k < 5; k++)
-            r[k] = from->data + (size_t)mirror((int32_t)(2u * y) + k - 2, from->height) * from->stride;
-        for (uint32_t x = 0; x < from->width; x++)
-            v[x] = (uint16_t)(r[0][x] + r[4][x] + 4 * (r[1][x] + r[3][x]) + 6 * r[2][x]);
-        for (int32_t k = 1; k <= 2; k++) {
-            v[-k] = v[mirror(-k, from->width)];
-            v[(int32_t)from->width - 1 + k] = v[mirror((int32_t)from->width - 1 + k, from->width)];
-        }
-        uint8_t *out = store + (size_t)y * to->stride;
-        for (uint32_t x = 0; x < to->width; x++) {
-            const uint16_t *p = row + 2u * x;
-            out[x] = (uint8_t)((p[0] + p[4] + 4 * (p[1] + p[3]) + 6 * p[2] + 128) >> 8);
-        }
+            r[k] = from->data + (size_t)pf_mirror((int32_t)(2u * y) + k - 2, from->height) * from->stride;
+        pf_reduce(r, from->width, row, store + (size_t)y * to->stride);
     }
 }
 
@@ -95,6 +73,6 @@ pf_status pf_pyramid_build(pf_pyramid *pyramid, const pf_image *frame)
         return PF_ERR_ARGUMENT;
     pyramid->level[0] = *frame;
     for (uint32_t l = 1; l < pyramid->levels; l++)
-        reduce(&pyramid->level[l - 1u], &pyramid->level[l], pyramid->store[l], pyramid->row);
+        reduce_level(&pyramid->level[l - 1u], &pyramid->level[l], pyramid->store[l], pyramid->row);
     return PF_OK;
 }

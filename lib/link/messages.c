@@ -176,9 +176,46 @@ static void set_telemetry(pipefish_v1_Telemetry *out, const pf_msg_telemetry *in
     out->emergency_stop = in->emergency_stop;
 }
 
+static pipefish_v1_Profile profile_message(const pf_msg_profile *in)
+{
+    pipefish_v1_Profile out = {.name = text(in->name),
+                               .serial = text(in->serial),
+                               .crc32c = in->crc32c,
+                               .trial = in->is_trial,
+                               .starts_left = in->starts_left};
+    memcpy(out.sha256, in->sha256, sizeof out.sha256);
+    return out;
+}
+
+static void set_tracking(pipefish_v1_Tracking *out, const pf_msg_tracking *in)
+{
+    *out = (pipefish_v1_Tracking){.standing = (in->scene & PF_SCENE_STANDING) != 0,
+                                  .reversing = (in->scene & PF_SCENE_REVERSING) != 0,
+                                  .dark = (in->scene & PF_SCENE_DARK) != 0,
+                                  .covered = (in->scene & PF_SCENE_COVERED) != 0,
+                                  .over_exposed = (in->scene & PF_SCENE_OVEREXPOSED) != 0,
+                                  .weak_texture = (in->scene & PF_SCENE_WEAK_TEXTURE) != 0,
+                                  .frames = in->frames,
+                                  .tracked = in->tracked,
+                                  .detected = in->detected,
+                                  .lost_left = in->lost_by[PF_TRACK_LEFT],
+                                  .lost_flat = in->lost_by[PF_TRACK_FLAT],
+                                  .lost_diverged = in->lost_by[PF_TRACK_DIVERGED],
+                                  .lost_residual = in->lost_by[PF_TRACK_RESIDUAL],
+                                  .lost_backward = in->lost_by[PF_TRACK_BACKWARD],
+                                  .lost_crowded = in->lost_by[PF_TRACK_CROWDED],
+                                  .lost_drift = in->lost_by[PF_TRACK_DRIFT],
+                                  .lost_masked = in->lost_by[PF_TRACK_MASKED],
+                                  .lost_static = in->lost_by[PF_TRACK_STATIC],
+                                  .lost_saturated = in->lost_by[PF_TRACK_SATURATED],
+                                  .age_median = in->age_median,
+                                  .quality_median = in->quality_median,
+                                  .static_blocks = in->static_blocks};
+}
+
 static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
 {
-    out->has_time = out->has_stage = out->has_spool = out->has_link = out->has_telemetry = true;
+    out->has_time = out->has_stage = out->has_spool = out->has_link = out->has_telemetry = out->has_tracking = true;
     out->time = device_time(&in->time);
     memcpy(out->survey_id, in->survey_id, sizeof out->survey_id);
     out->state = text(in->state);
@@ -211,6 +248,10 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     out->uptime_ns = in->uptime_ns;
     out->has_clock = in->has_clock;
     out->clock = (pipefish_v1_ClockSync){in->clock.boot_id, in->clock.offset_ns, in->clock.error_ns};
+    out->has_profile = in->has_profile;
+    if (in->has_profile)
+        out->profile = profile_message(&in->profile);
+    set_tracking(&out->tracking, &in->tracking);
 }
 
 /* The library fails on a full buffer only: the callbacks here never do, and texts are not checked. */
@@ -253,6 +294,8 @@ pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *k, uint8_t *out, size_t 
     m.has_observations = true;
     set_observations(&m.observations, columns, k->tracks, k->n_tracks);
     m.common_tracks = k->common_tracks;
+    m.has_tracking = true;
+    set_tracking(&m.tracking, &k->tracking);
     return encode(pipefish_v1_Keyframe_fields, &m, out, capacity, n);
 }
 
@@ -377,7 +420,7 @@ pf_status pf_msg_encode_preview(const pf_msg_preview *p, uint8_t *out, size_t ca
 pf_status pf_msg_encode_reply(const pf_msg_reply *r, uint8_t *out, size_t capacity, size_t *n)
 {
     pipefish_v1_Reply m = pipefish_v1_Reply_init_zero;
-    if (r->status && r->info)
+    if ((r->status != NULL) + (r->info != NULL) + (r->profile != NULL) > 1)
         return PF_ERR_ARGUMENT;
     m.id = r->id;
     m.error = text(r->error);
@@ -393,6 +436,18 @@ pf_status pf_msg_encode_reply(const pf_msg_reply *r, uint8_t *out, size_t capaci
                                    .source = text(r->info->source)};
         memcpy(info->survey_id, r->info->survey_id, sizeof info->survey_id);
         memcpy(info->profile_sha256, r->info->profile_sha256, sizeof info->profile_sha256);
+    } else if (r->profile) {
+        pipefish_v1_ProfileState *state = &m.what.profile;
+        m.which_what = pipefish_v1_Reply_profile_tag;
+        *state = (pipefish_v1_ProfileState){.has_in_use = r->profile->has_in_use,
+                                            .has_stored = r->profile->has_stored,
+                                            .problem = text(r->profile->problem),
+                                            .slot_erases_a = r->profile->slot_erases[0],
+                                            .slot_erases_b = r->profile->slot_erases[1]};
+        if (state->has_in_use)
+            state->in_use = profile_message(&r->profile->in_use);
+        if (state->has_stored)
+            state->stored = profile_message(&r->profile->stored);
     }
     return encode(pipefish_v1_Reply_fields, &m, out, capacity, n);
 }
@@ -403,7 +458,10 @@ _Static_assert((int)PF_REQUEST_GET_STATUS == pipefish_v1_Request_get_status_tag 
                    (int)PF_REQUEST_STOP_SURVEY == pipefish_v1_Request_stop_survey_tag &&
                    (int)PF_REQUEST_SET_LAMP == pipefish_v1_Request_set_lamp_tag &&
                    (int)PF_REQUEST_CLOCK_SYNC == pipefish_v1_Request_clock_sync_tag &&
-                   (int)PF_REQUEST_SHUTDOWN == pipefish_v1_Request_shutdown_tag,
+                   (int)PF_REQUEST_SHUTDOWN == pipefish_v1_Request_shutdown_tag &&
+                   (int)PF_REQUEST_GET_PROFILE == pipefish_v1_Request_get_profile_tag &&
+                   (int)PF_REQUEST_CONFIRM_PROFILE == pipefish_v1_Request_confirm_profile_tag &&
+                   (int)PF_REQUEST_REVERT_PROFILE == pipefish_v1_Request_revert_profile_tag,
                "pf_msg_decode_request copies the number");
 
 pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *request)
@@ -415,6 +473,8 @@ pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *
     *request = (pf_msg_request){.id = m.id, .what = (pf_request_what)m.which_what};
     if (request->what == PF_REQUEST_SET_LAMP)
         request->lamp = m.what.set_lamp;
+    if (request->what == PF_REQUEST_CONFIRM_PROFILE)
+        memcpy(request->profile_sha256, m.what.confirm_profile, sizeof request->profile_sha256);
     if (request->what == PF_REQUEST_CLOCK_SYNC)
         request->clock =
             (pf_msg_clock_sync){m.what.clock_sync.boot_id, m.what.clock_sync.offset_ns, m.what.clock_sync.error_ns};

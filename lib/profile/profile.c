@@ -1,27 +1,46 @@
-/* The profile's binary format; docs/profile.md describes it. Encoding writes the bytes and then checks those bytes, so
- * there is one set of rules, and decoding can check before it touches the caller's profile without a copy of it. */
+/* The profile's binary format; SPEC.md describes it. Encoding writes the bytes and then checks those bytes, so there is
+ * one set of rules, and decoding can check before it touches the caller's profile without a copy of it. */
 #include "pipefish/profile.h"
 
-#include <string.h>
+#include "bytes.h"
+#include "vectors.h"
 
-#define AT_MAGIC       0u
-#define AT_VERSION     4u
-#define AT_LENGTH      8u
-#define AT_SOURCE      12u
-#define AT_CREATED     16u
-#define AT_RMS         24u
-#define AT_COVERED     32u
-#define AT_NAME        40u
-#define AT_SERIAL      104u
-#define AT_WIDTH       168u
-#define AT_HEIGHT      172u
-#define AT_RADIAL      176u
-#define AT_FREE_COUNT  180u
-#define AT_CAMERA      184u
-#define AT_FREE_PARAM  544u
-#define AT_COVARIANCE  584u
-#define CHECKSUM_BYTES 4u
-#define SMALLEST       (AT_COVARIANCE + CHECKSUM_BYTES)
+#define AT_MAGIC        0u
+#define AT_VERSION      4u
+#define AT_LENGTH       8u
+#define AT_SOURCE       12u
+#define AT_CREATED      16u
+#define AT_RMS          24u
+#define AT_COVERED      32u
+#define AT_NAME         40u
+#define AT_SERIAL       104u
+#define AT_WIDTH        168u
+#define AT_HEIGHT       172u
+#define AT_RADIAL       176u
+#define AT_FREE_COUNT   180u
+#define AT_CAMERA       184u
+#define AT_FREE_PARAM   544u
+#define AT_COVARIANCE_1 584u /* where version 1 has its covariance */
+
+/* What version 2 puts in front of the covariance; behind it come the self-test vectors. */
+#define AT_UNITS         584u
+#define AT_HELD_VIEWS    588u
+#define AT_HELD_RMS      592u
+#define AT_VIEWS         600u
+#define AT_POINTS        604u
+#define AT_LENS          608u
+#define AT_TOOL          672u
+#define AT_TOOL_VERSION  704u
+#define AT_MODEL_CHOICE  736u
+#define AT_VECTORS       800u
+#define AT_FIXED_VECTORS 804u
+#define AT_COVARIANCE_2  808u
+
+#define CHECKSUM_BYTES     4u
+#define FIXED_VECTOR_BYTES 28u
+#define FIXED_VECTORS_MAX  8u
+
+#define UNITS 1u /* pixels with the centre of the top-left one at (0, 0), radians, metres: there are no others */
 
 /* 9999-12-31T23:59:59Z: the last second that the JSON form can write. */
 #define CREATED_MAX 253402300799
@@ -64,46 +83,35 @@ static const run CAMERA_RUNS[] = {
 
 _Static_assert(AT_SERIAL == AT_NAME + PF_PROFILE_NAME_MAX && AT_WIDTH == AT_SERIAL + PF_PROFILE_NAME_MAX &&
                    AT_FREE_PARAM == AT_CAMERA + 45 * sizeof(double) &&
-                   AT_COVARIANCE == AT_FREE_PARAM + PF_PROFILE_FREE_MAX,
+                   AT_COVARIANCE_1 == AT_FREE_PARAM + PF_PROFILE_FREE_MAX && AT_TOOL == AT_LENS + PF_PROFILE_NAME_MAX &&
+                   AT_TOOL_VERSION == AT_TOOL + PF_PROFILE_TOOL_MAX &&
+                   AT_MODEL_CHOICE == AT_TOOL_VERSION + PF_PROFILE_TOOL_MAX &&
+                   AT_VECTORS == AT_MODEL_CHOICE + PF_PROFILE_NAME_MAX,
                "the layout of the images that are on devices");
-_Static_assert(SMALLEST + sizeof(((pf_profile *)0)->covariance) <= PF_PROFILE_BINARY_MAX, "PF_PROFILE_BINARY_MAX");
+_Static_assert(AT_COVARIANCE_2 + sizeof(((pf_profile *)0)->covariance) + PF_PROFILE_VECTORS * PF_VECTOR_BYTES +
+                       FIXED_VECTORS_MAX * FIXED_VECTOR_BYTES + CHECKSUM_BYTES <=
+                   PF_PROFILE_BINARY_MAX,
+               "PF_PROFILE_BINARY_MAX");
 
-static void put_u32(uint8_t *p, uint32_t value)
-{
-    for (unsigned i = 0; i < 4; i++)
-        p[i] = (uint8_t)(value >> (8 * i));
-}
-
-static uint32_t get_u32(const uint8_t *p)
-{
-    return (uint32_t)p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
-}
-
-static void put_u64(uint8_t *p, uint64_t value)
-{
-    put_u32(p, (uint32_t)value);
-    put_u32(p + 4, (uint32_t)(value >> 32));
-}
-
-static uint64_t get_u64(const uint8_t *p)
-{
-    return (uint64_t)get_u32(p) | (uint64_t)get_u32(p + 4) << 32;
-}
-
-static void put_f64(uint8_t *p, double value)
-{
-    uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    put_u64(p, bits);
-}
-
-static double get_f64(const uint8_t *p)
-{
-    uint64_t bits = get_u64(p);
-    double value;
-    memcpy(&value, &bits, sizeof value);
-    return value;
-}
+typedef struct text_field {
+    uint32_t since; /* version of the format */
+    size_t at, size, offset;
+    const char *why;
+} text_field;
+#define TEXT(since, at, field)                                                                                         \
+    {                                                                                                                  \
+        since, at, sizeof(((pf_profile *)0)->field), offsetof(pf_profile, field),                                      \
+            #field ": not UTF-8 text without control characters, or too long"                                          \
+    }
+static const text_field TEXTS[] = {
+    TEXT(1, AT_NAME, name),
+    TEXT(1, AT_SERIAL, serial),
+    TEXT(2, AT_LENS, lens),
+    TEXT(2, AT_TOOL, tool),
+    TEXT(2, AT_TOOL_VERSION, tool_version),
+    TEXT(2, AT_MODEL_CHOICE, model_choice),
+};
+#define TEXT_COUNT (sizeof TEXTS / sizeof TEXTS[0])
 
 /* By the exponent's bits, for this room has no math.h. */
 static bool is_finite(const uint8_t *p)
@@ -114,9 +122,25 @@ static bool is_finite(const uint8_t *p)
 /* The only NaN a file may hold, so that one profile has one encoding. */
 #define NAN_BITS 0x7FF8000000000000u
 
-static size_t encoded_length(uint32_t free_count)
+static size_t covariance_bytes(uint32_t free_count)
 {
-    return SMALLEST + (size_t)free_count * (free_count + 1) / 2 * sizeof(double);
+    return (size_t)free_count * (free_count + 1) / 2 * sizeof(double);
+}
+
+/* Where what changed with the version lies; lengths as the counts in the bytes say. */
+typedef struct layout {
+    uint32_t version, vectors, fixed_vectors;
+    size_t covariance, vectors_at, length;
+} layout;
+
+static layout layout_of(uint32_t version, uint32_t free_count, uint32_t vectors, uint32_t fixed_vectors)
+{
+    layout l = {.version = version, .vectors = vectors, .fixed_vectors = fixed_vectors};
+    l.covariance = version == 1 ? AT_COVARIANCE_1 : AT_COVARIANCE_2;
+    l.vectors_at = l.covariance + covariance_bytes(free_count);
+    l.length =
+        l.vectors_at + (size_t)vectors * PF_VECTOR_BYTES + (size_t)fixed_vectors * FIXED_VECTOR_BYTES + CHECKSUM_BYTES;
+    return l;
 }
 
 static pf_status refuse(pf_status status, const char *text, const char **why)
@@ -151,19 +175,24 @@ static size_t utf8_character(const uint8_t *p, size_t room)
 }
 
 /* Text, then zeros to the end, at least one. */
-static bool is_text(const uint8_t *p)
+static bool is_text(const uint8_t *p, size_t size)
 {
     size_t n = 0;
-    while (n < PF_PROFILE_NAME_MAX && p[n] != 0) {
-        size_t bytes = utf8_character(p + n, PF_PROFILE_NAME_MAX - n);
+    while (n < size && p[n] != 0) {
+        size_t bytes = utf8_character(p + n, size - n);
         if (bytes == 0)
             return false;
         n += bytes;
     }
-    for (size_t i = n; i < PF_PROFILE_NAME_MAX; i++)
+    for (size_t i = n; i < size; i++)
         if (p[i] != 0)
             return false;
-    return n < PF_PROFILE_NAME_MAX;
+    return n < size;
+}
+
+static bool is_rms(const uint8_t *p)
+{
+    return get_u64(p) == NAN_BITS || (is_finite(p) && get_f64(p) >= 0);
 }
 
 static void read_camera(const uint8_t *bytes, pf_camera *camera)
@@ -179,14 +208,14 @@ static void read_camera(const uint8_t *bytes, pf_camera *camera)
         }
 }
 
-static pf_status check_covariance(const uint8_t *bytes, const char **why)
+static pf_status check_covariance(const uint8_t *bytes, const uint8_t *row, const char **why)
 {
     uint32_t count = get_u32(bytes + AT_FREE_COUNT);
-    const uint8_t *param = bytes + AT_FREE_PARAM, *row = bytes + AT_COVARIANCE;
+    const uint8_t *param = bytes + AT_FREE_PARAM;
     for (uint32_t i = 0; i < PF_PROFILE_FREE_MAX; i++) {
         if (i >= count && param[i] != 0)
             return refuse(PF_ERR_FORMAT, "free_param: not zero beyond free_count", why);
-        if (i < count && param[i] >= PF_PROFILE_PARAMS)
+        if (i < count && param[i] >= PF_CAMERA_PARAMS)
             return refuse(PF_ERR_FORMAT, "free_param: no such parameter", why);
         if (i > 0 && i < count && param[i] <= param[i - 1])
             return refuse(PF_ERR_FORMAT, "free_param: not in increasing order", why);
@@ -209,63 +238,73 @@ static pf_status check_covariance(const uint8_t *bytes, const char **why)
     return PF_OK;
 }
 
-/* Everything between the length and the checksum, for bytes as long as encoded_length says. */
-static pf_status check_fields(const uint8_t *bytes, const char **why)
+/* Everything between the length and the vectors, for bytes as long as the layout says. */
+static pf_status check_fields(const uint8_t *bytes, const layout *l, const char **why)
 {
     if (get_u32(bytes + AT_SOURCE) > PF_SOURCE_SIMULATED)
         return refuse(PF_ERR_FORMAT, "source: no such source", why);
     if (get_u64(bytes + AT_CREATED) > CREATED_MAX)
         return refuse(PF_ERR_FORMAT, "created_unix_s: before 1970 or after 9999", why);
-    if (get_u64(bytes + AT_RMS) != NAN_BITS && !(is_finite(bytes + AT_RMS) && get_f64(bytes + AT_RMS) >= 0))
+    if (!is_rms(bytes + AT_RMS))
         return refuse(PF_ERR_FORMAT, "rms_px: neither a residual nor unknown", why);
     double covered = get_f64(bytes + AT_COVERED);
     if (!(covered >= 0 && covered <= THETA_MAX))
         return refuse(PF_ERR_FORMAT, "theta_covered: not within 0..pi radians, pi excluded", why);
-    if (!is_text(bytes + AT_NAME))
-        return refuse(PF_ERR_FORMAT, "name: not UTF-8 text of at most 63 bytes without control characters", why);
-    if (!is_text(bytes + AT_SERIAL))
-        return refuse(PF_ERR_FORMAT, "serial: not UTF-8 text of at most 63 bytes without control characters", why);
+    for (size_t i = 0; i < TEXT_COUNT; i++)
+        if (TEXTS[i].since <= l->version && !is_text(bytes + TEXTS[i].at, TEXTS[i].size))
+            return refuse(PF_ERR_FORMAT, TEXTS[i].why, why);
+    if (l->version >= 2) {
+        if (get_u32(bytes + AT_UNITS) != UNITS)
+            return refuse(PF_ERR_FORMAT, "units: not pixels, radians and metres", why);
+        if (!is_rms(bytes + AT_HELD_RMS))
+            return refuse(PF_ERR_FORMAT, "held_out_rms_px: neither a residual nor unknown", why);
+    }
     pf_camera camera;
     read_camera(bytes, &camera);
     pf_status status = pf_camera_check(&camera, why);
     if (status != PF_OK)
         return status == PF_ERR_ARGUMENT ? PF_ERR_FORMAT : status;
-    return check_covariance(bytes, why);
+    return check_covariance(bytes, bytes + l->covariance, why);
 }
 
-static void put_text(uint8_t *p, const char *text)
+/* The self-test, of fields that have been checked. */
+static pf_status check_vectors(const uint8_t *bytes, const layout *l, const char **why)
+{
+    pf_camera camera;
+    read_camera(bytes, &camera);
+    if (l->fixed_vectors > 0)
+        return refuse(PF_ERR_UNSUPPORTED, "fixed_vectors: this build has no integer camera to test", why);
+    return pf_vectors_check(&camera, bytes + l->vectors_at, l->vectors, why);
+}
+
+static void put_text(uint8_t *p, const char *value, size_t size)
 {
     size_t n = 0;
-    while (n < PF_PROFILE_NAME_MAX && text[n] != 0)
+    while (n < size && value[n] != 0)
         n++;
-    memcpy(p, text, n);
-    memset(p + n, 0, PF_PROFILE_NAME_MAX - n);
+    memcpy(p, value, n);
+    memset(p + n, 0, size - n);
 }
 
-pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capacity, size_t *n, const char **why)
+static void put_rms(uint8_t *p, double value)
 {
-    const char *ignored;
-    why = why ? why : &ignored;
-    if (!profile || !out || !n)
-        return refuse(PF_ERR_ARGUMENT, "profile: a null pointer", why);
-    if (profile->free_count > PF_PROFILE_FREE_MAX)
-        return refuse(PF_ERR_ARGUMENT, "free_count: more than 40", why);
-    size_t length = encoded_length(profile->free_count);
-    if (capacity < length)
-        return refuse(PF_ERR_SPACE, "profile: the buffer is too small", why);
+    if (value != value)
+        put_u64(p, NAN_BITS);
+    else
+        put_f64(p, value);
+}
 
+static void put_fields(const pf_profile *profile, const layout *l, uint8_t *out)
+{
     memcpy(out + AT_MAGIC, MAGIC, sizeof MAGIC);
-    put_u32(out + AT_VERSION, PF_PROFILE_FORMAT);
-    put_u32(out + AT_LENGTH, (uint32_t)length);
+    put_u32(out + AT_VERSION, l->version);
+    put_u32(out + AT_LENGTH, (uint32_t)l->length);
     put_u32(out + AT_SOURCE, profile->source);
     put_u64(out + AT_CREATED, (uint64_t)profile->created_unix_s);
-    if (profile->rms_px != profile->rms_px)
-        put_u64(out + AT_RMS, NAN_BITS);
-    else
-        put_f64(out + AT_RMS, profile->rms_px);
+    put_rms(out + AT_RMS, profile->rms_px);
     put_f64(out + AT_COVERED, profile->theta_covered);
-    put_text(out + AT_NAME, profile->name);
-    put_text(out + AT_SERIAL, profile->serial);
+    for (size_t i = 0; i < TEXT_COUNT; i++)
+        put_text(out + TEXTS[i].at, (const char *)profile + TEXTS[i].offset, TEXTS[i].size);
     put_u32(out + AT_WIDTH, profile->camera.width);
     put_u32(out + AT_HEIGHT, profile->camera.height);
     put_u32(out + AT_RADIAL, profile->camera.radial);
@@ -279,14 +318,37 @@ pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capa
         }
     memset(out + AT_FREE_PARAM, 0, PF_PROFILE_FREE_MAX);
     memcpy(out + AT_FREE_PARAM, profile->free_param, profile->free_count);
-    for (size_t i = 0; i < (size_t)profile->free_count * (profile->free_count + 1) / 2; i++)
-        put_f64(out + AT_COVARIANCE + i * sizeof(double), profile->covariance[i]);
-    put_u32(out + length - CHECKSUM_BYTES, pf_crc32c(0, out, length - CHECKSUM_BYTES));
+    put_u32(out + AT_UNITS, UNITS);
+    put_u32(out + AT_HELD_VIEWS, profile->held_out_views);
+    put_rms(out + AT_HELD_RMS, profile->held_out_rms_px);
+    put_u32(out + AT_VIEWS, profile->views);
+    put_u32(out + AT_POINTS, profile->points);
+    put_u32(out + AT_VECTORS, l->vectors);
+    put_u32(out + AT_FIXED_VECTORS, l->fixed_vectors);
+    for (size_t i = 0; i < covariance_bytes(profile->free_count) / sizeof(double); i++)
+        put_f64(out + l->covariance + i * sizeof(double), profile->covariance[i]);
+}
 
-    pf_status status = check_fields(out, why);
+pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capacity, size_t *n, const char **why)
+{
+    const char *ignored;
+    why = why ? why : &ignored;
+    if (!profile || !out || !n)
+        return refuse(PF_ERR_ARGUMENT, "profile: a null pointer", why);
+    if (profile->free_count > PF_PROFILE_FREE_MAX)
+        return refuse(PF_ERR_ARGUMENT, "free_count: more than 40", why);
+    layout l = layout_of(PF_PROFILE_FORMAT, profile->free_count, PF_PROFILE_VECTORS, 0);
+    if (capacity < l.length)
+        return refuse(PF_ERR_SPACE, "profile: the buffer is too small", why);
+
+    put_fields(profile, &l, out);
+    pf_status status = check_fields(out, &l, why);
     if (status != PF_OK)
         return status == PF_ERR_FORMAT ? PF_ERR_ARGUMENT : status;
-    *n = length;
+    if (pf_vectors_write(&profile->camera, out + l.vectors_at) != PF_OK)
+        return refuse(PF_ERR_DOMAIN, "self_test: the camera cannot be evaluated", why);
+    put_u32(out + l.length - CHECKSUM_BYTES, pf_crc32c(0, out, l.length - CHECKSUM_BYTES));
+    *n = l.length;
     return refuse(PF_OK, "ok", why);
 }
 
@@ -307,40 +369,72 @@ static pf_status check_envelope(const uint8_t *bytes, size_t n, const char **why
         return refuse(PF_ERR_FORMAT, "length: data follow the profile", why);
     if (get_u32(bytes + n - CHECKSUM_BYTES) != pf_crc32c(0, bytes, n - CHECKSUM_BYTES))
         return refuse(PF_ERR_CHECKSUM, "checksum: the profile is damaged", why);
-    if (get_u32(bytes + AT_VERSION) != PF_PROFILE_FORMAT)
+    if (get_u32(bytes + AT_VERSION) < 1 || get_u32(bytes + AT_VERSION) > PF_PROFILE_FORMAT)
         return refuse(PF_ERR_VERSION, "version: written by a version that this one cannot read", why);
+    return PF_OK;
+}
+
+/* The counts, which the length must agree with. */
+static pf_status check_layout(const uint8_t *bytes, size_t n, layout *l, const char **why)
+{
+    uint32_t version = get_u32(bytes + AT_VERSION), vectors = 0, fixed_vectors = 0;
+    if (n < (version == 1 ? AT_COVARIANCE_1 : AT_COVARIANCE_2) + CHECKSUM_BYTES)
+        return refuse(PF_ERR_FORMAT, "length: shorter than any profile of its version", why);
+    uint32_t free_count = get_u32(bytes + AT_FREE_COUNT);
+    if (free_count > PF_PROFILE_FREE_MAX)
+        return refuse(PF_ERR_FORMAT, "free_count: more than 40", why);
+    if (version >= 2) {
+        vectors = get_u32(bytes + AT_VECTORS);
+        fixed_vectors = get_u32(bytes + AT_FIXED_VECTORS);
+        if (vectors < 1 || vectors > PF_PROFILE_VECTORS)
+            return refuse(PF_ERR_FORMAT, "vectors: not 1..8", why);
+        if (fixed_vectors > FIXED_VECTORS_MAX)
+            return refuse(PF_ERR_FORMAT, "fixed_vectors: more than 8", why);
+    }
+    *l = layout_of(version, free_count, vectors, fixed_vectors);
+    if (n != l->length)
+        return refuse(PF_ERR_FORMAT, "length: does not agree with the counts", why);
     return PF_OK;
 }
 
 pf_status pf_profile_decode(const uint8_t *bytes, size_t n, pf_profile *profile, const char **why)
 {
     const char *ignored;
+    layout l;
     why = why ? why : &ignored;
     if (!bytes || !profile)
         return refuse(PF_ERR_ARGUMENT, "profile: a null pointer", why);
     pf_status status = check_envelope(bytes, n, why);
-    if (status != PF_OK)
-        return status;
-    uint32_t count = n < SMALLEST ? 0 : get_u32(bytes + AT_FREE_COUNT);
-    if (count > PF_PROFILE_FREE_MAX)
-        return refuse(PF_ERR_FORMAT, "free_count: more than 40", why);
-    if (n != encoded_length(count))
-        return refuse(PF_ERR_FORMAT, "length: does not agree with free_count", why);
-    status = check_fields(bytes, why);
+    if (status == PF_OK)
+        status = check_layout(bytes, n, &l, why);
+    if (status == PF_OK)
+        status = check_fields(bytes, &l, why);
+    if (status == PF_OK)
+        status = check_vectors(bytes, &l, why);
     if (status != PF_OK)
         return status;
 
     memset(profile, 0, sizeof *profile);
     read_camera(bytes, &profile->camera);
-    memcpy(profile->name, bytes + AT_NAME, sizeof profile->name);
-    memcpy(profile->serial, bytes + AT_SERIAL, sizeof profile->serial);
+    for (size_t i = 0; i < TEXT_COUNT; i++)
+        if (TEXTS[i].since <= l.version)
+            memcpy((char *)profile + TEXTS[i].offset, bytes + TEXTS[i].at, TEXTS[i].size);
     profile->source = get_u32(bytes + AT_SOURCE);
     profile->created_unix_s = (int64_t)get_u64(bytes + AT_CREATED);
     profile->rms_px = get_f64(bytes + AT_RMS);
     profile->theta_covered = get_f64(bytes + AT_COVERED);
-    profile->free_count = count;
+    if (l.version >= 2) {
+        profile->held_out_rms_px = get_f64(bytes + AT_HELD_RMS);
+        profile->held_out_views = get_u32(bytes + AT_HELD_VIEWS);
+        profile->views = get_u32(bytes + AT_VIEWS);
+        profile->points = get_u32(bytes + AT_POINTS);
+    } else {
+        static const uint64_t unknown = NAN_BITS;
+        memcpy(&profile->held_out_rms_px, &unknown, sizeof unknown);
+    }
+    profile->free_count = get_u32(bytes + AT_FREE_COUNT);
     memcpy(profile->free_param, bytes + AT_FREE_PARAM, sizeof profile->free_param);
-    for (size_t i = 0; i < (size_t)count * (count + 1) / 2; i++)
-        profile->covariance[i] = get_f64(bytes + AT_COVARIANCE + i * sizeof(double));
+    for (size_t i = 0; i < covariance_bytes(profile->free_count) / sizeof(double); i++)
+        profile->covariance[i] = get_f64(bytes + l.covariance + i * sizeof(double));
     return refuse(PF_OK, "ok", why);
 }

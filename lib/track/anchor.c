@@ -8,8 +8,8 @@
 
 #include "track_private.h"
 
-#define SETTLED       655  /* 0.01 px */
-#define SETTLED_WARP  2000 /* Q16, times half the window: 0.03 px at the window's edge */
+#define SETTLED       1311 /* 0.02 px: the next step would be a tenth of it */
+#define SETTLED_WARP  8000 /* Q16, times half the window: 0.12 px at the window's edge */
 #define STEP_MAX      (2 << 16)
 #define WARP_STEP_MAX (1 << 14)
 /* Added to the unit diagonal, Q20. It changes no fixed point (there the right-hand side is zero); it keeps directions
@@ -27,27 +27,9 @@ static int32_t row_bytes(const pf_klt *klt)
     return klt->window + 2;
 }
 
-/* Unpacks the template: t (Q5 - 4080), Scharr gradients in Q4 and x times them. */
-static void unpack(pf_klt *klt, const uint8_t *pixels)
+static pf_gradients gradients(pf_klt *klt)
 {
-    const int32_t w = row_bytes(klt);
-    for (int32_t r = 0; r < klt->window; r++) {
-        const uint8_t *restrict a = pixels + r * w, *restrict b = a + w, *restrict c = b + w;
-        int16_t *restrict t = klt->t + r * PATCH_ROW, *restrict gx = klt->gx + r * PATCH_ROW,
-                          *restrict gy = klt->gy + r * PATCH_ROW;
-        for (int32_t i = 0; i < klt->window; i++) {
-            t[i] = (int16_t)(b[i + 1] * 32 - 4080);
-            gx[i] = (int16_t)((3 * (a[i + 2] - a[i]) + 10 * (b[i + 2] - b[i]) + 3 * (c[i + 2] - c[i]) + 1) >> 1);
-            gy[i] = (int16_t)((3 * (c[i] - a[i]) + 10 * (c[i + 1] - a[i + 1]) + 3 * (c[i + 2] - a[i + 2]) + 1) >> 1);
-        }
-        for (int32_t i = klt->window; i < klt->cols; i++)
-            t[i] = gx[i] = gy[i] = 0;
-        int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
-        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
-            px[i] = (int16_t)(gx[i] * (i - klt->half));
-            py[i] = (int16_t)(gy[i] * (i - klt->half));
-        }
-    }
+    return (pf_gradients){klt->t, klt->gx, klt->gy, klt->xgx, klt->xgy, {0, 0}};
 }
 
 /* Inverts the symmetric positive matrix m (Q20, diagonal about 1) in place: Gauss-Jordan without pivoting. With the
@@ -70,6 +52,17 @@ static void invert6(int64_t m[6][6])
     }
 }
 
+/* Where the inverse's (i, j) is kept, j <= i. */
+static int32_t *entry(pf_anchor *anchor, int32_t i, int32_t j)
+{
+    return &anchor->inverse[i * (i + 1) / 2 + j];
+}
+
+static int32_t inverse_at(const pf_anchor *anchor, int32_t i, int32_t j)
+{
+    return anchor->inverse[i > j ? i * (i + 1) / 2 + j : j * (j + 1) / 2 + i];
+}
+
 /* Scales the normal matrix to a diagonal in [1/4, 1) and stores its inverse and the scales. */
 static void factor(pf_anchor *anchor, int64_t h[6][6])
 {
@@ -86,8 +79,8 @@ static void factor(pf_anchor *anchor, int64_t h[6][6])
         m[i][i] += i < 2 ? RIDGE : RIDGE_WARP;
     invert6(m);
     for (int32_t i = 0; i < 6; i++)
-        for (int32_t j = 0; j < 6; j++)
-            anchor->inverse[6 * i + j] = pf_clamp_i64(m[i][j], 1 << 30);
+        for (int32_t j = 0; j <= i; j++)
+            *entry(anchor, i, j) = pf_clamp_i64(m[i][j], 1 << 30);
 }
 
 /* Product of the parts of two images that lie in the space of planes, given their sums times 1, x, y: over the
@@ -107,106 +100,115 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     anchor->a[1] = anchor->a[2] = 0;
     for (int32_t r = 0; r < w; r++)
         memcpy(pixels + r * w, image->data + (size_t)(iy - half - 1 + r) * image->stride + (ix - half - 1), (size_t)w);
-    unpack(klt, pixels);
-    int64_t h[6][6] = {{0}}, tt = 0;
-    memset(anchor->sum_j, 0, sizeof anchor->sum_j);
-    memset(anchor->dot_jt, 0, sizeof anchor->dot_jt);
-    memset(anchor->sum_t, 0, sizeof anchor->sum_t);
-    for (int32_t y = -half; y <= half; y++)
-        for (int32_t x = -half; x <= half; x++) {
-            const int32_t k = (y + half) * PATCH_ROW + x + half;
-            const int32_t gx = klt->gx[k], gy = klt->gy[k], t = klt->t[k], plane[3] = {1, x, y};
-            const int32_t j[6] = {gx, gy, gx * x, gx * y, gy * x, gy * y};
-            for (int32_t a = 0; a < 6; a++) {
-                for (int32_t b = a; b < 6; b++)
-                    h[a][b] += (int64_t)j[a] * j[b];
-                for (int32_t b = 0; b < 3; b++)
-                    anchor->sum_j[a][b] += j[a] * plane[b];
-                anchor->dot_jt[a] += (int64_t)j[a] * t;
-            }
-            for (int32_t b = 0; b < 3; b++)
-                anchor->sum_t[b] += t * plane[b];
-            tt += (int64_t)t * t;
-        }
-    anchor->var_t = tt - plane_part(klt, anchor->sum_t, anchor->sum_t);
-    if (anchor->var_t < 1)
-        anchor->var_t = 1;
+    const pf_gradients images = gradients(klt);
+    PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
+    pf_normal_sums s;
+    PF_KERNEL(normal)(&images, klt->window, klt->groups, &s);
+    int64_t var_t = s.tt - plane_part(klt, s.t, s.t);
+    if (var_t < 1)
+        var_t = 1;
     for (int32_t a = 0; a < 6; a++)
-        anchor->dot_jt[a] -= plane_part(klt, anchor->sum_j[a], anchor->sum_t);
+        for (int32_t b = 0; b < 3; b++)
+            anchor->sum_j[a][b] = (int32_t)s.j[a][b];
+    for (int32_t a = 0; a < 6; a++)
+        s.jt[a] -= plane_part(klt, s.j[a], s.t);
     for (int32_t a = 0; a < 6; a++)
         for (int32_t b = a; b < 6; b++) {
             /* Q8 of the ratio: it times dot_jt stays below 2^62 */
-            const int64_t ratio = anchor->dot_jt[b] * 256 / anchor->var_t;
-            h[a][b] -= plane_part(klt, anchor->sum_j[a], anchor->sum_j[b]) + ((anchor->dot_jt[a] * ratio) >> 8);
-            h[b][a] = h[a][b];
+            const int64_t ratio = s.jt[b] * 256 / var_t;
+            s.h[a][b] -= plane_part(klt, s.j[a], s.j[b]) + ((s.jt[a] * ratio) >> 8);
+            s.h[b][a] = s.h[a][b];
         }
     for (int32_t a = 0; a < 6; a++)
-        if (h[a][a] < 0)
-            h[a][a] = 0;
-    factor(anchor, h);
+        if (s.h[a][a] < 0)
+            s.h[a][a] = 0;
+    factor(anchor, s.h);
 }
 
-/* Samples `image` on the warped window around `centre` into klt->c. False if it would leave the image. */
+/* Samples `image` on the warped window around `centre` into klt->c. False if it would come within a pixel of the
+ * image's edge. */
 static bool sample_warped(pf_klt *klt, const pf_image *image, pf_point_q16 centre, const int32_t a[4])
 {
-    const int64_t half = klt->half;
-    const int64_t rx = (int64_t)(magnitude(a[0]) + magnitude(a[1])) * half,
-                  ry = (int64_t)(magnitude(a[2]) + magnitude(a[3])) * half;
+    const int64_t half = klt->half, margin = 1 << 16;
+    const int64_t rx = (int64_t)(magnitude(a[0]) + magnitude(a[1])) * half + margin,
+                  ry = (int64_t)(magnitude(a[2]) + magnitude(a[3])) * half + margin;
     if (centre.x - rx < 0 || centre.y - ry < 0 || centre.x + rx >= ((int64_t)image->width - 1) << 16 ||
         centre.y + ry >= ((int64_t)image->height - 1) << 16)
         return false;
-    const size_t stride = image->stride;
-    for (int32_t r = 0; r < klt->window; r++) {
-        int32_t x = (int32_t)(centre.x - half * a[0] + (r - half) * a[1]);
-        int32_t y = (int32_t)(centre.y - half * a[2] + (r - half) * a[3]);
-        int16_t *restrict out = klt->c + r * PATCH_ROW;
-        for (int32_t i = 0; i < klt->window; i++, x += a[0], y += a[2]) {
-            const uint8_t *p = image->data + (size_t)(y >> 16) * stride + (size_t)(x >> 16);
-            const int32_t fx = (x & 0xFFFF) >> 5, fy = (y & 0xFFFF) >> 5; /* Q11: 1/2048 px */
-            const int32_t top = (p[0] << 11) + (p[1] - p[0]) * fx;
-            const int32_t bottom = (p[stride] << 11) + (p[stride + 1] - p[stride]) * fx;
-            out[i] = (int16_t)(((top * 2048 + (bottom - top) * fy + (1 << 16)) >> 17) - 4080);
-        }
-    }
+    const pf_warp warp = {image->data, image->stride,           image->width, image->height, centre.x,
+                          centre.y,    {a[0], a[1], a[2], a[3]}};
+    PF_KERNEL(warp)(&warp, klt->whole, klt->window, klt->groups, klt->c);
     return true;
 }
 
-/* Right-hand side: the steepest-descent images against the sampled patch. */
+/* Sums of a patch with the steepest-descent images, all less their best plane. */
 typedef struct pf_rhs {
     int64_t b[6], gain_q14;
-    int64_t cov, var; /* with the template, and of the patch, both less their best plane */
+    int64_t cov, var; /* with the template, and of the patch */
 } pf_rhs;
 
-static void right_hand_side(const pf_klt *klt, const pf_anchor *anchor, pf_rhs *out)
+/* What of the template changes with the smoothing. */
+typedef struct pf_reference {
+    int64_t sum[3], var, b[6];
+} pf_reference;
+
+/* Sums of the patch c and their parts off the plane. */
+static void off_plane(const pf_klt *klt, const pf_anchor *anchor, const pf_affine_sums *s, pf_rhs *out)
 {
-    int64_t b[6] = {0}, sc[3] = {0}, scc = 0, sct = 0;
-    for (int32_t r = 0; r < klt->window; r++) {
-        const int16_t *restrict c = klt->c + r * PATCH_ROW, *restrict t = klt->t + r * PATCH_ROW;
-        const int16_t *restrict gx = klt->gx + r * PATCH_ROW, *restrict gy = klt->gy + r * PATCH_ROW;
-        const int16_t *restrict px = klt->xgx + r * PATCH_ROW, *restrict py = klt->xgy + r * PATCH_ROW;
-        const int16_t first = (int16_t)-klt->half;
-        int32_t s = 0, sx = 0, ss = 0, st = 0, x = 0, y = 0, xx = 0, xy = 0;
-        for (int32_t i = 0; i < WHOLE(klt->cols); i++) {
-            s += c[i];
-            sx += c[i] * (int16_t)(first + i);
-            ss += c[i] * c[i];
-            st += c[i] * t[i];
-            x += c[i] * gx[i];
-            y += c[i] * gy[i];
-            xx += c[i] * px[i];
-            xy += c[i] * py[i];
-        }
-        const int32_t row = r - klt->half;
-        sc[0] += s, sc[1] += sx, sc[2] += s * row, scc += ss, sct += st;
-        b[0] += x, b[1] += y, b[2] += xx, b[3] += (int64_t)x * row, b[4] += xy, b[5] += (int64_t)y * row;
+    out->var = s->cc - plane_part(klt, s->c, s->c);
+    for (int32_t i = 0; i < 6; i++) {
+        const int64_t j[3] = {anchor->sum_j[i][0], anchor->sum_j[i][1], anchor->sum_j[i][2]};
+        out->b[i] = s->b[i] - plane_part(klt, j, s->c);
     }
-    const int64_t cov = sct - plane_part(klt, anchor->sum_t, sc), var = scc - plane_part(klt, sc, sc);
-    out->gain_q14 = cov * GAIN_ONE / anchor->var_t;
-    out->cov = cov;
-    out->var = var;
-    const int64_t gain_q16 = cov * 65536 / anchor->var_t;
+}
+
+/* A half f (1 - f) at a coordinate, Q15. */
+static int32_t smoothing_at(int64_t v)
+{
+    const int32_t f = (int32_t)(v & 0xFFFF) >> 1;
+    return (f * (32768 - f)) >> 16;
+}
+
+/* Unpacks the template, smoothed as sampling will smooth the image: by the mean over the window's centre and corners,
+ * for where the warp turns or scales, the fraction differs from pixel to pixel. Unsmoothed, fine texture would pull by
+ * a hundredth of a pixel. */
+static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 centre,
+                           pf_reference *out)
+{
+    pf_gradients images = gradients(klt);
+    const int32_t *a = anchor->a;
+    int32_t x = 0, y = 0;
+    for (int32_t v = -1; v <= 1; v++)
+        for (int32_t u = -1; u <= 1; u++) {
+            const int32_t reach = klt->half / 2 + 1;
+            x += smoothing_at((int64_t)centre.x + (int64_t)reach * (u * (int64_t)a[0] + v * (int64_t)a[1]));
+            y += smoothing_at((int64_t)centre.y + (int64_t)reach * (u * (int64_t)a[2] + v * (int64_t)a[3]));
+        }
+    images.smooth[0] = (int16_t)(x / 9);
+    images.smooth[1] = (int16_t)(y / 9);
+    PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
+    pf_affine_sums s;
+    pf_rhs rhs;
+    PF_KERNEL(affine)(klt->t, &images, klt->window, klt->groups, &s);
+    off_plane(klt, anchor, &s, &rhs);
+    out->var = rhs.var < 1 ? 1 : rhs.var;
     for (int32_t i = 0; i < 6; i++)
-        out->b[i] = b[i] - plane_part(klt, anchor->sum_j[i], sc) - ((anchor->dot_jt[i] * gain_q16) >> 16);
+        out->b[i] = rhs.b[i];
+    for (int32_t i = 0; i < 3; i++)
+        out->sum[i] = s.c[i];
+}
+
+static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, const pf_reference *t, pf_rhs *out)
+{
+    const pf_gradients g = gradients(klt);
+    pf_affine_sums s;
+    PF_KERNEL(affine)(klt->c, &g, klt->window, klt->groups, &s);
+    off_plane(klt, anchor, &s, out);
+    out->cov = s.ct - plane_part(klt, t->sum, s.c);
+    out->gain_q14 = out->cov * GAIN_ONE / t->var;
+    const int64_t gain_q16 = out->cov * 65536 / t->var;
+    for (int32_t i = 0; i < 6; i++)
+        out->b[i] -= (t->b[i] * gain_q16) >> 16;
 }
 
 /* The step d: Q16 pixels, Q16 warp. */
@@ -218,8 +220,8 @@ static void solve(const pf_anchor *anchor, const pf_rhs *rhs, int32_t d[6])
     for (int32_t i = 0; i < 6; i++) {
         int64_t v = 0;
         for (int32_t j = 0; j < 6; j++)
-            v += anchor->inverse[6 * i + j] * scaled[j];
-        /* v is Q32 in Q9 over Q8: to Q16 pixels */
+            v += (int64_t)inverse_at(anchor, i, j) * scaled[j];
+        /* v is Q32 in Q7 over Q6: to Q16 pixels */
         v >>= 17 + anchor->scale[i];
         d[i] = pf_clamp_i64((int64_t)pf_clamp_i64(v, 1 << 26) * GAIN_ONE / rhs->gain_q14,
                             i < 2 ? STEP_MAX : WARP_STEP_MAX);
@@ -253,15 +255,14 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     const pf_point_q16 before = warped_offset(anchor);
     pf_point_q16 centre = {at->x - before.x, at->y - before.y};
     pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
-    unpack(klt, pixels);
-    for (int32_t r = 0; r < klt->window; r++)
-        memset(klt->c + r * PATCH_ROW + klt->window, 0, (size_t)(klt->cols - klt->window) * sizeof(int16_t));
+    pf_reference reference;
+    take_reference(klt, anchor, pixels, centre, &reference);
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
             return fit;
         }
-        right_hand_side(klt, anchor, &rhs);
+        right_hand_side(klt, anchor, &reference, &rhs);
         if (rhs.gain_q14 < GAIN_MIN || rhs.gain_q14 > GAIN_MAX) {
             fit.reason = PF_TRACK_DRIFT;
             return fit;
@@ -281,7 +282,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = pf_zncc(rhs.cov, anchor->var_t, rhs.var);
+    fit.zncc_q15 = pf_zncc(rhs.cov, reference.var, rhs.var);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
     return fit;
 }
@@ -293,8 +294,8 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
     const int64_t factor_q8 = 256 + ((int64_t)256 << 14) / gain2;
     int64_t cov[3];
     for (int32_t i = 0; i < 3; i++) {
-        const int64_t m = anchor->inverse[6 * row[i] + col[i]];
-        const int32_t shift = 8 + anchor->scale[row[i]] + anchor->scale[col[i]];
+        const int64_t m = inverse_at(anchor, row[i], col[i]);
+        const int32_t shift = 10 + anchor->scale[row[i]] + anchor->scale[col[i]];
         const int64_t v = (m * ((int64_t)noise_q8 * noise_q8)) >> shift;
         cov[i] = v > (int64_t)1 << 40 ? (int64_t)1 << 40 : v < -((int64_t)1 << 40) ? -((int64_t)1 << 40) : v;
         cov[i] = (cov[i] * factor_q8) >> 8;

@@ -1,103 +1,131 @@
-/* Shi-Tomasi corners, one cell at a time: no response image, bounded time whatever the texture. */
-#include <string.h>
-
+/* Shi-Tomasi corners, one cell at a time: no response image, bounded time whatever the texture. They are sought at half
+ * resolution, where noise is a quarter and pixels are a quarter as many, with a tensor over 3 x 3; what is taken is
+ * then placed at full resolution. Against a search at full resolution the same share is found again in another view
+ * (docs/tracker.md). */
 #include "track_private.h"
 
-#define TAPS (2 * CORNER_HALF + 1)
+#define REACH  2 /* the place at full resolution lies so near */
+#define AROUND (2 * REACH + 1)
+#define SPAN   (AROUND + 2 * REACH)
 
 uint32_t pf_isqrt64(uint64_t n)
 {
-    uint64_t root = 0, bit = (uint64_t)1 << 62;
-    while (bit > n)
-        bit >>= 2;
-    for (; bit; bit >>= 2) {
-        if (n >= root + bit) {
-            n -= root + bit;
-            root = (root >> 1) + bit;
-        } else {
-            root >>= 1;
-        }
+    if (n < 2)
+        return (uint32_t)n;
+    /* Newton from above: 2^k >= sqrt n > 2^(k - 1), so the error falls from a factor of 2 at most to 1.25, 1.025, ...
+     */
+    const int32_t k = (65 - __builtin_clzll(n)) / 2;
+    uint64_t root = k < 32 ? (uint64_t)1 << k : UINT32_MAX, next = (root + n / root) / 2;
+    while (next < root) {
+        root = next;
+        next = (root + n / root) / 2;
     }
     return (uint32_t)root;
 }
 
 int32_t pf_corner_least(uint32_t min_eigen)
 {
-    /* doubled gradients: a factor of 4; the strongest possible sum is 121 * 255^2 < 2^23 */
-    return (int32_t)(min_eigen * 4u * TAPS * TAPS);
+    /* doubled gradients: a factor of 4; 9 pixels; twice the eigenvalue */
+    return (int32_t)(min_eigen * 4u * 9u * 2u);
 }
 
-/* Doubled central differences of row y, columns x0 - CORNER_HALF on; `n` of them. */
-static void gradient_row(const pf_image *image, int32_t x, int32_t y, int32_t n, int16_t *restrict gx,
-                         int16_t *restrict gy)
+/* Twice the smaller eigenvalue, or `least` if that is not above it. */
+static int32_t strength_above(int32_t least, int32_t trace, int32_t difference, int32_t twice)
 {
-    const uint8_t *row = image->data + (size_t)y * image->stride + x;
-    const uint8_t *above = row - image->stride, *below = row + image->stride;
-    for (int32_t i = 0; i < n; i++) {
-        gx[i] = (int16_t)(row[i + 1] - row[i - 1]);
-        gy[i] = (int16_t)(below[i] - above[i]);
-    }
+    if (trace <= least)
+        return least;
+    const int64_t over = trace - least, square = (int64_t)difference * difference + (int64_t)twice * twice;
+    return over * over > square ? trace - (int32_t)pf_isqrt64((uint64_t)square) : least;
 }
 
-/* Adds (sign 1) or removes (sign -1) one row of gradients from the column sums. */
-static void column_sums(pf_corner_scratch *restrict s, int32_t slot, int32_t n, int32_t sign)
+uint32_t pf_corner_scan(pf_corner_scratch *scratch, const pf_pyramid *pyramid, const int32_t box[4], int32_t least,
+                        pf_corner_allowed allowed, const void *context, pf_corner best[4])
 {
-    const int16_t *restrict gx = s->gx[slot], *restrict gy = s->gy[slot];
-    if (sign > 0) {
-        for (int32_t i = 0; i < n; i++) {
-            s->xx[i] += gx[i] * gx[i];
-            s->xy[i] += gx[i] * gy[i];
-            s->yy[i] += gy[i] * gy[i];
-        }
-    } else {
-        for (int32_t i = 0; i < n; i++) {
-            s->xx[i] -= gx[i] * gx[i];
-            s->xy[i] -= gx[i] * gy[i];
-            s->yy[i] -= gy[i] * gy[i];
-        }
-    }
-}
-
-bool pf_corner_best(pf_corner_scratch *scratch, const pf_image *image, const int32_t box[4], int32_t least,
-                    pf_corner_allowed allowed, const void *context, pf_corner *best)
-{
-    const int32_t x0 = box[0], y0 = box[1], x1 = box[2], y1 = box[3];
-    const int32_t n = x1 - x0 + 2 * CORNER_HALF;
-    bool found = false;
-    memset(scratch->xx, 0, sizeof scratch->xx);
-    memset(scratch->xy, 0, sizeof scratch->xy);
-    memset(scratch->yy, 0, sizeof scratch->yy);
-    for (int32_t y = y0 - CORNER_HALF; y < y1 + CORNER_HALF; y++) {
-        const int32_t slot = (y - y0 + CORNER_HALF) % TAPS;
-        if (y - y0 > CORNER_HALF)
-            column_sums(scratch, slot, n, -1);
-        gradient_row(image, x0 - CORNER_HALF, y, n, scratch->gx[slot], scratch->gy[slot]);
-        column_sums(scratch, slot, n, 1);
-        if (y - y0 < CORNER_HALF)
+    const int32_t l = pyramid->levels > 1u ? 1 : 0;
+    const pf_image *image = &pyramid->level[l];
+    const int32_t x0 = (box[0] + l) >> l, y0 = (box[1] + l) >> l, n = ((box[2] + l) >> l) - x0;
+    const int32_t y1 = (box[3] + l) >> l, middle_x = x0 + n / 2, middle_y = (y0 + y1) / 2;
+    const pf_tensor_row *row[3] = {&scratch->row[0], &scratch->row[1], &scratch->row[2]};
+    for (int32_t q = 0; q < 4; q++)
+        best[q].strength = least;
+    for (int32_t y = y0 - 1; y <= y1; y++) {
+        pf_tensor_row *next = &scratch->row[(y - y0 + 1) % 3];
+        PF_KERNEL(tensor)(image->data + (size_t)y * image->stride + (x0 - 1), image->stride, n + 2, next);
+        if (y <= y0)
             continue;
-        int32_t a = 0, b = 0, c = 0;
-        for (int32_t i = 0; i < TAPS - 1; i++) {
-            a += scratch->xx[i];
-            b += scratch->xy[i];
-            c += scratch->yy[i];
-        }
-        for (int32_t i = 0; i < x1 - x0; i++) {
-            a += scratch->xx[i + TAPS - 1];
-            b += scratch->xy[i + TAPS - 1];
-            c += scratch->yy[i + TAPS - 1];
-            /* smaller eigenvalue > least, without a root: both diagonal terms and the determinant of M - least I */
-            if (a > least && c > least && (int64_t)(a - least) * (c - least) > (int64_t)b * b &&
-                allowed(context, x0 + i, y - CORNER_HALF)) {
-                const int64_t d = a - c;
-                const int32_t root = (int32_t)pf_isqrt64((uint64_t)(d * d + 4 * (int64_t)b * b));
-                least = (a + c - root) / 2;
-                *best = (pf_corner){x0 + i, y - CORNER_HALF, least};
-                found = true;
-            }
-            a -= scratch->xx[i];
-            b -= scratch->xy[i];
-            c -= scratch->yy[i];
+        pf_corner *half = best + (y - 1 < middle_y ? 0 : 2);
+        const int32_t weakest = half[0].strength < half[1].strength ? half[0].strength : half[1].strength;
+        if (PF_KERNEL(corners)(row, n, &scratch->sum) <= weakest)
+            continue;
+        for (int32_t i = 0; i < n; i++) {
+            pf_corner *c = half + (x0 + i >= middle_x);
+            const int32_t s =
+                strength_above(c->strength, scratch->sum.k[0][i], scratch->sum.k[1][i], scratch->sum.k[2][i]);
+            if (s > c->strength && allowed(context, (x0 + i) << l, (y - 1) << l))
+                *c = (pf_corner){(x0 + i) << l, (y - 1) << l, s};
         }
     }
+    uint32_t found = 0;
+    for (int32_t q = 0; q < 4; q++)
+        if (best[q].strength > least)
+            best[found++] = best[q];
     return found;
+}
+
+/* Where the parabola through three strengths has its top, Q16, within half a pixel. */
+static int32_t top_of(int32_t before, int32_t at, int32_t after)
+{
+    const int64_t bend = 2 * (int64_t)at - before - after;
+    return bend > 0 ? pf_clamp_i64(((int64_t)after - before) * 32768 / bend, 32768) : 0;
+}
+
+/* Structure tensors of Sobel gradients around (x, y), summed over columns of AROUND. */
+static void column_tensors(const pf_image *image, int32_t x, int32_t y, int32_t column[AROUND][SPAN][3])
+{
+    for (int32_t i = 0; i < SPAN; i++) {
+        int32_t sum[3] = {0}, row[SPAN][3];
+        for (int32_t j = 0; j < SPAN; j++) {
+            const uint8_t *b = image->data + (size_t)(y + j - 2 * REACH) * image->stride + (size_t)(x + i - 2 * REACH);
+            const uint8_t *a = b - image->stride, *c = b + image->stride;
+            const int32_t gx = a[1] - a[-1] + 2 * (b[1] - b[-1]) + c[1] - c[-1];
+            const int32_t gy = c[-1] - a[-1] + 2 * (c[0] - a[0]) + c[1] - a[1];
+            row[j][0] = gx * gx + gy * gy;
+            row[j][1] = gx * gx - gy * gy;
+            row[j][2] = 2 * gx * gy;
+            for (int32_t k = 0; k < 3; k++) {
+                sum[k] += row[j][k] - (j >= AROUND ? row[j - AROUND][k] : 0);
+                if (j >= AROUND - 1)
+                    column[j - AROUND + 1][i][k] = sum[k];
+            }
+        }
+    }
+}
+
+/* The strength, if above `least`, of the tensor over AROUND x AROUND that begins at column i of a row of such. */
+static int32_t square_strength(int32_t least, int32_t column[SPAN][3], int32_t i)
+{
+    int32_t s[3] = {0};
+    for (int32_t k = 0; k < AROUND; k++)
+        for (int32_t c = 0; c < 3; c++)
+            s[c] += column[i + k][c];
+    return strength_above(least, s[0], s[1], s[2]);
+}
+
+pf_point_q16 pf_corner_place(const pf_image *image, const pf_corner *corner)
+{
+    int32_t column[AROUND][SPAN][3], most = 0, x = REACH, y = REACH;
+    column_tensors(image, corner->x, corner->y, column);
+    for (int32_t j = 0; j < AROUND; j++)
+        for (int32_t i = 0; i < AROUND; i++) {
+            const int32_t s = square_strength(most, column[j], i);
+            if (s > most)
+                most = s, x = i, y = j;
+        }
+    pf_point_q16 at = {(corner->x + x - REACH) * 65536, (corner->y + y - REACH) * 65536};
+    /* a top at the rim of what was searched has no neighbour there: it stays on its pixel */
+    if (x > 0 && x < AROUND - 1)
+        at.x += top_of(square_strength(0, column[y], x - 1), most, square_strength(0, column[y], x + 1));
+    if (y > 0 && y < AROUND - 1)
+        at.y += top_of(square_strength(0, column[y - 1], x), most, square_strength(0, column[y + 1], x));
+    return at;
 }

@@ -42,54 +42,38 @@ bool pf_klt_inside(const pf_klt *klt, const pf_image *image, pf_point_q16 at)
     return in_circle(klt, (dx < 0 ? -dx : dx) + reach, (dy < 0 ? -dy : dy) + reach);
 }
 
-/* a b / 2^16, rounded down: one instruction on eight lanes. */
-static inline int16_t high_product(int16_t a, int16_t b)
+void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen)
 {
-    return (int16_t)((a * b) >> 16);
+    klt->window = (int32_t)window;
+    klt->half = klt->window / 2;
+    klt->groups = (klt->window + 7) / 8;
+    klt->iterations = (int32_t)iterations;
+    klt->min_eigen = (int32_t)min_eigen;
+    for (int32_t r = 0; r < klt->window; r++)
+        for (int32_t i = 0; i < 8 * klt->groups; i++)
+            klt->whole[r * PATCH_ROW + i] = (int16_t) - (i < klt->window);
 }
 
-/* One row between columns, Q6, at most 1/64 too low; `fx` Q15. Clamped to the image's border where `whole` is false. */
-static void blend_row(const pf_image *image, int64_t ix, int64_t iy, bool whole, int32_t cols, int16_t fx,
-                      int16_t *restrict out)
+/* Where the kernels read a patch of `rows` rows and `groups` groups whose top-left sample is at (x, y): the image, or,
+ * where it would run out of the image, a copy with the border repeated. */
+static pf_spot spot_at(pf_klt *klt, const pf_image *image, int64_t x, int64_t y, int32_t rows, int32_t groups)
 {
-    uint8_t edge[PATCH_ROW + 1];
-    const uint8_t *restrict p = edge;
-    if (whole) {
-        p = image->data + (size_t)iy * image->stride + (size_t)ix;
-    } else {
-        const int64_t right = (int64_t)image->width - 1, bottom = (int64_t)image->height - 1;
-        const uint8_t *row = image->data + (size_t)(iy < 0 ? 0 : iy > bottom ? bottom : iy) * image->stride;
-        for (int32_t i = 0; i <= cols; i++)
-            edge[i] = row[ix + i < 0 ? 0 : ix + i > right ? right : ix + i];
+    const int64_t ix = x >> 16, iy = y >> 16, right = (int64_t)image->width - 1, bottom = (int64_t)image->height - 1;
+    const int32_t columns = 8 * groups + 1;
+    pf_spot spot = {NULL, image->stride, (int16_t)((x & 0xFFFF) >> 1), (int16_t)((y & 0xFFFF) >> 1)};
+    if (ix >= 0 && iy >= 0 && ix + columns <= right + 1 && iy + rows <= bottom) {
+        spot.p = image->data + (size_t)iy * image->stride + (size_t)ix;
+        return spot;
     }
-    for (int32_t i = 0; i < WHOLE(cols); i++) {
-        const int16_t slope = (int16_t)((p[i + 1] - p[i]) * 128);
-        out[i] = (int16_t)(p[i] * 64 + high_product(slope, fx));
+    for (int32_t r = 0; r <= rows; r++) {
+        const int64_t v = iy + r < 0 ? 0 : iy + r > bottom ? bottom : iy + r;
+        const uint8_t *row = image->data + (size_t)v * image->stride;
+        for (int32_t i = 0; i < columns; i++)
+            klt->edge[r * EDGE_ROW + i] = row[ix + i < 0 ? 0 : ix + i > right ? right : ix + i];
     }
-}
-
-/* Bilinear patch of `rows` rows and `cols` (a multiple of 8) columns whose top-left sample is at (x, y), Q5 - 4080.
- * Coordinates off the image are clamped to its border. `mask` (stride PATCH_ROW) or NULL. */
-static void sample_patch(const pf_image *image, int64_t x, int64_t y, int32_t rows, int32_t cols, const int16_t *mask,
-                         int16_t *out)
-{
-    const int16_t fx = (int16_t)((x & 0xFFFF) >> 1), fy = (int16_t)((y & 0xFFFF) >> 1);
-    const int64_t ix = x >> 16, iy = y >> 16;
-    const bool whole = ix >= 0 && iy >= 0 && ix + cols < (int64_t)image->width && iy + rows < (int64_t)image->height;
-    int16_t line[2][PATCH_ROW];
-    blend_row(image, ix, iy, whole, cols, fx, line[0]);
-    for (int32_t r = 0; r < rows; r++) {
-        const int16_t *restrict upper = line[r & 1], *restrict lower = line[~r & 1];
-        int16_t *restrict o = out + r * PATCH_ROW;
-        blend_row(image, ix, iy + r + 1, whole, cols, fx, line[~r & 1]);
-        for (int32_t i = 0; i < WHOLE(cols); i++) {
-            const int16_t slope = (int16_t)((lower[i] - upper[i]) * 2);
-            o[i] = (int16_t)(((int16_t)(upper[i] + high_product(slope, fy)) >> 1) - 4080);
-        }
-        if (mask)
-            for (int32_t i = 0; i < WHOLE(cols); i++)
-                o[i] &= mask[r * PATCH_ROW + i];
-    }
+    spot.p = klt->edge;
+    spot.stride = EDGE_ROW;
+    return spot;
 }
 
 /* Narrows columns [*lo, *hi] of the window row at absolute `y` to the part of `image` that lies inside the image (with
@@ -133,70 +117,49 @@ static bool window_clear(const pf_klt *klt, const pf_image *image, uint32_t leve
     return r > 0 && ax * ax + ay * ay <= r * r;
 }
 
-/* Which pixels of the window count at this level, for a reference at `p` and a start at `q`. Returns how many. */
+/* Which pixels of the window count at this level, for a reference at `p` and a start at `q`: klt->counted. Returns how
+ * many. */
 static int32_t make_mask(pf_klt *klt, const pf_image *image, uint32_t level, pf_point_q16 p, pf_point_q16 q)
 {
+    if (window_clear(klt, image, level, p) && window_clear(klt, image, level, q)) {
+        klt->counted = klt->whole;
+        return klt->window * klt->window;
+    }
     const int64_t px = (p.x >> 16) - klt->half, py = (p.y >> 16) - klt->half;
     const int64_t qx = (q.x >> 16) - klt->half, qy = (q.y >> 16) - klt->half;
-    const bool clear = window_clear(klt, image, level, p) && window_clear(klt, image, level, q);
     int32_t count = 0;
     for (int32_t r = 0; r < klt->window; r++) {
         int32_t lo = 0, hi = klt->window - 1;
-        if (!clear) {
-            row_span(klt, image, level, px, py + r, &lo, &hi);
-            row_span(klt, image, level, qx, qy + r, &lo, &hi);
-        }
+        row_span(klt, image, level, px, py + r, &lo, &hi);
+        row_span(klt, image, level, qx, qy + r, &lo, &hi);
         int16_t *m = klt->mask + r * PATCH_ROW;
-        for (int32_t i = 0; i < klt->cols; i++)
+        for (int32_t i = 0; i < 8 * klt->groups; i++)
             m[i] = (int16_t) - (i >= lo && i <= hi);
         count += hi >= lo ? hi - lo + 1 : 0;
     }
+    klt->counted = klt->mask;
     return count;
 }
 
-/* Splits the raw patch into template and doubled gradients (Q6), masked, and sums them. */
-static void template_sums(pf_klt *klt, int32_t count, pf_template *s)
+/* The template of `count` pixels whose window's corner, less the border, is at (x, y). */
+static void take_template(pf_klt *klt, const pf_image *from, int64_t x, int64_t y, int32_t count, pf_template *s)
 {
-    int64_t t = 0, tt = 0, gx1 = 0, gy1 = 0, xx = 0, xy = 0, yy = 0, xt = 0, yt = 0;
-    const int32_t cols = WHOLE(klt->cols);
-    for (int32_t r = 0; r < klt->window; r++) {
-        const int16_t *restrict above = klt->raw + r * PATCH_ROW + 1;
-        const int16_t *restrict row = above + PATCH_ROW, *restrict below = row + PATCH_ROW;
-        const int16_t *restrict m = klt->mask + r * PATCH_ROW;
-        int16_t *restrict ot = klt->t + r * PATCH_ROW, *restrict ox = klt->gx + r * PATCH_ROW,
-                          *restrict oy = klt->gy + r * PATCH_ROW;
-        for (int32_t i = 0; i < cols; i++) {
-            ot[i] = (int16_t)(row[i] & m[i]);
-            ox[i] = (int16_t)((row[i + 1] - row[i - 1]) & m[i]);
-            oy[i] = (int16_t)((below[i] - above[i]) & m[i]);
-        }
-        int32_t a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0, k = 0;
-        for (int32_t i = 0; i < cols; i++) {
-            a += ot[i];
-            b += ot[i] * ot[i];
-            c += ox[i];
-            d += oy[i];
-            h += ox[i] * ot[i];
-            k += oy[i] * ot[i];
-        }
-        for (int32_t i = 0; i < cols; i++) {
-            e += ox[i] * ox[i];
-            f += ox[i] * oy[i];
-            g += oy[i] * oy[i];
-        }
-        t += a, tt += b, gx1 += c, gy1 += d, xx += e, xy += f, yy += g, xt += h, yt += k;
-    }
+    const int32_t rows = klt->window + 2, groups = (klt->window + 9) / 8;
+    const pf_spot spot = spot_at(klt, from, x, y, rows, groups);
+    pf_template_sums k;
+    PF_KERNEL(sample)(&spot, rows, groups, klt->raw);
+    PF_KERNEL(template)(klt->raw, klt->counted, klt->window, klt->groups, klt->t, klt->gx, klt->gy, &k);
     const int64_t n = count;
-    *s = (pf_template){.n = n, .t = t, .gx = gx1, .gy = gy1};
-    s->var = tt - t * t / n;
-    s->tx = xt - gx1 * t / n;
-    s->ty = yt - gy1 * t / n;
-    if (s->var < n << 8) /* standard deviation below half a grey level: nothing there */
+    *s = (pf_template){.n = n, .t = k.t, .gx = k.x, .gy = k.y};
+    s->var = k.tt - k.t * k.t / n;
+    s->tx = k.xt - k.x * k.t / n;
+    s->ty = k.yt - k.y * k.t / n;
+    if (s->var < n << 6) /* standard deviation below half a grey level: nothing there */
         return;
     const int64_t rx = s->tx * 16384 / s->var, ry = s->ty * 16384 / s->var;
-    s->xx = xx - gx1 * gx1 / n - ((s->tx * rx) >> 14);
-    s->xy = xy - gx1 * gy1 / n - ((s->tx * ry) >> 14);
-    s->yy = yy - gy1 * gy1 / n - ((s->ty * ry) >> 14);
+    s->xx = k.xx - k.x * k.x / n - ((s->tx * rx) >> 14);
+    s->xy = k.xy - k.x * k.y / n - ((s->tx * ry) >> 14);
+    s->yy = k.yy - k.y * k.y / n - ((s->ty * ry) >> 14);
 }
 
 /* Whether the smaller eigenvalue reaches the threshold; scales the matrix for the solver (entries below 2^30). */
@@ -204,7 +167,7 @@ static bool template_usable(const pf_klt *klt, pf_template *s)
 {
     if (s->xx <= 0 || s->yy <= 0)
         return false;
-    int64_t least = (s->n * klt->min_eigen) << 12; /* doubled gradients of Q5 grey: Q12 */
+    int64_t least = (s->n * klt->min_eigen) << 10; /* doubled gradients of Q4 grey: Q10 */
     int64_t most = s->xx > s->yy ? s->xx : s->yy;
     while (most >> s->shift >= (int64_t)1 << 30)
         s->shift++;
@@ -227,24 +190,11 @@ int32_t pf_zncc(int64_t cov, int64_t var_a, int64_t var_b)
 static bool step(pf_klt *klt, const pf_image *to, const pf_template *s, pf_point_q16 *at, pf_fit *fit, pf_like *like,
                  int32_t *moved)
 {
-    const int32_t cols = WHOLE(klt->cols);
-    sample_patch(to, (int64_t)at->x - ((int64_t)klt->half << 16), (int64_t)at->y - ((int64_t)klt->half << 16),
-                 klt->window, cols, klt->mask, klt->c);
-    int64_t sc = 0, scc = 0, sct = 0, sxc = 0, syc = 0;
-    for (int32_t r = 0; r < klt->window; r++) {
-        const int16_t *restrict c = klt->c + r * PATCH_ROW, *restrict t = klt->t + r * PATCH_ROW;
-        const int16_t *restrict gx = klt->gx + r * PATCH_ROW, *restrict gy = klt->gy + r * PATCH_ROW;
-        int32_t a = 0, b = 0, d = 0, e = 0, f = 0;
-        for (int32_t i = 0; i < cols; i++) {
-            a += c[i];
-            b += c[i] * c[i];
-            d += c[i] * t[i];
-            e += c[i] * gx[i];
-            f += c[i] * gy[i];
-        }
-        sc += a, scc += b, sct += d, sxc += e, syc += f;
-    }
-    const int64_t cov = sct - s->t * sc / s->n, var = scc - sc * sc / s->n;
+    const int64_t reach = (int64_t)klt->half << 16;
+    const pf_spot spot = spot_at(klt, to, at->x - reach, at->y - reach, klt->window, klt->groups);
+    pf_step_sums k;
+    PF_KERNEL(step)(&spot, klt->counted, klt->window, klt->groups, klt->t, klt->gx, klt->gy, &k);
+    const int64_t cov = k.ct - s->t * k.c / s->n, var = k.cc - k.c * k.c / s->n;
     const int64_t gain_q18 = cov * (1 << 18) / s->var, gain = gain_q18 >> 4;
     fit->gain_q14 = pf_clamp_i64(gain, 1 << 30);
     like->cov = cov;
@@ -252,8 +202,8 @@ static bool step(pf_klt *klt, const pf_image *to, const pf_template *s, pf_point
     *moved = 0;
     if (gain < GAIN_MIN || gain > GAIN_MAX)
         return false;
-    const int64_t bx = (sxc - s->gx * sc / s->n - ((s->tx * gain_q18) >> 18)) >> s->shift;
-    const int64_t by = (syc - s->gy * sc / s->n - ((s->ty * gain_q18) >> 18)) >> s->shift;
+    const int64_t bx = (k.cx - s->gx * k.c / s->n - ((s->tx * gain_q18) >> 18)) >> s->shift;
+    const int64_t by = (k.cy - s->gy * k.c / s->n - ((s->ty * gain_q18) >> 18)) >> s->shift;
     const int64_t det = (s->xx * s->yy - s->xy * s->xy) >> 17; /* Q16 result, and 2 for the doubled gradients */
     const int64_t nx = s->yy * bx - s->xy * by, ny = s->xx * by - s->xy * bx;
     if (det <= 0)
@@ -286,8 +236,7 @@ static pf_fit align_level(pf_klt *klt, const pf_image *from, const pf_image *to,
         return fit;
     }
     const int64_t reach = (int64_t)(klt->half + 1) << 16;
-    sample_patch(from, p.x - reach, p.y - reach, klt->window + 2, (klt->window + 9) / 8 * 8, NULL, klt->raw);
-    template_sums(klt, count, &sums);
+    take_template(klt, from, p.x - reach, p.y - reach, count, &sums);
     if (!template_usable(klt, &sums))
         return fit;
     const pf_point_q16 start = *at;
@@ -312,11 +261,11 @@ static pf_fit align_level(pf_klt *klt, const pf_image *from, const pf_image *to,
 }
 
 pf_fit pf_klt_track(pf_klt *klt, const pf_pyramid *from, const pf_pyramid *to, pf_point_q16 from_pos,
-                    pf_point_q16 *to_pos, uint32_t top)
+                    pf_point_q16 *to_pos, uint32_t top, uint32_t last)
 {
     pf_fit fit = {PF_TRACK_FLAT, 0, GAIN_ONE};
     pf_point_q16 at = *to_pos;
-    for (uint32_t l = top + 1u; l-- > 0u;) {
+    for (uint32_t l = top + 1u; l-- > last;) {
         const pf_point_q16 p = {from_pos.x >> l, from_pos.y >> l};
         pf_point_q16 q = {at.x >> l, at.y >> l};
         fit = align_level(klt, &from->level[l], &to->level[l], l, p, &q);
@@ -326,7 +275,7 @@ pf_fit pf_klt_track(pf_klt *klt, const pf_pyramid *from, const pf_pyramid *to, p
         }
     }
     *to_pos = at;
-    if (fit.reason == PF_TRACK_OK && !pf_klt_inside(klt, &to->level[0], at))
+    if (last == 0 && fit.reason == PF_TRACK_OK && !pf_klt_inside(klt, &to->level[0], at))
         fit.reason = PF_TRACK_LEFT;
     return fit;
 }

@@ -1,36 +1,37 @@
 /* What the files of the tracker share. Not for users.
  *
- * Fixed point inside: pixels of a patch are Q5 less 4080 (a signed 16-bit number that centres 0..255), positions are
- * Q16.16, bilinear weights Q15. A row of products of two patch values is summed in 32 bits (31 columns of
- * 8160 * 4080 stay below 2^31), rows in 64: every sum is exact, so its order cannot matter and vector code may choose.
+ * Fixed point inside: pixels of a patch are Q4 less 2040 (a signed 16-bit number that centres 0..255; its rounding adds
+ * 0.0003 grey^2, noise of sigma 2 has 4), positions are Q16.16, bilinear weights Q15. Every sum is exact, so its order
+ * cannot matter and vector code may choose: kernels.h.
  */
 #ifndef PIPEFISH_TRACK_PRIVATE_H
 #define PIPEFISH_TRACK_PRIVATE_H
 
+#include "kernels.h"
 #include "pipefish/image.h"
 #include "pipefish/track.h"
 
-#define WINDOW_MAX  31
-#define PATCH_ROW   40 /* row stride of a patch: window + 2 border columns, padded to whole groups of 8 */
-#define PATCH_MAX   ((WINDOW_MAX + 2) * PATCH_ROW)
-#define WHOLE(cols) ((cols) & ~7)  /* tells the compiler that rows are whole groups: no loop for a rest */
-#define GAIN_ONE    16384          /* gains are Q14 */
-#define GAIN_MIN    (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
-#define GAIN_MAX    (GAIN_ONE * 8)
+#define EDGE_ROW 48             /* row stride of a copy at the image's edge: 5 groups and a pixel */
+#define GAIN_ONE 16384          /* gains are Q14 */
+#define GAIN_MIN (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
+#define GAIN_MAX (GAIN_ONE * 8)
 
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {
     int32_t window, half;
-    int32_t cols; /* window rounded up to whole groups of 8; the surplus columns are masked */
+    int32_t groups; /* of 8 columns, that hold the window; the surplus columns are masked */
     int32_t iterations;
     int32_t min_eigen; /* grey^2, mean over the window; below this a patch is flat */
     pf_point_q16 circle;
-    int32_t radius_q16;      /* 0 = no circle */
-    int16_t raw[PATCH_MAX];  /* reference patch with its border */
-    int16_t mask[PATCH_MAX]; /* -1 where a pixel counts, 0 where not */
+    int32_t radius_q16;       /* 0 = no circle */
+    const int16_t *counted;   /* the mask in use: `whole` or `mask` */
+    int16_t whole[PATCH_MAX]; /* -1 where a pixel counts, 0 where not; here: all of the window */
+    int16_t mask[PATCH_MAX];
+    int16_t raw[PATCH_MAX]; /* reference patch with its border */
     int16_t t[PATCH_MAX], gx[PATCH_MAX], gy[PATCH_MAX];
     int16_t xgx[PATCH_MAX], xgy[PATCH_MAX];
     int16_t c[PATCH_MAX];
+    uint8_t edge[(WINDOW_MAX + 3) * EDGE_ROW];
 } pf_klt;
 
 /* Outcome of an alignment. */
@@ -45,12 +46,9 @@ typedef struct pf_fit {
 typedef struct pf_anchor {
     pf_point_q16 offset; /* of the track's point from the template's centre pixel, |.| <= 1/2 */
     int32_t a[4];        /* Q16.16, row-major */
-    int32_t inverse[36]; /* Q12.20, of the scaled 6x6 normal matrix; order dx dy, then the warp row by row */
+    int32_t inverse[21]; /* Q12.20, of the scaled 6x6 normal matrix, lower triangle; order dx dy, the warp by rows */
     int32_t scale[6];    /* log2 of each parameter's scale */
-    int64_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
-    int64_t sum_t[3];    /* the same of the template */
-    int64_t dot_jt[6];   /* steepest-descent images times the template, both less their best plane */
-    int64_t var_t;       /* sum of squares of the template less its best plane, >= 1 */
+    int32_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
 } pf_anchor;
 
 uint32_t pf_isqrt64(uint64_t n);
@@ -66,18 +64,28 @@ static inline int32_t pf_clamp_i64(int64_t v, int32_t limit)
     return v > limit ? limit : v < -limit ? -limit : (int32_t)v;
 }
 
-/* Q0.15 correlation of two patches from their sums of centred products (Q10, below 2^37). */
+/* Q0.15 correlation of two patches from their sums of centred products (Q8, below 2^37). */
 int32_t pf_zncc(int64_t cov, int64_t var_a, int64_t var_b);
+
+/* Sets the parameters but the circle, which is the caller's. */
+void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen);
+
+/* Bytes of a template's pixels. */
+static inline uint32_t pf_anchor_bytes(uint32_t window)
+{
+    return (window + 2u) * (window + 2u) + 8u; /* vectors read 8 pixels at a time */
+}
 
 /* Whether the window around `at`, with one pixel of border, lies inside the image and the circle. */
 bool pf_klt_inside(const pf_klt *klt, const pf_image *image, pf_point_q16 at);
 
-/* Finds in `to` what lies at `from_pos` in `from`, coarse to fine from level `top`; *to_pos is the start guess in and
- * the result out (unchanged meaning of any failure: last position). Translation, gain and bias. */
+/* Finds in `to` what lies at `from_pos` in `from`, coarse to fine from level `top` to level `last`; *to_pos is the
+ * start guess in and the result out. Translation, gain and bias. The outcome is that of the last level; where a level
+ * fails, its start stands. */
 pf_fit pf_klt_track(pf_klt *klt, const pf_pyramid *from, const pf_pyramid *to, pf_point_q16 from_pos,
-                    pf_point_q16 *to_pos, uint32_t top);
+                    pf_point_q16 *to_pos, uint32_t top, uint32_t last);
 
-/* Takes the template of a track at `at` (pf_klt_inside) into `pixels`, (window + 2)^2 bytes. */
+/* Takes the template of a track at `at` (pf_klt_inside) into `pixels`, pf_anchor_bytes. */
 void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anchor *anchor, uint8_t *pixels);
 
 /* Aligns the template with `image` by an affine warp, gain and bias, starting at *at and the anchor's last warp;
@@ -87,28 +95,58 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
 /* Variance of the position against the template; gain as the fit gave it. Fills the three fields of `track`. */
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
 
-/* Detection. */
-#define CORNER_HALF 5 /* the structure tensor is a mean over 11 x 11 */
-#define CELL_MAX    256
-#define CORNER_ROW  (CELL_MAX + 2 * CORNER_HALF + 6)
+/* --- bearings (rotation.c) --- */
+
+#define PF_ROTATION_LEAST 8u /* fewer pairs of bearings say nothing */
+
+static inline bool pf_ray_valid(const pf_ray_q30 *ray)
+{
+    return ray->x != 0 || ray->y != 0 || ray->z != 0;
+}
+
+/* Row-major Q30 rotation times a ray, each coordinate within 1 LSB. */
+void pf_ray_rotate(const int32_t r[9], const pf_ray_q30 *v, pf_ray_q30 *out);
+
+/* Squared chord between two unit rays, Q2.30, at most 3 LSB too low, saturating just below 4. */
+uint32_t pf_ray_chord2(const pf_ray_q30 *a, const pf_ray_q30 *b);
+
+/* r <- C(w) r with Cayley's map of the small rotation w, Q30 rad: for |w| << 1 the rotation by w. */
+void pf_rotation_turn(const int32_t w[3], int32_t r[9]);
+
+/* The rotation (row-major, Q30) that takes the rays a[n] to b[n], n <= 2048, with Cauchy weights of 0.05 rad: what
+ * moved with the others counts, near walls that did not count little. From 30 degrees apart and less it converges.
+ * Invalid rays (0, 0, 0) are left out. Returns the pairs used; with fewer than PF_ROTATION_LEAST, or where they do not
+ * determine a rotation, r is what was found so far (first the identity). Exact data: within 1e-7 rad. */
+uint32_t pf_rotation_fit(const pf_ray_q30 *a, const pf_ray_q30 *b, uint32_t n, int32_t r[9]);
+
+/* Value of rank k (0 = least, k < n) by bisection over the bits: the array stays, no order of ties matters. */
+uint32_t pf_value_of_rank(const uint32_t *value, uint32_t n, uint32_t k);
+
+/* --- detection (corners.c) --- */
+
+/* From the border: a corner is placed within 2 px, by a tensor over 5 x 5 of 3 x 3 gradients. */
+#define CORNER_REACH 6
 
 typedef struct pf_corner {
     int32_t x, y;
-    int32_t strength; /* smaller eigenvalue of the summed tensor of doubled gradients */
+    int32_t strength; /* twice the smaller eigenvalue of the summed tensor of doubled gradients */
 } pf_corner;
 
 typedef struct pf_corner_scratch {
-    int16_t gx[2 * CORNER_HALF + 1][CORNER_ROW], gy[2 * CORNER_HALF + 1][CORNER_ROW];
-    int32_t xx[CORNER_ROW], xy[CORNER_ROW], yy[CORNER_ROW];
+    pf_tensor_row row[3], sum;
 } pf_corner_scratch;
 
 /* Says whether a corner may be put at (x, y). */
 typedef bool (*pf_corner_allowed)(const void *context, int32_t x, int32_t y);
 
-/* The strongest corner with x0 <= x < x1, y0 <= y < y1 and strength > `least`. The rectangle keeps CORNER_HALF + 1
- * pixels from the border. False if there is none. */
-bool pf_corner_best(pf_corner_scratch *scratch, const pf_image *image, const int32_t box[4], int32_t least,
-                    pf_corner_allowed allowed, const void *context, pf_corner *best);
+/* The strongest corner of each quarter of the rectangle x0 <= x < x1, y0 <= y < y1 (at most CELL_MAX a side) with
+ * strength > `least`, at even coordinates where there is a half resolution. The rectangle keeps CORNER_REACH pixels
+ * from the border. Returns how many of the four there are. */
+uint32_t pf_corner_scan(pf_corner_scratch *scratch, const pf_pyramid *pyramid, const int32_t box[4], int32_t least,
+                        pf_corner_allowed allowed, const void *context, pf_corner best[4]);
+
+/* The place of a corner at full resolution, to a fraction of a pixel, at most 2.5 px from where it was found. */
+pf_point_q16 pf_corner_place(const pf_image *image, const pf_corner *corner);
 
 /* `min_eigen` of the configuration in the unit of pf_corner.strength. */
 int32_t pf_corner_least(uint32_t min_eigen);

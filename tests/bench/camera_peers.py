@@ -25,7 +25,7 @@ class Core:
 
     def __init__(self, path: str) -> None:
         self.library = ctypes.CDLL(path)
-        self.library.bench_camera.restype = ctypes.c_void_p
+        self.library.bench_camera.restype = self.library.bench_rays.restype = ctypes.c_void_p
         self.ok = np.empty(N, np.uint8)
 
     def project(self, asymmetric: int, xyz: np.ndarray, uv: np.ndarray) -> Callable[[], None]:
@@ -40,6 +40,12 @@ class Core:
         origin = ctypes.c_void_p(None)
         arguments = [camera, ctypes.c_size_t(N)] + [ctypes.c_void_p(a.ctypes.data) for a in (uv, ray)]
         return lambda: self.library.pf_camera_unproject_n(*arguments, origin, ctypes.c_void_p(self.ok.ctypes.data))
+
+    def lookup(self, pixels: np.ndarray, rays: np.ndarray) -> Callable[[], None]:
+        """A call that looks up the rays (N,3) int32 Q1.30 of pixels (N,2) int32 Q16.16; the arrays must live on."""
+        table = ctypes.c_void_p(self.library.bench_rays())
+        arguments = [table, ctypes.c_size_t(N)] + [ctypes.c_void_p(a.ctypes.data) for a in (pixels, rays)]
+        return lambda: self.library.pf_camera_rays_lookup(*arguments)
 
 
 def fastest(*calls: Callable[[], object]) -> list[float]:
@@ -71,6 +77,13 @@ def main() -> None:
     ours()
     back()
     assert np.abs(ray - xyz / length).max() < 1e-12, "the core does not come back to its rays"
+    # The table: those of the pixels that lie on the sensor, in random order.
+    chosen = np.resize(np.flatnonzero((np.abs(uv - [639.5, 399.5]) < [640, 400]).all(axis=1)), N)
+    pixels_q16, rays_q30 = np.rint(uv[chosen] * 65536).astype(np.int32), np.empty((N, 3), np.int32)
+    table = core.lookup(pixels_q16, rays_q30)
+    table()
+    error = np.abs(rays_q30 / 2**30 - xyz[chosen] / length[chosen]).max()
+    assert error < 1e-5, f"the table of rays is off by {error}"
     intrinsics = [356.2, 355.9, 647.3, 404.8]
     radial = [-0.031, 0.0042, -0.0011, 0.00006]
 
@@ -88,8 +101,9 @@ def main() -> None:
         t = fastest(ours, ours_p23, lambda: cv2.fisheye.projectPoints(points, zero, zero, matrix, np.array(radial)))
         report("camera.project.p9", t[0], peer, t[2])
         report("camera.project.p23", t[1], peer, t[2])
-        t = fastest(back, lambda: cv2.fisheye.undistortPoints(pixels, matrix, np.array(radial)))
-        report("camera.unproject.p9", t[0], peer, t[1])
+        t = fastest(back, table, lambda: cv2.fisheye.undistortPoints(pixels, matrix, np.array(radial)))
+        report("camera.unproject.p9", t[0], peer, t[2])
+        report("camera.lut", t[1], peer, t[2])
 
     try:
         import mrcal
@@ -103,7 +117,9 @@ def main() -> None:
         report("camera.project.p9", t[0], "mrcal OPENCV8", t[1])
         few = uv[: N // 20].copy()
         best = min(_timed(lambda: mrcal.unproject(few, model, values)) for _ in range(3))
-        report("camera.unproject.p9", fastest(back)[0], "mrcal OPENCV4", best / len(few))
+        t = fastest(back, table)
+        report("camera.unproject.p9", t[0], "mrcal OPENCV4", best / len(few))
+        report("camera.lut", t[1], "mrcal OPENCV4", best / len(few))
 
     try:
         import pycolmap
@@ -113,8 +129,9 @@ def main() -> None:
         camera = pycolmap.Camera(model="OPENCV_FISHEYE", width=1280, height=800, params=[*intrinsics, *radial])
         t = fastest(ours, lambda: camera.img_from_cam(xyz))
         report("camera.project.p9", t[0], "pycolmap", t[1])
-        t = fastest(back, lambda: camera.cam_from_img(uv))
-        report("camera.unproject.p9", t[0], "pycolmap", t[1])
+        t = fastest(back, table, lambda: camera.cam_from_img(uv))
+        report("camera.unproject.p9", t[0], "pycolmap", t[2])
+        report("camera.lut", t[1], "pycolmap", t[2])
 
 
 def _timed(call: Callable[[], object]) -> float:

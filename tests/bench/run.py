@@ -14,12 +14,11 @@ import sys
 import time
 from pathlib import Path
 
+import room_track
+from peers import PEERS
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ROOT / "build" / "release" / "tests" / "bench"
-
-
-# Debian's Python has Debian's OpenCV and mrcal; the other has what pip brings.
-PEER_PYTHONS = (Path("/usr/bin/python3"), ROOT / "build" / "venv-peers" / "bin" / "python")
 
 
 def run_program(*command: Path) -> list[dict]:
@@ -44,13 +43,13 @@ def bench_sim() -> list[dict]:
 
 
 def bench_camera() -> list[dict]:
-    """camera.project, camera.unproject against every peer that is installed."""
+    """camera.project, camera.unproject, camera.lut against every peer that is installed."""
     library = PROGRAMS / "libbench_camera_core.so"
     script = ROOT / "tests" / "bench" / "camera_peers.py"
-    return [figure for python in PEER_PYTHONS if python.exists() for figure in run_program(python, script, library)]
+    return [figure for python in PEERS.values() if python.exists() for figure in run_program(python, script, library)]
 
 
-PYTHON_ROOMS = {"camera": bench_camera, "sim": bench_sim}
+PYTHON_ROOMS = {"camera": bench_camera, "sim": bench_sim, "track": room_track.measure}
 
 
 def cpu_name() -> str:

@@ -40,7 +40,12 @@ def make(**changes):
         "serial": "SN 42",
         "source": "target",
         "created": datetime.datetime(2026, 1, 31, 12, 0, 5, tzinfo=datetime.UTC),
+        "lens": "f/2 1.6 mm, Schärfe 0,3 m",
         "rms_px": 0.1 + 0.2,
+        "held_out_rms_px": 1 / 3,
+        "provenance": pf.Provenance(
+            tool="pipefish", version="0.1.0", model_choice="p9", views=20, points=1760, held_out_views=5
+        ),
         "theta_covered": 1.5,
         "covariance_parameters": ("f_u", "k5", "cpoly[13]"),
         "covariance": [[1e-2, 1e-7, 0], [1e-7, 3e-9, -1e-10], [0, -1e-10, 1 / 3]],
@@ -195,7 +200,7 @@ BAD_VALUES = [
     ("tilt", [0]),
     ("tilt", "00"),
     ("asym_radial_theta", [2e6, 0, 0]),
-    ("asym_radial_phi", [2e6, 0, 0, 0]),
+    ("asym_radial_phi[0]", ["1", 0, 0, 0]),
     ("asym_tangential_theta", [0, 0, 2e6]),
     ("asym_tangential_phi", 0),
     ("cpoly", [0] * 13),
@@ -213,6 +218,10 @@ BAD_VALUES = [
     ("name", "\ud800"),
     ("serial", None),
     ("rms_px", -1),
+    ("held_out_rms_px", -1),
+    ("held_out_rms_px", "x"),
+    ("lens", "x" * 64),
+    ("lens", 1),
     ("rms_px", float("nan")),
     ("theta_covered", 4),
     ("created", 5),
@@ -232,9 +241,18 @@ BAD_JSON = [
     ("created", "yesterday"),
     ("created", "1969-12-31T23:59:59Z"),
     ("format", "other"),
-    ("version", 2),
+    ("version", 3),
     ("version", True),
     ("f_w", 1),
+    ("units", {"image": "pixel", "angle": "degree", "length": "metre"}),
+    ("provenance", []),
+    ("provenance.author", {"author": "me"}),
+    ("provenance.tool", {"tool": "x" * 32}),
+    ("provenance.version", {"version": 1}),
+    ("provenance.model_choice", {"model_choice": "a\nb"}),
+    ("provenance.views", {"views": -1}),
+    ("provenance.points", {"points": 1.5}),
+    ("provenance.held_out_views", {"held_out_views": 1 << 32}),
     ("covariance", []),
     ("covariance", {"parameters": ["f_u"]}),
     ("covariance", {"parameters": ["f_u"], "lower": []}),
@@ -263,7 +281,7 @@ def test_bad_json_names_file_and_key(tmp_path, key, value):
 
 
 @pytest.mark.parametrize(
-    "key", ["format", "version", "width", "height", "f_u", "f_v", "c_u", "c_v", "k2", "k5", "theta_max"]
+    "key", ["format", "version", "units", "width", "height", "f_u", "f_v", "c_u", "c_v", "k2", "k5", "theta_max"]
 )
 def test_missing_keys_are_named(tmp_path, key):
     path = tmp_path / "profile.json"

@@ -24,6 +24,7 @@ COMMANDS = [
     ["profile", "show"],
     ["profile", "check"],
     ["profile", "convert"],
+    ["undistort"],
 ]
 
 

@@ -433,18 +433,103 @@ def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_
     assert crawler.text().count("hung up") == 1
 
 
-def test_two_runs_of_one_recording_track_the_same(tmp_path: Path):
-    write_recording(tmp_path / "survey.y4m", 30)
+@pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 2)])
+def test_runs_of_one_recording_are_the_same_with_one_thread_and_with_two(tmp_path: Path, threads: tuple[int, int]):
+    write_recording(tmp_path / "survey.y4m", 60, skip=(20, *range(31, 39)))  # a dropped frame, and a break
     runs = []
-    for name in ("a", "b"):
+    for name, count in zip("ab", threads, strict=True):
         folder = tmp_path / name
         folder.mkdir()
-        crawler = Crawler(folder, camera__path=tmp_path / "survey.y4m")
+        crawler = Crawler(folder, camera__path=tmp_path / "survey.y4m", daemon__threads=count)
         store = Store(crawler.port)
         crawler.start()
         assert receive_all(crawler, store) == 0
-        runs.append([(k.observations.SerializeToString(), k.jpeg) for k in store.keyframes])
-    assert runs[0] == runs[1]
+        runs.append(store.keyframes)
+        for keyframe in runs[-1]:  # all but what belongs to the run
+            keyframe.ClearField("survey_id")
+            keyframe.ClearField("time")
+            keyframe.telemetry.ClearField("time")
+    assert len(runs[0]) > 20
+    assert [k.break_reason for k in runs[0] if k.after_break] == ["gap of 8 frames"]
+    assert [k.SerializeToString(deterministic=True) for k in runs[0]] == [
+        k.SerializeToString(deterministic=True) for k in runs[1]
+    ]
+
+
+def write_pgm(path: Path, pixels: np.ndarray) -> None:
+    path.write_bytes(b"P5\n%d %d\n255\n" % pixels.shape[::-1] + pixels.astype(np.uint8).tobytes())
+
+
+def test_nothing_is_tracked_under_the_mask_of_the_configuration(tmp_path: Path):
+    mask = np.full((HEIGHT, WIDTH), 255)
+    mask[:, 96:160] = 0
+    write_pgm(tmp_path / "mask.pgm", mask)
+    write_recording(tmp_path / "survey.y4m", 20)
+    crawler = Crawler(tmp_path, tracker__mask=tmp_path / "mask.pgm")
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    x = np.concatenate([np.array(k.observations.x_q16) / 65536 for k in store.keyframes])
+    assert len(x) > 50 and not np.any((x >= 96) & (x < 160))
+    assert store.ends[0].last_status.tracking.lost_masked > 0  # the pattern moves to the left, into the mask
+
+
+@pytest.mark.parametrize(
+    ("mask", "what"),
+    [
+        (np.zeros((5, 7)), "tracker.mask: {path}: 7 x 5 pixels, but the camera gives 192 x 160"),
+        (None, "tracker.mask: {path}: No such file or directory"),
+        (b"GIF89a", "tracker.mask: {path}: byte 0: neither PNG, JPEG nor binary PGM"),
+    ],
+)
+def test_a_mask_that_does_not_fit_is_a_clear_error(tmp_path: Path, crawler: Crawler, mask, what: str):
+    path = tmp_path / "mask.pgm"
+    if isinstance(mask, bytes):
+        path.write_bytes(mask)
+    elif mask is not None:
+        write_pgm(path, mask)
+    crawler.start("--set", f"tracker.mask={path}")
+    assert crawler.wait() == 1
+    assert what.format(path=path) in crawler.text()
+
+
+def test_polar_cells_without_a_circle_are_a_clear_error(crawler: Crawler):
+    crawler.start("--set", "tracker.cells=polar")
+    assert crawler.wait() == 1
+    assert "tracker.cells = polar: needs an image circle" in crawler.text()
+
+
+def write_states(path: Path) -> None:
+    """Moving, standing, dark, moving: 30 frames each."""
+    pattern = texture(3)
+    with path.open("wb") as out:
+        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F25:1 Ip A1:1 Cmono\n".encode())
+        shift = 0
+        for i in range(120):
+            part = i // 30
+            shift += 2 if part in (0, 3) else 0
+            frame = np.roll(pattern, -shift, axis=1)[:, :WIDTH]
+            out.write(b"FRAME\n" + np.ascontiguousarray(frame // (60 if part == 2 else 1)).tobytes())
+    path.with_suffix(".csv").unlink(missing_ok=True)
+
+
+def test_states_of_the_scene_reach_the_host_and_the_log(tmp_path: Path):
+    write_states(tmp_path / "survey.y4m")
+    crawler = Crawler(tmp_path, encoder__metres_per_count=0, keyframe__min_common=2000)
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    log = crawler.text()
+    order = ["standing still", "dark", "no longer dark"]
+    at = [log.index(f": {text}\n") for text in order]
+    assert at == sorted(at)
+    last = store.ends[0].last_status.tracking
+    assert last.frames == 120 and not last.dark and not last.standing
+    lost = last.lost_residual + last.lost_flat + last.lost_backward + last.lost_diverged + last.lost_drift
+    assert lost > 0  # in the dark
+    assert crawler.status()["tracking"]["frames"] == 120
+    assert sum(k.tracking.frames for k in store.keyframes) <= 120
+    assert any(k.tracking.standing for k in store.keyframes) or len(store.keyframes) < 5
 
 
 def test_dropped_frames_are_counted_and_a_long_gap_is_a_marked_break(tmp_path: Path, crawler: Crawler):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipefish.evaluate import evaluate, survival, track_errors
+from pipefish.evaluate import evaluate, observed, opencv_tracks, survival, track_errors, verdict
 from pipefish.survey import Survey
 from synthetic import write_survey
 
@@ -41,7 +41,7 @@ def test_perfect_tracks_have_no_error(tmp_path):
 
 
 def test_drift_grows_with_the_age_since_the_anchor(tmp_path):
-    errors = track_errors(opened(tmp_path), Flat(drift=0.12))
+    errors = track_errors(observed(opened(tmp_path)), Flat(drift=0.12))
     np.testing.assert_allclose(errors["error"], 0.12 * errors["age"], atol=1e-3)
     result = evaluate(opened_again(tmp_path), Flat(drift=0.12))
     assert result["by_age"][0]["within_1px"] == 1.0  # 5 frames: 0.6 px
@@ -76,5 +76,48 @@ def test_survival_counts_only_tracks_that_could_go_on(tmp_path):
         tracks.frame == tracks.frame.max()
     )  # a track each that a keyframe has and the next not
     pairs = 11 * 40  # 12 keyframes of 40 tracks
-    assert survival(survey, Flat()) == pytest.approx(1 - gone / pairs)
-    assert survival(survey, Rim(1)) is None  # everything leaves the field: nobody is to blame
+    assert survival(observed(survey), Flat()) == pytest.approx(1 - gone / pairs)
+    assert survival(observed(survey), Rim(1)) is None  # everything leaves the field: nobody is to blame
+
+
+FIGURES = {"within_1px": 0.98, "survival": 0.95, "median_px": 0.1, "length_median": 30.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "failed"),
+    [
+        ({}, []),
+        ({"within_1px": 0.965}, ["within_1px"]),
+        ({"survival": 0.89}, ["survival"]),
+        ({"survival": None}, ["survival"]),
+        ({"median_px": 0.21}, ["median_px"]),
+        ({"length_median": 29.0}, ["length_ratio"]),
+    ],
+)
+def test_each_bar_is_enforced(change, failed):
+    rows = verdict(FIGURES | change, {"length_median": 20.0})
+    assert [name for name, row in rows.items() if not row["holds"]] == failed
+    assert "length_ratio" not in verdict(FIGURES, None)
+    assert verdict(FIGURES | {"within_1px": 0.965}, None, smooth=True)["within_1px"]["holds"]
+
+
+def test_the_peer_follows_a_shift_and_is_judged_like_the_device():
+    pytest.importorskip("cv2")
+    rng = np.random.default_rng(1)
+    wall = rng.normal(size=(200, 400))
+    for _ in range(4):
+        wall = (wall + np.roll(wall, 1, 0) + np.roll(wall, 1, 1) + np.roll(wall, -1, 0) + np.roll(wall, -1, 1)) / 5
+    wall = np.clip(128 + wall * 200, 0, 255).astype(np.uint8)
+    seen = opencv_tracks(lambda k: wall[20:180, 100 - 2 * k : 340 - 2 * k], {0: 0, 1: 5, 2: 10}, [(0, 1), (1, 2)], 80)
+
+    class Plane:
+        def cast(self, frame, pixels):
+            points = np.column_stack([pixels - [2 * frame, 0], np.zeros(len(pixels))])
+            return points, np.all((pixels > 0) & (pixels < [239, 159]), axis=1)
+
+        def project(self, frame, points):
+            return points[:, :2] + [2 * frame, 0], np.ones(len(points), dtype=bool)
+
+    assert np.median(track_errors(seen, Plane())["error"]) < 0.1
+    assert survival(seen, Plane()) > 0.9
+    assert seen.tracks.age.max() == 10

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
 from pipefish.errors import PipefishError
+from pipefish.page import write_statistics
 from pipefish.show import Painter, Style, animation, show, spread
 from pipefish.survey import Survey
-from synthetic import write_survey
+from pipefish.trackstats import statistics
+from synthetic import as_object, survey_objects, write_survey
 
 
 @pytest.fixture
@@ -77,3 +80,46 @@ def test_what_cannot_be_drawn_is_said(survey, tmp_path):
 def test_spread_keeps_both_ends():
     assert spread(100, 5) == [0, 25, 50, 74, 99] or spread(100, 5)[::4] == [0, 99]
     assert spread(3, 10) == [0, 1, 2] and spread(1, 5) == [0]
+
+
+def tracking_survey(tmp_path) -> Survey:
+    """A survey whose device counted: in keyframe k it found 30 tracks in each of 5 frames and lost k by drift."""
+    objects = []
+    for k, (name, kind, data) in enumerate(survey_objects(6)):
+        if kind == 2:
+            message = pb.Keyframe.FromString(data)
+            counts = message.tracking
+            counts.frames, counts.tracked, counts.lost_drift, counts.age_median = 5, 150, k, 7
+            counts.quality_median, counts.reversing = 31130, message.index == 3
+            name, kind, data = as_object(kind, message)
+        objects.append((name, kind, data))
+    write_survey(tmp_path / "t.mcap", objects=objects)
+    return Survey.open(tmp_path / "t.mcap")
+
+
+def test_statistics_are_means_a_frame_and_states_are_drawn(tmp_path):
+    survey = tracking_survey(tmp_path)
+    stats = statistics(survey)
+    np.testing.assert_allclose(stats["tracked"], 30)
+    np.testing.assert_allclose(stats["lost_drift"], np.arange(1, 7) / 5)
+    np.testing.assert_allclose(stats["quality_median"], 0.95, atol=1e-4)
+    assert stats["reversing"].tolist() == [False, False, False, True, False, False]
+    assert survey.info["states"] == {"reversing": 1}
+    plain, stated = (np.asarray(Painter(survey).draw(i, Style(640, legend=False)))[:30, :120] for i in (2, 3))
+    assert (stated == (255, 190, 90)).all(axis=-1).any() and not (plain == (255, 190, 90)).all(axis=-1).any()
+
+
+def test_the_statistics_page_has_its_charts_and_needs_counters(tmp_path, survey):
+    write_statistics(tracking_survey(tmp_path), tmp_path / "s.html")
+    text = (tmp_path / "s.html").read_text(encoding="utf-8")
+    assert [f"plot-{name}" in text for name in ("stats-live", "stats-lost", "stats-age", "stats-states")] == [True] * 4
+    assert "drifted from its template" in text and "saturated" not in text.split("application/json")[1][:20000]
+    with pytest.raises(PipefishError, match="no track statistics"):
+        write_statistics(survey, tmp_path / "none.html")
+
+
+def test_colour_by_quality_differs_from_colour_by_age(survey):
+    by_age, by_quality = (
+        np.asarray(Painter(survey).draw(9, Style(640, legend=True, colour=c))) for c in ("age", "quality")
+    )
+    assert by_age.shape == by_quality.shape and (by_age != by_quality).any(axis=-1).mean() > 0.001

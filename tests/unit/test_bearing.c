@@ -1,49 +1,50 @@
-/* Bearings of tracks, with a camera of the test's own: only the room's part (rounding, domain) is under test. */
-#include <math.h>
-
+/* Bearings of tracks, from the table of rays: only this room's part is under test, test_camera_rays has the rest. */
 #include "pipefish/track.h"
 #include "unity.h"
+
+static _Alignas(16) uint8_t camera_workspace[8192], rays_workspace[100000];
 
 void setUp(void) {}
 void tearDown(void) {}
 
-/* A pinhole of 100 pixels; nothing left of u = 0. */
-pf_status pf_camera_unproject(const pf_camera *camera, const double uv[2], double ray[3], double origin[3],
-                              double *d_ray_d_uv)
+/* Proves: each track's bearing is the table's ray of its position, (0, 0, 0) outside the image circle. */
+static void test_bearings_are_the_rays_of_the_positions_and_zero_outside(void)
 {
-    (void)camera, (void)origin, (void)d_ray_d_uv;
-    if (uv[0] < 0)
-        return PF_ERR_DOMAIN;
-    const double n = sqrt(uv[0] * uv[0] + uv[1] * uv[1] + 10000);
-    ray[0] = uv[0] / n;
-    ray[1] = uv[1] / n;
-    ray[2] = 100 / n;
-    return PF_OK;
-}
-
-/* Proves: rays are the camera's, rounded to nearest in Q1.30 (negative ones too, 1 exactly representable); positions
- * outside the domain give zero. */
-static void test_bearings_are_rounded_and_zero_outside_the_domain(void)
-{
-    const pf_camera camera = {0};
-    const pf_track tracks[4] = {
-        {.pos = {0, 0}}, {.pos = {30 << 16, -(40 << 16) - 32768}}, {.pos = {-1, 0}}, {.pos = {7 << 16, 12345678}}};
+    const pf_camera camera = {.width = 320,
+                              .height = 240,
+                              .radial = PF_RADIAL_EQUIDISTANT,
+                              .f_u = 100,
+                              .f_v = 100,
+                              .c_u = 160,
+                              .c_v = 120,
+                              .theta_max = 1.6,
+                              .circle_u = 160,
+                              .circle_v = 120,
+                              .circle_radius = 110};
+    const pf_track tracks[4] = {{.pos = {160 << 16, 120 << 16}},
+                                {.pos = {(160 << 16) + 5147185, 120 << 16}},
+                                {.pos = {160 << 16, (120 << 16) - 7208960}},
+                                {.pos = {50 << 16, 119 << 16}}};
+    const pf_camera_fixed *fixed;
+    const pf_camera_rays *table;
     pf_ray_q30 rays[4];
-    pf_track_bearings(&camera, tracks, 4, rays);
-    TEST_ASSERT_EQUAL_INT32(1 << 30, rays[0].z);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_fixed_init(&fixed, &camera, camera_workspace, sizeof camera_workspace));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_rays_init(&table, fixed, 8, rays_workspace, sizeof rays_workspace));
+    pf_track_bearings(table, tracks, 4, rays);
+    const double expected[4][3] = {{0, 0, 1}, {0.70710678, 0, 0.70710678}, {0, -0.89120736, 0.45359612}, {0, 0, 0}};
     for (int i = 0; i < 4; i++) {
-        const double uv[2] = {tracks[i].pos.x / 65536.0, tracks[i].pos.y / 65536.0};
-        double ray[3] = {0, 0, 0};
-        (void)pf_camera_unproject(&camera, uv, ray, NULL, NULL);
-        TEST_ASSERT_EQUAL_INT32(lrint(ray[0] * 1073741824.0), rays[i].x);
-        TEST_ASSERT_EQUAL_INT32(lrint(ray[1] * 1073741824.0), rays[i].y);
-        TEST_ASSERT_EQUAL_INT32(lrint(ray[2] * 1073741824.0), rays[i].z);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected[i][0], rays[i].x / 1073741824.0);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected[i][1], rays[i].y / 1073741824.0);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected[i][2], rays[i].z / 1073741824.0);
+        const pf_ray_q30 at = pf_camera_rays_at(table, tracks[i].pos);
+        TEST_ASSERT_EQUAL_MEMORY(&at, &rays[i], sizeof at);
     }
+    TEST_ASSERT_EQUAL_INT32(0, rays[3].z);
 }
 
 int main(void)
 {
     UNITY_BEGIN();
-    RUN_TEST(test_bearings_are_rounded_and_zero_outside_the_domain);
+    RUN_TEST(test_bearings_are_the_rays_of_the_positions_and_zero_outside);
     return UNITY_END();
 }

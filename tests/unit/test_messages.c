@@ -150,6 +150,20 @@ static pf_msg_telemetry sample_telemetry(void)
                               .emergency_stop = true};
 }
 
+static pf_msg_tracking sample_tracking(void)
+{
+    pf_msg_tracking t = {.scene = PF_SCENE_REVERSING | PF_SCENE_OVEREXPOSED,
+                         .frames = 7,
+                         .tracked = 8,
+                         .detected = 9,
+                         .age_median = 20,
+                         .quality_median = 21,
+                         .static_blocks = 22};
+    for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
+        t.lost_by[i] = 9 + i;
+    return t;
+}
+
 static pf_msg_status sample_status(void)
 {
     pf_msg_status s = {.time = {7, 8},
@@ -168,7 +182,8 @@ static pf_msg_status sample_status(void)
                        .telemetry = sample_telemetry(),
                        .uptime_ns = 99,
                        .has_clock = true,
-                       .clock = {7, -123456789, 1000}};
+                       .clock = {7, -123456789, 1000},
+                       .tracking = sample_tracking()};
     s.link.bytes_out = 21;
     s.link.bytes_in = 22;
     s.link.frames_out = 23;
@@ -217,7 +232,8 @@ static pf_msg_keyframe sample_keyframe(const pf_track *tracks)
                          .telemetry = sample_telemetry(),
                          .tracks = tracks,
                          .n_tracks = TRACKS,
-                         .common_tracks = 44};
+                         .common_tracks = 44,
+                         .tracking = sample_tracking()};
     memcpy(k.survey_id, survey_id, 16);
     memset(k.frame_sha256, 0xAB, 32);
     return k;
@@ -282,6 +298,15 @@ static void check_telemetry(view t)
     TEST_ASSERT_EQUAL_UINT64(1, number(t, 10));
 }
 
+/* Of sample_tracking: field i is i, but for the states. */
+static void check_tracking(view t)
+{
+    for (uint32_t i = 1; i <= 6; i++)
+        TEST_ASSERT_EQUAL_UINT64(i == 2 || i == 5, number(t, i));
+    for (uint32_t i = 7; i <= 22; i++)
+        TEST_ASSERT_EQUAL_UINT64(i, number(t, i));
+}
+
 static void check_status(view s)
 {
     static const uint32_t plain[][2] = {{4, 1000}, {5, 2}, {7, 400}, {8, 5}, {9, 6}, {10, 70}, {11, 8}, {17, 99}};
@@ -299,8 +324,29 @@ static void check_status(view s)
     for (uint32_t i = 2; i <= 12; i++)
         TEST_ASSERT_EQUAL_UINT64(19 + i, number(bytes(s, 15), i));
     check_telemetry(bytes(s, 16));
+    check_tracking(bytes(s, 20));
     TEST_ASSERT_EQUAL_INT64(-123456789, zigzag(number(bytes(s, 18), 2)));
     TEST_ASSERT_EQUAL_UINT64(1000, number(bytes(s, 18), 3));
+}
+
+static pf_msg_profile sample_profile(void)
+{
+    pf_msg_profile p = {.name = "Kanal 7", .serial = "S1", .crc32c = 0xDEADBEEF, .is_trial = true, .starts_left = 3};
+    for (uint8_t i = 0; i < 32; i++)
+        p.sha256[i] = (uint8_t)(200 + i);
+    return p;
+}
+
+static void check_profile(view p)
+{
+    pf_msg_profile expected = sample_profile();
+    check_text("Kanal 7", bytes(p, 1));
+    check_text("S1", bytes(p, 2));
+    TEST_ASSERT_EQUAL_size_t(32, bytes(p, 3).n);
+    TEST_ASSERT_EQUAL_MEMORY(expected.sha256, bytes(p, 3).data, 32);
+    TEST_ASSERT_EQUAL_HEX64(0xDEADBEEF, number(p, 4));
+    TEST_ASSERT_EQUAL_UINT64(1, number(p, 5));
+    TEST_ASSERT_EQUAL_UINT64(3, number(p, 6));
 }
 
 /* ---- tests */
@@ -322,6 +368,7 @@ static void test_keyframe_round_trip(void)
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_append_break("restart", out, n + 10, &n));
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_break("restart", out, n + 11, &n));
     m = (view){out, n};
+    check_tracking(bytes(m, 17));
     TEST_ASSERT_EQUAL_MEMORY(survey_id, bytes(m, 1).data, 16);
     TEST_ASSERT_EQUAL_UINT64(12, number(m, 2));
     TEST_ASSERT_EQUAL_UINT64(7, number(bytes(m, 3), 1));
@@ -485,11 +532,34 @@ static void test_reply_round_trip(void)
     check_text("replay", bytes(bytes(m, 4), 5));
     reply.status = &status;
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_msg_encode_reply(&reply, out, sizeof out, &n));
+
+    pf_msg_profile_state state = {.has_stored = true,
+                                  .in_use = sample_profile(),
+                                  .stored = sample_profile(),
+                                  .problem = "self_test: no",
+                                  .slot_erases = {5, 6}};
+    reply = (pf_msg_reply){.id = 79, .error = "", .profile = &state};
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
+    m = bytes((view){out, n}, 5);
+    TEST_ASSERT_FALSE(has(m, 1));
+    check_profile(bytes(m, 2));
+    check_text("self_test: no", bytes(m, 3));
+    TEST_ASSERT_EQUAL_UINT64(5, number(m, 4));
+    TEST_ASSERT_EQUAL_UINT64(6, number(m, 5));
+    reply.info = &info;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_msg_encode_reply(&reply, out, sizeof out, &n));
+
+    status.has_profile = true;
+    status.profile = sample_profile();
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_status(&status, out, sizeof out, &n));
+    check_profile(bytes((view){out, n}, 19));
 }
 
-/* Proves: a status at its largest fits a control message and a latest message of the link's limits (1000 bytes). */
+/* Proves: a status and the state of the profiles at their largest fit a control message and a latest message of the
+ * link's limits (1000 bytes). */
 static void test_largest_status_fits_a_control_message(void)
 {
+    char name[64] = "", problem[192] = "";
     uint8_t out[1000];
     size_t n = 0;
     pf_msg_status s;
@@ -499,6 +569,14 @@ static void test_largest_status_fits_a_control_message(void)
     s.link_up = s.has_clock = s.telemetry.has_encoder = s.telemetry.has_attitude = s.telemetry.has_exposure = true;
     s.telemetry.has_gain = s.telemetry.has_lamp = s.telemetry.emergency_stop = true;
     s.telemetry.attitude_sigma_rad = 1.0f;
+    memset(name, 'x', sizeof name - 1);
+    memset(problem, 'x', sizeof problem - 1);
+    s.has_profile = s.profile.is_trial = true;
+    s.profile.name = s.profile.serial = name;
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
+
+    pf_msg_profile_state state = {true, true, s.profile, s.profile, problem, {UINT32_MAX, UINT32_MAX}};
+    reply = (pf_msg_reply){.id = UINT32_MAX, .error = problem, .profile = &state};
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 }
 
@@ -601,10 +679,11 @@ static void test_requests_are_decoded(void)
 {
     static const uint8_t lamp[] = {0x08, 0x96, 0x01, 0x2D, 0x00, 0x00, 0x00, 0x3F}; /* id 150, set_lamp 0.5 */
     static const uint8_t clock[] = {0x08, 0x01, 0x32, 0x0D, 0x09, 1, 2, 3, 4, 5, 6, 7, 8, 0x10, 0x09, 0x18, 0x07};
-    static const uint8_t nothing[][4] = {
-        {0x08, 2, 0x12, 0}, {0x08, 2, 0x1A, 0}, {0x08, 2, 0x22, 0}, {0x08, 2, 0x3A, 0}};
-    static const pf_request_what what[] = {PF_REQUEST_GET_STATUS, PF_REQUEST_GET_INFO, PF_REQUEST_STOP_SURVEY,
-                                           PF_REQUEST_SHUTDOWN};
+    static const uint8_t nothing[][4] = {{0x08, 2, 0x12, 0}, {0x08, 2, 0x1A, 0}, {0x08, 2, 0x22, 0},
+                                         {0x08, 2, 0x3A, 0}, {0x08, 2, 0x42, 0}, {0x08, 2, 0x52, 0}};
+    static const pf_request_what what[] = {PF_REQUEST_GET_STATUS, PF_REQUEST_GET_INFO,    PF_REQUEST_STOP_SURVEY,
+                                           PF_REQUEST_SHUTDOWN,   PF_REQUEST_GET_PROFILE, PF_REQUEST_REVERT_PROFILE};
+    uint8_t confirm[36] = {0x08, 3, 0x4A, 32}, sha256[32];
     static const uint8_t newer[] = {0x08, 0x05, 0xA2, 0x06, 0x01, 0x61}; /* id 5, unknown field 100 */
     pf_msg_request r;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(lamp, sizeof lamp, &r));
@@ -616,10 +695,17 @@ static void test_requests_are_decoded(void)
     TEST_ASSERT_EQUAL_HEX64(0x0807060504030201u, r.clock.boot_id);
     TEST_ASSERT_EQUAL_INT64(-5, r.clock.offset_ns);
     TEST_ASSERT_EQUAL_UINT64(7, r.clock.error_ns);
-    for (size_t i = 0; i < 4; i++) {
+    for (size_t i = 0; i < 6; i++) {
         TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(nothing[i], 4, &r));
         TEST_ASSERT_EQUAL_INT(what[i], r.what);
     }
+    memset(sha256, 0xA5, sizeof sha256);
+    memcpy(confirm + 4, sha256, sizeof sha256);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(confirm, sizeof confirm, &r));
+    TEST_ASSERT_EQUAL_INT(PF_REQUEST_CONFIRM_PROFILE, r.what);
+    TEST_ASSERT_EQUAL_MEMORY(sha256, r.profile_sha256, sizeof sha256);
+    confirm[3] = 31; /* not a SHA-256 */
+    TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_msg_decode_request(confirm, sizeof confirm - 1, &r));
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(newer, sizeof newer, &r));
     TEST_ASSERT_EQUAL_UINT32(5, r.id);
     TEST_ASSERT_EQUAL_INT(PF_REQUEST_UNKNOWN, r.what);

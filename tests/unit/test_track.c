@@ -298,6 +298,45 @@ static void test_forward_backward_distance_is_enforced(void)
     }
 }
 
+/* Proves: a sudden shift of 60 px, in any direction, is found where it is expected (to 6 px): at least 90 % of the
+ * tracks that stay in view, within 0.2 px; without, hardly any are. Expecting a shift that does not come costs nothing.
+ */
+static void test_shifts_of_60_px_are_recovered_with_prediction(void)
+{
+    static pf_expected at[400];
+    for (int k = 0; k < 24; k++) {
+        const double angle = k / 3 * 0.7853981633974483;
+        const bool comes = k % 3 != 2, expected = k % 3 != 1;
+        const motion m = {{1, 0, 0, 1}, {comes ? 60 * cos(angle) : 0, comes ? 60 * sin(angle) : 0}, 1, 0};
+        pf_tracker *t = start(NULL);
+        uint32_t n, possible = 0, found = 0;
+        render(frame[0], &still, 2, 0);
+        render(frame[1], &m, 2, 0);
+        feed(t, frame[0]);
+        memcpy(before, pf_tracker_tracks(t, &n), sizeof before[0] * pf_tracker_last_stats(t)->live);
+        for (uint32_t i = 0; i < n; i++)
+            at[i] = (pf_expected){.warp_q16 = {65536, 0, 0, 65536},
+                                  .at = {before[i].pos.x + (int32_t)(65536 * (60 * cos(angle) + 4 * sin(i))),
+                                         before[i].pos.y + (int32_t)(65536 * (60 * sin(angle) + 4 * cos(i)))}};
+        if (expected)
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_expect(t, at, n));
+        feed(t, frame[1]);
+        const pf_track *now = pf_tracker_tracks(t, &n);
+        for (uint32_t i = 0; i < n && now[i].status != PF_TRACK_NEW; i++) {
+            const double x = before[i].pos.x / 65536.0 + m.d[0], y = before[i].pos.y / 65536.0 + m.d[1];
+            if (x < 13 || y < 13 || x > WIDTH - 15 || y > HEIGHT - 15)
+                continue;
+            possible++;
+            if (now[i].status != PF_TRACK_TRACKED)
+                continue;
+            TEST_ASSERT_TRUE(hypot(now[i].pos.x / 65536.0 - x, now[i].pos.y / 65536.0 - y) < 0.2);
+            found++;
+        }
+        TEST_ASSERT_GREATER_THAN_UINT32(30, possible);
+        TEST_ASSERT_TRUE(expected ? 10 * found >= 9 * possible : 2 * found < possible);
+    }
+}
+
 /* Proves: when the scene shrinks and tracks run together the younger is lost as CROWDED: no two stay within a quarter
  * of a cell. */
 static void test_tracks_that_run_together_are_thinned(void)
@@ -419,6 +458,7 @@ int main(void)
     RUN_TEST(test_occluder_takes_no_track_along);
     RUN_TEST(test_vanished_spot_is_not_mistaken_for_its_twin);
     RUN_TEST(test_forward_backward_distance_is_enforced);
+    RUN_TEST(test_shifts_of_60_px_are_recovered_with_prediction);
     RUN_TEST(test_tracks_that_run_together_are_thinned);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);

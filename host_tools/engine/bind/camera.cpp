@@ -12,6 +12,7 @@
 #include <algorithm>
 #include <array>
 #include <cstring>
+#include <limits>
 #include <memory>
 #include <string>
 #include <type_traits>
@@ -52,14 +53,67 @@ std::pair<Numbers, Mask> run_batch(const pf_profile &profile, const Rows<In> &in
     return {to_numpy<double>(std::move(out), {n, Out}), to_numpy<bool>(std::move(ok), {n})};
 }
 
-// pf_profile's texts end at a zero, so a zero inside would cut them silently.
-void set_text(char (&field)[PF_PROFILE_NAME_MAX], const std::string &text, const char *name)
+nb::ndarray<nb::numpy, double> origins(const pf_profile &profile, const Rows<2> &uv)
 {
-    if (text.size() >= PF_PROFILE_NAME_MAX || text.find('\0') != std::string::npos)
-        throw nb::value_error(
-            (std::string(name) + ": not UTF-8 text of at most 63 bytes without control characters").c_str());
+    size_t n = uv.shape(0);
+    std::unique_ptr<double[]> rays(new double[n * 3]), out(new double[n * 3]);
+    std::unique_ptr<uint8_t[]> ok(new uint8_t[n]);
+    {
+        nb::gil_scoped_release release;
+        pf_camera_unproject_n(&profile.camera, n, uv.data(), rays.get(), out.get(), ok.get());
+    }
+    return to_numpy<double>(std::move(out), {n, 3});
+}
+
+Mask in_image(const pf_profile &profile, const Rows<2> &uv)
+{
+    size_t n = uv.shape(0);
+    std::unique_ptr<bool[]> inside(new bool[n]);
+    for (size_t i = 0; i < n; i++)
+        inside[i] = pf_camera_in_image(&profile.camera, uv.data() + 2 * i);
+    return to_numpy<bool>(std::move(inside), {n});
+}
+
+nb::tuple project_jacobian(const pf_profile &profile, const Rows<3> &xyz)
+{
+    constexpr size_t params = PF_CAMERA_PARAMS;
+    size_t n = xyz.shape(0);
+    std::unique_ptr<double[]> uv(new double[n * 2]), d_xyz(new double[n * 6]), d_param(new double[n * 2 * params]);
+    std::unique_ptr<bool[]> ok(new bool[n]);
+    {
+        nb::gil_scoped_release release;
+        for (size_t i = 0; i < n; i++) {
+            double *out[] = {uv.get() + 2 * i, d_xyz.get() + 6 * i, d_param.get() + 2 * params * i};
+            ok[i] = pf_camera_project(&profile.camera, xyz.data() + 3 * i, out[0], out[1], out[2]) == PF_OK;
+            if (!ok[i]) {
+                const double nan = std::numeric_limits<double>::quiet_NaN();
+                std::fill_n(out[0], 2, nan);
+                std::fill_n(out[1], 6, nan);
+                std::fill_n(out[2], 2 * params, nan);
+            }
+        }
+    }
+    return nb::make_tuple(to_numpy<double>(std::move(uv), {n, 2}), to_numpy<bool>(std::move(ok), {n}),
+                          to_numpy<double>(std::move(d_xyz), {n, 2, 3}),
+                          to_numpy<double>(std::move(d_param), {n, 2, params}));
+}
+
+// pf_profile's texts end at a zero, so a zero inside would cut them silently.
+template <size_t Size> void set_text(char (&field)[Size], const std::string &text, const char *name)
+{
+    if (text.size() >= Size || text.find('\0') != std::string::npos)
+        throw nb::value_error((std::string(name) + ": not UTF-8 text of at most " + std::to_string(Size - 1) +
+                               " bytes without control characters")
+                                  .c_str());
     std::memset(field, 0, sizeof field);
     std::memcpy(field, text.data(), text.size());
+}
+
+template <auto Field> void bind_text(nb::class_<pf_profile> &type, const char *name)
+{
+    type.def_prop_rw(
+        name, [](const pf_profile &p) { return std::string(p.*Field); },
+        [name](pf_profile &p, const std::string &text) { set_text(p.*Field, text, name); });
 }
 
 void set_covariance(pf_profile &profile, const std::vector<uint8_t> &params, const std::vector<double> &lower)
@@ -138,16 +192,20 @@ void bind_camera(nb::module_ &m)
     FIELD(circle_v);
     FIELD(circle_radius);
 #undef FIELD
+    bind_text<&pf_profile::name>(type, "name");
+    bind_text<&pf_profile::serial>(type, "serial");
+    bind_text<&pf_profile::lens>(type, "lens");
+    bind_text<&pf_profile::tool>(type, "tool");
+    bind_text<&pf_profile::tool_version>(type, "tool_version");
+    bind_text<&pf_profile::model_choice>(type, "model_choice");
     type.def_rw("source", &pf_profile::source)
         .def_rw("created_unix_s", &pf_profile::created_unix_s)
         .def_rw("rms_px", &pf_profile::rms_px)
         .def_rw("theta_covered", &pf_profile::theta_covered)
-        .def_prop_rw(
-            "name", [](const pf_profile &p) { return std::string(p.name); },
-            [](pf_profile &p, const std::string &text) { set_text(p.name, text, "name"); })
-        .def_prop_rw(
-            "serial", [](const pf_profile &p) { return std::string(p.serial); },
-            [](pf_profile &p, const std::string &text) { set_text(p.serial, text, "serial"); })
+        .def_rw("held_out_rms_px", &pf_profile::held_out_rms_px)
+        .def_rw("views", &pf_profile::views)
+        .def_rw("points", &pf_profile::points)
+        .def_rw("held_out_views", &pf_profile::held_out_views)
         .def_prop_ro(
             "free_param",
             [](const pf_profile &p) { return std::vector<uint8_t>(p.free_param, p.free_param + p.free_count); })
@@ -172,5 +230,12 @@ void bind_camera(nb::module_ &m)
                                        [](const pf_camera *camera, size_t n, const double *in, double *out,
                                           uint8_t *ok) { pf_camera_unproject_n(camera, n, in, out, nullptr, ok); });
             },
-            nb::arg("uv").noconvert(), "(N,2) float64 -> (N,3) float64, (N,) bool; the profile must be valid.");
+            nb::arg("uv").noconvert(), "(N,2) float64 -> (N,3) float64, (N,) bool; the profile must be valid.")
+        .def("origins", &origins, nb::arg("uv").noconvert(),
+             "(N,2) float64 -> (N,3) float64 metres, NaN where there is no ray; the profile must be valid.")
+        .def("in_image", &in_image, nb::arg("uv").noconvert(), "(N,2) float64 -> (N,) bool: on the sensor and lit.")
+        .def("project_jacobian", &project_jacobian, nb::arg("xyz").noconvert(),
+             "(N,3) float64 -> (N,2) float64, (N,) bool, (N,2,3) by the point, (N,2,41) by the parameters; NaN where "
+             "not "
+             "valid. The profile need not be one-to-one.");
 }

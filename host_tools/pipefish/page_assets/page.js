@@ -11,8 +11,10 @@
     text.textContent = item.text;
     slider.setAttribute("aria-valuetext", item.text);
   };
-  slider.addEventListener("input", turn);
-  turn();
+  if (slider) {
+    slider.addEventListener("input", turn);
+    turn();
+  }
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const merge = (base, more) => {
@@ -33,7 +35,8 @@
     const layout = {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: getComputedStyle(document.body).fontFamily, color: colour("--muted") },
-      colorway: dark.matches ? ["#4cc3cd", "#f0a35e", "#b79cf0"] : ["#0f7f89", "#c8641b", "#6d4bc4"],
+      colorway: dark.matches ? ["#4cc3cd", "#f0a35e", "#b79cf0", "#8fc866", "#e8799a", "#d6c24e", "#7aa6f2"]
+        : ["#0f7f89", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63", "#8f7a00", "#2f62c0"],
       margin: { l: 54, r: 12, t: 8, b: 44 }, bargap: 0.06, dragmode: false,
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 12 } },
       hoverlabel: { font: { size: 13 } },

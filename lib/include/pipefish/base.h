@@ -40,7 +40,16 @@ typedef enum pf_status {
     PF_ERR_AGAIN = -10,      /* nothing to do now; try again later */
     PF_ERR_END = -11,        /* the stream is complete */
     PF_ERR_CLOSED = -12,     /* the peer or the device has gone */
+    PF_ERR_SELF_TEST = -13,  /* intact, but this device computes something else than the data say */
 } pf_status;
+
+typedef struct pf_point_q16 {
+    int32_t x, y; /* Q16.16 pixels */
+} pf_point_q16;
+
+typedef struct pf_ray_q30 {
+    int32_t x, y, z; /* Q1.30, a unit vector in the camera frame; (0, 0, 0) where there is none */
+} pf_ray_q30;
 
 /* One line of English for a status, never NULL. */
 const char *pf_status_text(pf_status status);

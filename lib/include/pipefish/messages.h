@@ -33,6 +33,13 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     bool emergency_stop;
 } pf_msg_telemetry;
 
+typedef struct pf_msg_tracking {
+    uint32_t scene; /* pf_scene_flag */
+    uint64_t frames, tracked, detected;
+    uint64_t lost_by[PF_TRACK_REASONS];
+    uint32_t age_median, quality_median, static_blocks;
+} pf_msg_tracking;
+
 typedef struct pf_msg_keyframe {
     uint8_t survey_id[16];
     uint32_t index;
@@ -49,6 +56,7 @@ typedef struct pf_msg_keyframe {
     const pf_track *tracks; /* n_tracks, ids ascending; lost ones are left out */
     uint32_t n_tracks;
     uint32_t common_tracks;
+    pf_msg_tracking tracking;
 } pf_msg_keyframe;
 
 /* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break reason at most 256 bytes: 10
@@ -84,6 +92,14 @@ typedef struct pf_msg_clock_sync {
     uint64_t error_ns;
 } pf_msg_clock_sync;
 
+typedef struct pf_msg_profile {
+    const char *name, *serial;
+    uint8_t sha256[32];
+    uint32_t crc32c;
+    bool is_trial;
+    uint32_t starts_left;
+} pf_msg_profile;
+
 typedef struct pf_msg_status {
     pf_msg_time time;
     uint8_t survey_id[16];
@@ -100,6 +116,9 @@ typedef struct pf_msg_status {
     uint64_t uptime_ns;
     bool has_clock;
     pf_msg_clock_sync clock;
+    bool has_profile;
+    pf_msg_profile profile; /* in use */
+    pf_msg_tracking tracking;
 } pf_msg_status;
 
 typedef struct pf_msg_survey_end {
@@ -129,11 +148,19 @@ typedef struct pf_msg_info {
     uint8_t profile_sha256[32]; /* of the binary profile; zeros = there is none */
 } pf_msg_info;
 
+typedef struct pf_msg_profile_state {
+    bool has_in_use, has_stored;
+    pf_msg_profile in_use, stored;
+    const char *problem; /* "" = none */
+    uint32_t slot_erases[2];
+} pf_msg_profile_state;
+
 typedef struct pf_msg_reply {
     uint32_t id;
     const char *error;           /* "" = done */
-    const pf_msg_status *status; /* at most one of status and info; both NULL = neither was asked for */
+    const pf_msg_status *status; /* at most one of status, info and profile; all NULL = none was asked for */
     const pf_msg_info *info;
+    const pf_msg_profile_state *profile;
 } pf_msg_reply;
 
 typedef enum pf_request_what {
@@ -144,13 +171,17 @@ typedef enum pf_request_what {
     PF_REQUEST_SET_LAMP = 5,
     PF_REQUEST_CLOCK_SYNC = 6,
     PF_REQUEST_SHUTDOWN = 7,
+    PF_REQUEST_GET_PROFILE = 8,
+    PF_REQUEST_CONFIRM_PROFILE = 9,
+    PF_REQUEST_REVERT_PROFILE = 10,
 } pf_request_what;
 
 typedef struct pf_msg_request {
     uint32_t id;
     pf_request_what what;
-    float lamp;              /* PF_REQUEST_SET_LAMP; as sent: may be any float */
-    pf_msg_clock_sync clock; /* PF_REQUEST_CLOCK_SYNC */
+    float lamp;                 /* PF_REQUEST_SET_LAMP; as sent: may be any float */
+    pf_msg_clock_sync clock;    /* PF_REQUEST_CLOCK_SYNC */
+    uint8_t profile_sha256[32]; /* PF_REQUEST_CONFIRM_PROFILE */
 } pf_msg_request;
 
 /* Marks the keyframe message out[0 .. *n) as the first after a break, for this reason; *n grows. PF_ERR_SPACE. */

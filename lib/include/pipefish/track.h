@@ -1,12 +1,11 @@
 /* The feature tracker: corners spread over the image, pyramidal KLT with forward-backward check, a table of tracks with
- * stable ids, bearings, keyframe choice. The tracker itself is integers only: the same bits on all targets. Bearings
- * are doubles rounded to Q1.30, so a keyframe chosen by parallax may differ where libm does; one chosen by encoder does
- * not.
+ * stable ids, bearings, prediction, masks, states of the scene, keyframe choice. Integers only: the same bits on all
+ * targets.
  */
 #ifndef PIPEFISH_TRACK_H
 #define PIPEFISH_TRACK_H
 
-#include "pipefish/camera.h"
+#include "pipefish/camera_fixed.h"
 #include "pipefish/image.h"
 
 #ifdef __cplusplus
@@ -15,8 +14,8 @@ extern "C" {
 
 #define PF_TRACKS_MAX 2048u
 
-/* Added to both variances of a position: (1/64 px)^2, for what interpolation and rounding leave. */
-#define PF_TRACK_COV_FLOOR_Q20 256
+/* Added to both variances of a position: (1/256 px)^2, for what interpolation and rounding leave. */
+#define PF_TRACK_COV_FLOOR_Q20 16
 
 typedef enum pf_track_status {
     PF_TRACK_NEW = 1,     /* detected in this frame */
@@ -34,11 +33,12 @@ typedef enum pf_track_reason {
     PF_TRACK_CROWDED = 6,  /* ran into an older track */
     PF_TRACK_DRIFT = 7,    /* no longer looks like its template (first sight, renewed as its shape changes), or lies
                             * elsewhere than the template says */
+    PF_TRACK_MASKED = 8,   /* ran into a masked part of the picture */
+    PF_TRACK_STATIC = 9,   /* stands still, or nearly, while all around it moves: a reflection of the lamp, dirt on the
+                            * lens, the camera's own shadow */
+    PF_TRACK_SATURATED = 10, /* over a quarter of its window is saturated */
+    PF_TRACK_REASONS = 11,
 } pf_track_reason;
-
-typedef struct pf_point_q16 {
-    int32_t x, y; /* Q16.16 pixels */
-} pf_point_q16;
 
 typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
@@ -63,20 +63,46 @@ typedef struct pf_tracker_config {
     uint32_t window;            /* KLT window side in pixels, odd, 7..31 [21] */
     uint32_t iterations;        /* most iterations a level, 1..30 [10] */
     uint32_t cell;              /* detection: side of a grid cell in pixels, 16..256 [chosen from max_tracks] */
-    uint32_t min_eigen;         /* detection: least smaller eigenvalue of the mean structure tensor (11 x 11), grey^2,
-                                 * up to 16384 [8; noise of sigma 2 alone gives 2] */
+    uint32_t min_eigen;         /* detection: least smaller eigenvalue of the mean structure tensor (3 x 3 at half
+                                 * resolution), grey^2, up to 16384 [8; noise of sigma 2 alone gives up to 1] */
     uint32_t fb_q16;            /* most forward-backward distance, Q16.16 px, up to 16 [0.5] */
     uint32_t min_zncc_q15;      /* least similarity to the previous patch, Q0.15, up to 32767 [0.8]; to the template
                                  * it is 0.1 less */
     uint32_t noise_q8;          /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
     pf_point_q16 circle;        /* centre of the image circle, Q16.16 px, each within +-16384 */
     uint32_t circle_radius_q16; /* its radius, up to 16384; 0 = the whole image is used */
+    const pf_image *mask;       /* of the frame's size, 0 = nothing may be tracked here, in blocks of 8 x 8: one such
+                                 * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
+    bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
+    bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
+                 * in each, none in its inner eighth (no parallax there); needs a circle */
 } pf_tracker_config;
+
+/* What the last frame tells of the scene, of the pixels inside the circle and the mask. */
+typedef struct pf_scene_measures {
+    uint32_t pixels;            /* looked at: every second row of a small level of the pyramid */
+    uint32_t mean_q8;           /* grey */
+    uint32_t low, median, high; /* grey: 5th, 50th, 95th percentile */
+    uint32_t saturated_q15;     /* share of pixels at 250 and above */
+    uint32_t texture_q8;        /* mean difference of the two neighbours in a row, grey */
+    uint32_t tracked;           /* tracks found again */
+    uint32_t enough;            /* so many are enough: 60, less where max_tracks is below 240 */
+    uint32_t sextants;          /* sixths of the picture around the circle's centre with such a track */
+    uint32_t motion_q16;        /* their median displacement, px; 0 with fewer than 8 of them */
+    uint32_t drift_q16;         /* median displacement over the last whole window of PF_SCENE_WINDOW frames; UINT32_MAX
+                                 * = not known: fewer than 8 tracks lived through it */
+    uint32_t outward, inward, moved; /* tracks that moved along the radius, and at all */
+    uint32_t static_blocks;          /* blocks of 8 x 8 px found to stand still */
+} pf_scene_measures;
+
+#define PF_SCENE_WINDOW 8u
 
 typedef struct pf_tracker_stats { /* of the last frame */
     uint32_t live;                /* tracks now alive, new ones included */
     uint32_t tracked, lost, detected;
-    uint32_t lost_by[8]; /* by pf_track_reason */
+    uint32_t lost_by[PF_TRACK_REASONS];  /* by pf_track_reason */
+    uint32_t age_median, quality_median; /* of the tracks found again; 0 when there are none */
+    pf_scene_measures scene;
 } pf_tracker_stats;
 
 /* Opaque; lives in the caller's workspace. */
@@ -104,6 +130,20 @@ typedef enum pf_tracker_stage {
  * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
 pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
 
+/* What is expected of a track in the next frame. */
+typedef struct pf_expected {
+    pf_point_q16 at;     /* x = PF_NO_GUESS: nothing */
+    int32_t warp_q16[4]; /* how its surroundings are distorted from this frame to the next, row-major; identity = not */
+} pf_expected;
+#define PF_NO_GUESS INT32_MIN
+
+/* Says what is expected of the tracks of the table: expected[n] in the order of pf_tracker_tracks. A hint: each track
+ * starts from whichever of this, its own last move and its old place looks most like it at a coarse level, and is tried
+ * from another if that fails. With a warp, a track that does not look like the last frame's patch any more may still be
+ * found by its template, warped so: at high speed in a narrow pipe a patch grows by a sixth from frame to frame.
+ * PF_ERR_ARGUMENT: n is not the table's. */
+pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, uint32_t n);
+
 /* The table after the last frame: live tracks (max_tracks at most) and those lost in it (as many again at most), by
  * ascending id. Valid until the next call. */
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
@@ -112,12 +152,81 @@ const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 /* Forgets all tracks (a break in the video). Ids go on; none is reused. */
 void pf_tracker_reset(pf_tracker *tracker);
 
-/* Bearings: unit rays of track positions in Q1.30, camera frame. Items outside the camera's domain get (0, 0, 0).
- * Rounded from double (camera/real); the table version of camera/fixed replaces it on targets without libm. */
-typedef struct pf_ray_q30 {
-    int32_t x, y, z;
-} pf_ray_q30;
-void pf_track_bearings(const pf_camera *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+/* Bearings: unit rays of track positions, from the table of rays. Items outside the image or the camera's domain get
+ * (0, 0, 0). Integers only. */
+void pf_track_bearings(const pf_camera_rays *camera, const pf_track *tracks, uint32_t n, pf_ray_q30 *rays);
+
+/* Projects a ray by the camera in integers, a pf_camera_fixed; false beyond its domain. A pf_ray_project. */
+bool pf_track_project(const void *fixed, const pf_ray_q30 *ray, pf_point_q16 *at);
+
+/* --- Prediction ---------------------------------------------------------------------------------------------------
+ * Where the tracks will be in the next frame, from the last motion, the encoder and the roll: rotation, then a drive
+ * along a tube, each track with its own distance from the camera's path. For pf_tracker_expect. */
+typedef struct pf_motion_hints { /* with a frame; a reading counts only if its has_ flag is set */
+    bool has_encoder, has_roll;
+    int64_t encoder;
+    int32_t roll_urad; /* about the optical axis, 0 = image y axis down; rises as the picture turns from y to x */
+} pf_motion_hints;
+
+/* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
+typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
+
+#define PF_FALL_UNKNOWN INT32_MIN
+
+typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker_reset */
+    uint32_t n;
+    uint64_t id[PF_TRACKS_MAX];
+    pf_ray_q30 ray[PF_TRACKS_MAX];
+    pf_motion_hints last;
+    bool is_known, has_per_count;
+    int32_t turn[9];                  /* rotation of the last frame, Q30 */
+    int32_t forward;                  /* median fall of the cotangents in the last frame, Q16 */
+    int64_t per_count_q30;            /* the same for each encoder count */
+    int32_t fall[2u * PF_TRACKS_MAX]; /* of each row of the table */
+    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX], driven[PF_TRACKS_MAX]; /* scratch */
+    uint16_t pair[PF_TRACKS_MAX];
+    uint32_t value[PF_TRACKS_MAX];
+} pf_predictor;
+
+/* Before the first frame: one encoder count moves the camera on by so much of the pipe's radius, Q5.27. */
+void pf_predictor_assume(pf_predictor *predictor, int32_t radii_per_count_q27);
+
+/* Learns from a frame just tracked: tracks[n], rays[n] are its table and bearings. */
+void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                        const pf_motion_hints *now);
+
+/* Fills expected[n] for pf_tracker_expect, for the same table; `next` comes with the frame that follows. */
+void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                        const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected);
+
+/* --- States of the scene --------------------------------------------------------------------------------------------
+ * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */
+typedef enum pf_scene_flag {
+    PF_SCENE_STANDING = 1,      /* median motion below 0.5 px over PF_SCENE_WINDOW frames */
+    PF_SCENE_REVERSING = 2,     /* what is seen moves towards the centre: the camera, looking ahead, goes back */
+    PF_SCENE_DARK = 4,          /* nothing is lit, and no lamp is known to be on */
+    PF_SCENE_COVERED = 8,       /* nothing to see though there is light: no contrast; or dark with the lamp on */
+    PF_SCENE_OVEREXPOSED = 16,  /* over a quarter of the picture is saturated */
+    PF_SCENE_WEAK_TEXTURE = 32, /* too few tracks, or in fewer than 4 of 6 sextants, and none of the three above */
+} pf_scene_flag;
+#define PF_SCENE_FLAGS 6u
+
+typedef struct pf_scene_hints { /* what else is known of the frame */
+    bool has_lamp, lamp_on;
+    bool has_encoder;
+    int64_t encoder; /* forward is positive */
+} pf_scene_hints;
+
+typedef struct pf_scene { /* private; zero-initialise */
+    uint32_t flags;
+    uint8_t count[PF_SCENE_FLAGS]; /* frames that have spoken for a change */
+    bool have_encoder;
+    int64_t encoder;
+    uint32_t still; /* frames in which the encoder has not moved */
+} pf_scene;
+
+/* Takes one frame's measures; returns the flags now in force. */
+uint32_t pf_scene_update(pf_scene *scene, const pf_scene_measures *measures, const pf_scene_hints *hints);
 
 /* --- Keyframe choice (RECONSTRUCTION section 6) --------------------------------------------------------------------
  * A frame becomes a keyframe when the encoder has moved `step_counts` since the last one; without an encoder, when the
@@ -135,7 +244,8 @@ typedef struct pf_keyframe_config { /* zero = default in brackets */
     uint32_t step_counts;           /* encoder counts between keyframes; 0 = do not use the encoder */
     uint32_t parallax_urad;         /* micro-radians [174533 = 10 degrees] */
     uint32_t min_common;   /* forced below so many common tracks [100], or below half of what the last keyframe had
-                            * where that is less: weak texture alone must not force one at every frame */
+                            * where that is less: weak texture alone must not force one at every frame. Forced as well
+                            * when there are over twice as many tracks as the last keyframe had, and 16 */
     uint32_t min_interval; /* frames, at least so many between keyframes [2] */
 } pf_keyframe_config;
 
@@ -146,7 +256,8 @@ typedef struct pf_keyframe_state { /* private; zero-initialise */
     int64_t encoder;
     uint64_t id[PF_TRACKS_MAX];
     pf_ray_q30 ray[PF_TRACKS_MAX];
-    uint32_t chord[PF_TRACKS_MAX]; /* scratch: squared chords for the median */
+    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX]; /* scratch: common bearings */
+    uint32_t chord[PF_TRACKS_MAX];                     /* scratch: squared chords for the median */
 } pf_keyframe_state;
 
 /* Decides for the current frame and, when it becomes a keyframe, makes it the new reference.

@@ -1,0 +1,37 @@
+"""The states of the scene and the fates of tracks that a device reports (pipefish.v1.Tracking), in words."""
+
+from __future__ import annotations
+
+from pipefish import pipefish_pb2 as pb
+
+# Fields of pipefish.v1.Tracking and how people call them.
+STATES = [
+    ("standing", "standing still"),
+    ("reversing", "reversing"),
+    ("dark", "dark"),
+    ("covered", "lens covered"),
+    ("over_exposed", "over-exposed"),
+    ("weak_texture", "weak texture"),
+]
+REASONS = [
+    ("lost_left", "left the picture"),
+    ("lost_flat", "no texture"),
+    ("lost_diverged", "did not settle"),
+    ("lost_residual", "looks different"),
+    ("lost_backward", "not found backwards"),
+    ("lost_crowded", "ran into another"),
+    ("lost_drift", "drifted from its template"),
+    ("lost_masked", "masked"),
+    ("lost_static", "stands still in the picture"),
+    ("lost_saturated", "saturated"),
+]
+
+
+def states_of(tracking: pb.Tracking) -> list[str]:
+    """The states in force, in words."""
+    return [words for name, words in STATES if getattr(tracking, name)]
+
+
+def losses_of(tracking: pb.Tracking) -> dict[str, int]:
+    """Lost tracks by reason in words; reasons that did not occur are left out."""
+    return {words: getattr(tracking, name) for name, words in REASONS if getattr(tracking, name)}

@@ -1,0 +1,117 @@
+"""What became of the tracks along a survey: the device's own counters and states, keyframe by keyframe, as charts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipefish.scene import REASONS, STATES
+from pipefish.survey import Survey
+
+
+def statistics(survey: Survey) -> dict[str, np.ndarray]:
+    """Per keyframe (N,): live tracks; mean a frame since the keyframe before of tracked, detected and each lost_*
+    (NaN where the device counts nothing); age_median in camera frames, quality_median 0..1 (NaN without tracks); each
+    state as bool."""
+    parts = [k.message.tracking for k in survey.keyframes]
+    frames = np.array([p.frames or np.nan for p in parts], dtype=float)
+    found = np.array([p.tracked > 0 for p in parts], dtype=bool)
+    result: dict[str, np.ndarray] = {"live": np.array([len(k.observations.id) for k in survey.keyframes])}
+    for name in ("tracked", "detected", *(name for name, _ in REASONS)):
+        result[name] = np.array([getattr(p, name) for p in parts], dtype=float) / frames
+    result["age_median"] = np.where(found, np.array([p.age_median for p in parts], dtype=float), np.nan)
+    result["quality_median"] = np.where(found, np.array([p.quality_median for p in parts]) / 32768.0, np.nan)
+    for name, _ in STATES:
+        result[name] = np.array([getattr(p, name) for p in parts], dtype=bool)
+    return result
+
+
+def _numbers(values: np.ndarray, digits: int = 3) -> list[float | None]:
+    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
+
+
+def charts(survey: Survey, along: np.ndarray, title: str) -> list[dict[str, Any]]:
+    """Charts over `along` (N,), whose axis is called `title`; [] if the device counted nothing. See pipefish.page."""
+    stats = statistics(survey)
+    if not np.isfinite(stats["tracked"]).any():
+        return []
+    x = _numbers(along, 4)
+    xaxis = {"title": {"text": title}}
+
+    def line(name: str, y: np.ndarray, **more: Any) -> dict[str, Any]:
+        return {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": _numbers(y), **more}
+
+    lost = [(name, words) for name, words in REASONS if np.nansum(stats[name]) > 0]
+    result = [
+        {
+            "id": "stats-live",
+            "title": "Tracks held and taken up",
+            "text": "Tracks in each keyframe; found again and newly detected in a camera frame, in the mean since the "
+            "keyframe before.",
+            "data": [
+                line("in the keyframe", stats["live"]),
+                line("found again a frame", stats["tracked"]),
+                line("new a frame", stats["detected"]),
+            ],
+            "layout": {"xaxis": xaxis, "yaxis": {"title": {"text": "tracks"}, "rangemode": "tozero"}},
+        },
+        {
+            "id": "stats-lost",
+            "title": "Why tracks end",
+            "text": "Tracks lost in a camera frame, by reason, in the mean since the keyframe before.",
+            "data": [
+                line(words, stats[name], stackgroup="lost", hovertemplate="%{y:.2f}", line={"width": 0.5})
+                for name, words in lost
+            ],
+            "layout": {
+                "xaxis": xaxis,
+                "yaxis": {"title": {"text": "lost a frame"}, "rangemode": "tozero"},
+                "hovermode": "x unified",
+                "legend": {"font": {"size": 11}},
+            },
+        },
+        {
+            "id": "stats-age",
+            "title": "Age and quality",
+            "text": "Medians over the tracks found again in the keyframe's own frame; quality is the similarity with "
+            "the frame before.",
+            "data": [
+                line("age, camera frames", stats["age_median"]),
+                line("quality", stats["quality_median"], yaxis="y2"),
+            ],
+            "layout": {
+                "xaxis": xaxis,
+                "yaxis": {"title": {"text": "camera frames"}, "rangemode": "tozero"},
+                "yaxis2": {
+                    "title": {"text": "quality"},
+                    "overlaying": "y",
+                    "side": "right",
+                    "showgrid": False,
+                    "tickformat": ".3f",
+                },
+            },
+        },
+    ]
+    seen = [(name, words) for name, words in STATES if stats[name].any()]
+    if seen:
+        result.append(
+            {
+                "id": "stats-states",
+                "title": "States of the scene",
+                "text": "Keyframes at which the device reported a state.",
+                "data": [
+                    {
+                        "type": "scatter",
+                        "mode": "markers",
+                        "name": words,
+                        "x": [v for v, on in zip(x, stats[name], strict=True) if on],
+                        "y": [words] * int(stats[name].sum()),
+                        "marker": {"symbol": "square", "size": 9},
+                    }
+                    for name, words in seen
+                ],
+                "layout": {"xaxis": xaxis, "yaxis": {"automargin": True}, "showlegend": False},
+            }
+        )
+    return result

@@ -1,0 +1,110 @@
+/* The tracker's own state, for the files that share it: tracker.c (memory, the frame), follow.c (live tracks), detect.c
+ * (new ones), mask.c (where nothing may be), measure.c (what the picture tells of the scene). */
+#ifndef PIPEFISH_TRACKER_PRIVATE_H
+#define PIPEFISH_TRACKER_PRIVATE_H
+
+#include "track_private.h"
+
+#define BLOCK      8u  /* px: side of a block of the masks */
+#define SECTORS    12u /* detection in polar cells: sectors of 30 degrees */
+#define RINGS      6u
+#define CANDIDATES 4u /* for corners, times the tracks there may be: most stand too near a stronger one */
+#define SATURATED  4u /* at most this fraction of a window may be saturated */
+
+typedef struct pf_slot {  /* the hidden part of a live track */
+    pf_point_q16 move;    /* its last displacement */
+    bool sure;            /* which its start met within CERTAIN */
+    pf_point_q16 own;     /* its moves summed with forgetting; */
+    int32_t radial, flow; /* what of them is radial, and the same of its ring: see follow.c */
+    pf_expected expected; /* by the caller, of the next frame */
+    pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
+    pf_anchor anchor;
+} pf_slot;
+
+typedef struct pf_block {           /* 8 x 8 px; of the masks */
+    uint16_t mean_q6, deviation_q6; /* of one pixel over time, while the rest moves */
+    uint8_t is_masked;              /* by the user */
+    uint8_t is_outside;             /* no window fits there */
+    uint8_t sentence;               /* lessons for which it stays static */
+    uint8_t is_closed;              /* to new tracks */
+    uint8_t is_static;              /* by what was seen */
+} pf_block;
+
+struct pf_tracker {
+    pf_tracker_config config; /* defaults filled in; .mask NULL */
+    pf_tracker_stats stats;
+    pf_pyramid pyramid[2];
+    uint32_t now; /* index of the current frame's pyramid */
+    bool started;
+    uint64_t last_id;
+    pf_track *table;
+    uint16_t *slot_of; /* of each live row of the table */
+    uint32_t *ring_of; /* scratch: ring and radial move of each row */
+    int32_t *radial;
+    uint32_t n;
+    pf_slot *slots;
+    uint8_t *pixels; /* templates, patch_bytes each */
+    uint32_t patch_bytes;
+    uint16_t *spare; /* free slots */
+    uint32_t spare_n;
+    int32_t *head; /* grid: first table row of each cell, -1 = none */
+    int32_t *next; /* grid: next table row in the same cell, by table row */
+    uint32_t grid_w, grid_h;
+    pf_corner *found; /* heap of candidates, weakest on top */
+    uint32_t found_n;
+    uint32_t *value; /* scratch for medians, a number a track */
+    pf_block *block;
+    uint32_t block_w, block_h, static_blocks;
+    bool is_mask_stale;            /* blocks have become static, or ceased to be, since is_closed was worked out */
+    uint32_t slice;                /* every SLICES-th row of blocks learns at a time: which ones next */
+    uint32_t travel_q16;           /* median motion since the last lesson */
+    uint32_t frame;                /* of the current window of PF_SCENE_WINDOW */
+    uint32_t drift_q16;            /* of the last one */
+    uint32_t bin[SECTORS * RINGS]; /* live tracks of each polar cell */
+    pf_klt klt;
+    pf_corner_scratch corners;
+};
+
+/* --- the grid (tracker.c) */
+
+void pf_grid_insert(pf_tracker *t, uint32_t row);
+
+/* Whether a track in the grid lies within `reach` (Q16.16 px, at most a cell) of `at`. */
+bool pf_grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach);
+
+/* --- live tracks (follow.c) */
+
+/* Finds every live track in the new frame, or loses it. */
+void pf_tracks_follow(pf_tracker *t);
+
+/* The centre of the flow: the circle's, or the picture's. */
+pf_point_q16 pf_flow_centre(const pf_tracker *t);
+
+/* --- new tracks (detect.c) */
+
+void pf_tracks_detect(pf_tracker *t);
+
+/* --- masks (mask.c) */
+
+/* Takes the user's mask; NULL = none. Forgets what was learned. */
+void pf_mask_init(pf_tracker *t, const pf_image *mask);
+
+/* Whether a live track may be at `at`; whether a new one may be at pixel (x, y): clear of static blocks by one more. */
+bool pf_mask_allows(const pf_tracker *t, pf_point_q16 at);
+bool pf_mask_allows_new(const pf_tracker *t, int32_t x, int32_t y);
+
+/* After tracking: looks which blocks stand still in the picture while it moves. */
+void pf_mask_learn(pf_tracker *t);
+
+/* What is at `at` has been seen to stand still. */
+void pf_mask_condemn(pf_tracker *t, pf_point_q16 at);
+
+/* Whether more than `most` of the window's pixels are saturated. */
+bool pf_mask_saturated(const pf_tracker *t, const pf_image *image, pf_point_q16 at, uint32_t most);
+
+/* --- the scene (measure.c) */
+
+/* Fills the medians of stats and stats.scene. */
+void pf_scene_measure(pf_tracker *t);
+
+#endif

@@ -1,0 +1,287 @@
+"""Profiles on a device: pipefishd's own store, `pipefish flash`, and what power cuts and bad profiles do to it."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import random
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import pipefish as pf
+from pipefish import cli
+from pipefish import pipefish_pb2 as pb
+from pipefish.errors import PipefishError
+from pipefish.flash import Flasher
+from pipefish.transport import TcpTransport
+from spec_reader import crc32c
+from test_daemon import HEIGHT, SEED, WIDTH, Crawler, Store, run, serve, wait_for_log, write_recording
+
+
+def camera(name: str, **changes: object) -> pf.Camera:
+    cam = pf.Camera(width=WIDTH, height=HEIGHT, f_u=60, f_v=60, c_u=96, c_v=80, theta_max=1.5, name=name, serial="S1")
+    return dataclasses.replace(cam, **changes)
+
+
+OLD, NEW = camera("old"), camera("new", f_u=61)
+
+
+@pytest.fixture
+def crawler(tmp_path: Path) -> Iterator[Crawler]:
+    """A daemon with a profile store that does not exist yet, and a short survey behind it."""
+    write_recording(tmp_path / "survey.y4m", 4)
+    crawler = Crawler(
+        tmp_path, camera__profile_store=tmp_path / "profiles.store", daemon__exit_when_done="false", daemon__drain_s=0
+    )
+    crawler.store = tmp_path / "profiles.store"
+    yield crawler
+    if crawler.process is not None:
+        crawler.kill()
+
+
+def device(crawler: Crawler) -> Flasher:
+    wait_for_log(crawler, "; survey ")
+    return Flasher(TcpTransport("127.0.0.1", crawler.port), 10)
+
+
+def restart(crawler: Crawler) -> pb.ProfileState:
+    """kill -9 and a new start; what the device then uses and has stored."""
+    if crawler.process is not None:
+        crawler.kill()
+    crawler.log.unlink(missing_ok=True)
+    crawler.status_file.unlink(missing_ok=True)
+    crawler.start()
+    with device(crawler) as flasher:
+        return flasher.state()
+
+
+def flash(crawler: Crawler, capsys, *arguments: object) -> dict:
+    """`pipefish flash ... --json`."""
+    code = cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", *map(str, arguments), "--json"])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    return json.loads(out)
+
+
+def name_of(profile: pb.Profile | dict | None) -> str | None:
+    name = profile.get("name") if isinstance(profile, dict) else profile and profile.name
+    return name or None
+
+
+def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawler: Crawler, capsys):
+    assert name_of(restart(crawler).in_use) is None
+    OLD.save(tmp_path / "old.json")
+    document = flash(crawler, capsys, tmp_path / "old.json")
+    assert document["in_use"] is None and document["stored"]["name"] == "old" and not document["stored"]["trial"]
+    assert document["stored"]["sha256"] == hashlib.sha256(OLD.to_binary()).hexdigest()
+    assert sum(document["slot_erases"]) == 1
+    state = restart(crawler)
+    assert (state.in_use.name, state.in_use.serial, state.in_use.trial) == ("old", "S1", False)
+    assert state.in_use.crc32c == int.from_bytes(OLD.to_binary()[-4:], "little")
+    store = Store(crawler.port)
+    with store.client() as client:
+        serve(crawler, client, lambda: any(s.profile for s in store.starts) and store.statuses)
+        status = client.answer_to(10, get_status=pb.Nothing()).status
+    assert OLD.to_binary() in [s.profile for s in store.starts]
+    assert status.profile == state.in_use == store.statuses[-1].profile
+    end = time.monotonic() + 10
+    while not crawler.status():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert crawler.status()["profile"]["sha256"] == status.profile.sha256.hex()
+    assert cli.main(["status", f"tcp://127.0.0.1:{crawler.port}"]) == 0
+    assert "old, serial S1" in capsys.readouterr().out
+
+
+def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawler: Crawler, capsys):
+    restart(crawler)
+    (tmp_path / "old.bin").write_bytes(OLD.to_binary())
+    NEW.save(tmp_path / "new.json")
+    flash(crawler, capsys, tmp_path / "old.bin")
+    document = flash(crawler, capsys, tmp_path / "new.json", "--no-confirm")
+    assert document["stored"]["trial"] and document["stored"]["starts_left"] == 1
+    state = restart(crawler)  # one start on trial: camera.trial_starts
+    assert state.in_use.name == "new" and state.in_use.trial and state.in_use.starts_left == 0
+    assert restart(crawler).in_use.name == "old"
+
+    flash(crawler, capsys, tmp_path / "new.json", "--no-confirm")
+    restart(crawler)
+    document = flash(crawler, capsys, "--confirm")
+    assert document["stored"]["name"] == document["in_use"]["name"] == "new" and not document["in_use"]["trial"]
+    for _ in range(2):
+        assert restart(crawler).in_use.name == "new"
+    assert flash(crawler, capsys, "--revert")["stored"]["name"] == "old"
+    assert restart(crawler).in_use.name == "old"
+
+
+def test_without_starts_on_trial_the_next_start_reverts(tmp_path: Path, crawler: Crawler):
+    with crawler.config.open("a") as config:
+        config.write("[camera]\ntrial_starts = 0\n")
+    restart(crawler)
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+        assert flasher.send(NEW.to_binary()).stored.trial
+        assert flasher.revert().stored.name == "old"
+        assert flasher.send(NEW.to_binary()).stored.trial
+    assert restart(crawler).in_use.name == "old"
+
+
+def test_the_device_refuses_what_is_no_profile_for_it_and_says_why(crawler: Crawler):
+    restart(crawler)
+    changed = bytearray(NEW.to_binary())
+    changed[-4 - 64 + 24] ^= 0xFF  # the last vector's pixel; then an intact checksum
+    changed[-4 - 64 + 26] ^= 0xFF
+    changed[-4 - 64 + 29] ^= 0x01
+    changed[-4:] = crc32c(bytes(changed[:-4])).to_bytes(4, "little")
+    damaged = bytearray(NEW.to_binary())
+    damaged[300] ^= 1
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+        for data, why in (
+            (bytes(changed), "self_test: this device does not"),
+            (bytes(damaged), "checksum: the profile is damaged"),
+            (camera("big", width=640).to_binary(), f"is for 640 x {HEIGHT}, the camera gives {WIDTH} x {HEIGHT}"),
+            (b"JSON", "magic: this is not a profile"),
+        ):
+            with pytest.raises(PipefishError, match="the device refuses the profile: .*" + why):
+                flasher.send(data)
+        with pytest.raises(PipefishError, match="another profile is stored"):
+            flasher.confirm(hashlib.sha256(NEW.to_binary()).digest())
+        with pytest.raises(PipefishError, match="no profile to go back to"):
+            flasher.revert()
+        assert flasher.state().stored.name == "old"
+    assert restart(crawler).in_use.name == "old"
+
+
+def test_a_device_without_a_store_says_so(tmp_path: Path, crawler: Crawler, capsys):
+    crawler.start("--set", "camera.profile_store=")
+    wait_for_log(crawler, "; survey ")
+    NEW.save(tmp_path / "new.json")
+    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", str(tmp_path / "new.json")]) == 1
+    assert "camera.profile_store is not set" in capsys.readouterr().err
+    done = run("--config", crawler.config, "--check-config", "--set", "camera.profile=x")
+    assert done.returncode == 1 and "camera.profile_store: not together with camera.profile" in done.stderr
+
+
+def test_flash_arguments_that_do_not_go_together_are_wrong_usage(capsys):
+    for arguments in ([], ["--no-confirm"], ["a.json", "--revert"], ["--confirm", "--revert"]):
+        assert cli.main(["flash", "tcp://127.0.0.1:1", *arguments]) == 2
+        assert "flash: " in capsys.readouterr().err
+
+
+def flip(path: Path, at: int) -> None:
+    with path.open("r+b") as file:
+        file.seek(at)
+        byte = file.read(1)[0]
+        file.seek(at)
+        file.write(bytes([byte ^ 1]))
+
+
+def test_a_damaged_store_is_told_and_can_be_written_again(tmp_path: Path, crawler: Crawler):
+    assert run("--config", crawler.config, "--check-config").returncode == 0 and not crawler.store.exists()
+    restart(crawler)
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+    restart(crawler)
+    assert run("--config", crawler.config, "--check-config").returncode == 0
+    crawler.kill()
+    flip(crawler.store, 2 * 16384 + 200)  # in slot A
+    done = run("--config", crawler.config, "--check-config")
+    assert done.returncode == 1 and "the stored profile is damaged" in done.stderr
+    state = restart(crawler)  # it runs, for the host must be able to send another one
+    assert not state.HasField("in_use") and "damaged" in state.problem
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(NEW.to_binary()).stored.sha256)
+    crawler.kill()
+    for log in (0, 16384):
+        flip(crawler.store, log + 100)  # behind the record: does no harm
+    assert restart(crawler).in_use.name == "new"
+
+    done = run("--config", crawler.config, "--set", "spool.path=" + str(tmp_path / "other.db"))
+    assert done.returncode == 1 and "another process has it open" in done.stderr
+    crawler.kill()
+    crawler.process = None
+    crawler.store.write_bytes(b"nonsense")
+    done = run("--config", crawler.config)
+    assert done.returncode == 1 and "not a profile store" in done.stderr
+
+
+def test_a_profile_of_another_frame_size_does_not_keep_the_device_from_starting(tmp_path: Path, crawler: Crawler):
+    restart(crawler)
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+        flasher.send(NEW.to_binary())
+    crawler.kill()
+    narrow = bytearray()  # the camera now gives frames of half the height
+    for chunk in (tmp_path / "survey.y4m").read_bytes().split(b"FRAME\n"):
+        narrow += (
+            chunk.replace(f"H{HEIGHT}".encode(), f"H{HEIGHT // 2}".encode())
+            if not narrow
+            else (b"FRAME\n" + chunk[: WIDTH * HEIGHT // 2])
+        )
+    (tmp_path / "survey.y4m").write_bytes(narrow)
+    state = restart(crawler)
+    assert not state.HasField("in_use") and f"the camera gives {WIDTH} x {HEIGHT // 2}" in state.problem
+    with device(crawler) as flasher:
+        fitting = camera("fitting", height=HEIGHT // 2)
+        flasher.confirm(flasher.send(fitting.to_binary()).stored.sha256)
+    assert restart(crawler).in_use.name == "fitting"
+
+
+def test_sending_goes_on_after_the_device_was_killed(crawler: Crawler):
+    """Nothing was stored when power failed; the same send ends well after the device is back."""
+    crawler.start("--set", "link.port=" + str(crawler.port))
+    with device(crawler) as flasher:
+        flasher.state()
+        os.kill(crawler.process.pid, 19)  # SIGSTOP: it takes no profile any more
+        result: list[pb.ProfileState | Exception] = []
+
+        def send() -> None:
+            try:
+                flasher._client.link.send_object(hashlib.sha256(NEW.to_binary()).digest(), 4, NEW.to_binary())
+                flasher._client.run(lambda: flasher._delivery.stored is not None, 20)
+                result.append(flasher.state())
+            except PipefishError as error:
+                result.append(error)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        time.sleep(0.2)
+        crawler.kill()
+        crawler.start()
+        thread.join(30)
+        assert isinstance(result[0], pb.ProfileState) and result[0].stored.name == "new", result
+
+
+def test_kill_at_any_moment_of_flashing_leaves_the_old_profile_or_the_new_one(crawler: Crawler):
+    """kill -9 while a profile is on its way, being written, or being confirmed; and it can be flashed again."""
+    rng = random.Random(SEED)
+    restart(crawler)
+    with device(crawler) as flasher:
+        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+    stored, seen = OLD, set()
+    for round_ in range(8):
+        wanted = camera(f"round {round_}", f_u=70 + round_)
+        with device(crawler) as flasher:
+            timer = threading.Timer(rng.uniform(0.0, 0.12), crawler.process.kill)
+            timer.start()
+            flasher._timeout_s = 0.3
+            try:
+                flasher.confirm(flasher.send(wanted.to_binary()).stored.sha256)
+                seen.add("confirmed")
+            except PipefishError:
+                seen.add("cut")
+            timer.join()
+        crawler.process.wait()
+        state = restart(crawler)
+        allowed = {hashlib.sha256(cam.to_binary()).digest(): cam for cam in (stored, wanted)}
+        assert state.in_use.sha256 in allowed, (round_, state)
+        with device(crawler) as flasher:
+            stored = camera(f"after {round_}", f_u=90 + round_)
+            flasher.confirm(flasher.send(stored.to_binary()).stored.sha256)
+    assert "cut" in seen
+    assert restart(crawler).in_use.name == stored.name
