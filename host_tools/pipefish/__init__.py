@@ -13,6 +13,11 @@ __version__ = "0.1.0"
 _LAZY = {
     "Camera": "pipefish.camera",
     "Scene": "pipefish.simulate",
+    "Studio": "pipefish.studio",
+    "Target": "pipefish.target",
+    "simulate_target_views": "pipefish.studio_targets",
+    "simulate_two_views": "pipefish.studio_pairs",
+    "simulate_objects": "pipefish.studio_objects",
     "Survey": "pipefish.survey",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",

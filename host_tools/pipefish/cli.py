@@ -255,7 +255,7 @@ def run_simulate(args: argparse.Namespace) -> Result:
     from pipefish import simulate as room
 
     if args.list:
-        names = room.scenarios()
+        names = {**room.scenarios(), **room.studio_scenarios()}
         return names, table(list(names.items()))
     if args.contact_sheet:
         room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
@@ -271,9 +271,10 @@ def run_simulate(args: argparse.Namespace) -> Result:
         seed=args.seed,
         quiet=args.json,
     )
+    what = "frames" if "frames" in document else "pictures"
     rows = [
-        ("frames", f"{document['frames']} of {document['width']} x {document['height']} pixels"),
-        ("driven", f"{document['driven_m']:.2f} m"),
+        (what, f"{document[what]} of {document['width']} x {document['height']} pixels"),
+        *([("driven", f"{document['driven_m']:.2f} m")] if what == "frames" else []),
         *(("written", file) for file in document["files"]),
     ]
     return document, table(rows)
@@ -412,7 +413,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     p.add_argument("scene", metavar="SCENE", nargs="?", help="a name of --list, or a TOML or JSON file")
     what = p.add_mutually_exclusive_group(required=True)
-    what.add_argument("-o", "--output", metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...")
+    what.add_argument("-o", "--output", metavar="STEM", help="start of the names: STEM.y4m, STEM.csv, ...; a folder")
     what.add_argument("--list", action="store_true", help="tell which scenes there are")
     what.add_argument("--picture", metavar="FILE", help="draw one frame into FILE (.png, .jpg, .webp)")
     what.add_argument("--contact-sheet", metavar="FILE", help="draw one frame of each scene of --list into FILE")
@@ -425,7 +426,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="another value in the scene, as in its file: diameter=0.15, motion.speed=0.4, texture.material=pvc; "
         "may be repeated",
     )
-    p.add_argument("--frames", type=positive, help="stop after so many frames")
+    p.add_argument("--frames", type=positive, help="stop after so many frames, views or scenes")
     p.add_argument("--seed", type=int, help="of all that is random [the scene's]")
     p.add_argument("--frame", type=int, metavar="N", help="which, for --picture [at three quarters of the drive]")
 

@@ -49,8 +49,29 @@ class Sights:
 
 
 def scenarios() -> dict[str, str]:
-    """The built-in scenes: name -> what it is, in one line. docs/scenarios.md shows them."""
+    """The built-in pipes: name -> what it is, in one line. docs/scenarios.md shows them."""
     return {path.stem: read_scene(path)[1] for path in sorted(SCENARIOS.glob("*.toml"))}
+
+
+def studio_scenarios() -> dict[str, str]:
+    """The built-in scenes that are no pipes (targets, pairs, objects), likewise."""
+    from pipefish.studio_files import scenarios as known
+
+    return {name: read_scene(path)[1] for name, path in known().items()}
+
+
+def studio_scene(scene: str | os.PathLike[str] | dict[str, Any]) -> tuple[dict[str, Any], Path | None] | None:
+    """A scene that is no pipe (it has a `kind`) and its file, by name, file or description; None if it is a pipe or not
+    there. Raises FormatError, OSError."""
+    from pipefish.studio_files import scenarios as known
+
+    if isinstance(scene, dict):
+        return (scene, None) if "kind" in scene else None
+    path = known().get(str(scene), Path(scene))
+    if (SCENARIOS / f"{scene}.toml").exists() or not path.is_file():
+        return None
+    described = read_scene(path)[0]
+    return (described, path) if "kind" in described else None
 
 
 def read_json(path: Path) -> Any:
@@ -105,7 +126,9 @@ def described(
         if Path(scene).name != str(scene) or not source.exists():
             source = Path(scene)
         if not source.exists():
-            raise PipefishError(f"there is no scene '{scene}': a file, or one of {', '.join(scenarios())}")
+            raise PipefishError(
+                f"there is no scene '{scene}': a file, or one of {', '.join([*scenarios(), *studio_scenarios()])}"
+            )
         made = read_scene(source)[0]
     for key, value in (changes or {}).items():
         *parts, last = key.split(".")
@@ -443,12 +466,20 @@ def simulate(
     threads: int | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all.
+    """Writes STEM.y4m, STEM.csv, STEM.truth.json and STEM.profile.json, each complete or not at all; of a scene that is
+    no pipe the folder STEM.
 
     scene: a scenario's name, a TOML or JSON file, or the description itself. changes: other values, as described()
     takes them. frames: stop after so many. seed: of all that is random but the shapes of what is in the pipe. Returns
     what was written. Raises FormatError, PipefishError, OSError.
     """
+    if (studio := studio_scene(scene)) is not None:
+        from pipefish.studio_files import simulate_studio
+
+        if changes:
+            raise PipefishError("a scene that is no pipe takes no changed values: edit its file")
+        more = {"count": frames, "seed": seed, "threads": threads, "quiet": quiet}
+        return simulate_studio(studio[0], Path(stem), path=studio[1], **more)
     changes = dict(changes or {})
     if frames is not None:
         changes["motion.frames"] = frames
@@ -516,6 +547,11 @@ def picture(
 ) -> None:
     """Writes one frame of a scene [at three quarters of the drive] as a small picture; what kind, the name's end says.
     Raises FormatError, PipefishError, OSError."""
+    if (studio := studio_scene(scene)) is not None:
+        from pipefish.studio_files import thumbnail
+
+        _save(_shrunk(thumbnail(*studio, frame or 0), width), Path(path))
+        return
     made = Scene.load(scene, changes)
     frame = made.frames * 3 // 4 if frame is None else frame
     if not 0 <= frame < made.frames:
@@ -544,10 +580,14 @@ def contact_sheet(path: Path, names: list[str] | None = None, width: int = 400, 
 
 
 def _thumbnail(scene: Scene, frame: int, width: int) -> Any:
+    grey = scene.render(frame)
+    return _shrunk(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8), width)
+
+
+def _shrunk(grey: np.ndarray, width: int) -> Any:
     from PIL import Image
 
-    grey = scene.render(frame)
-    image = Image.fromarray(grey if grey.dtype == np.uint8 else (grey >> 2).astype(np.uint8))
+    image = Image.fromarray(grey)
     width = min(width, image.width)
     return image.resize((width, round(image.height * width / image.width)), Image.Resampling.BOX)
 

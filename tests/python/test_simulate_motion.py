@@ -12,7 +12,7 @@ import pytest
 
 from pipefish.cli import main
 from pipefish.errors import FormatError
-from pipefish.simulate import Scene, contact_sheet, picture, scenarios, simulate
+from pipefish.simulate import Scene, contact_sheet, picture, scenarios, simulate, studio_scenarios
 
 STEADY = {"wobble_m": 0, "wobble_rad": 0}
 
@@ -329,7 +329,7 @@ def test_every_scenario_is_valid_and_says_what_it_is() -> None:
 def test_every_scenario_is_in_the_documents_with_a_small_picture() -> None:
     docs = Path(__file__).resolve().parents[2] / "docs"
     page = (docs / "scenarios.md").read_text()
-    for name, about in scenarios().items():
+    for name, about in {**scenarios(), **studio_scenarios()}.items():
         assert f"## {name}\n" in page, name
         assert about in " ".join(page.split()), name
         assert f"(scenarios/{name}.jpg)" in page, name
@@ -346,7 +346,7 @@ def test_pictures_are_small_and_whole(tmp_path: Path) -> None:
 
 def test_the_command_lists_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == scenarios()
+    assert json.loads(capsys.readouterr().out) == {**scenarios(), **studio_scenarios()}
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.bmpx")]) == 1
     assert "pictures end in" in capsys.readouterr().err
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--frame", "99"]) == 1

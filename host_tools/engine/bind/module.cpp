@@ -6,6 +6,7 @@ namespace nb = nanobind;
 void bind_camera(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
+void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
@@ -13,4 +14,5 @@ NB_MODULE(_engine, m)
     bind_camera(m);
     bind_link(m);
     bind_sim(m);
+    bind_sim_studio(m);
 }

@@ -58,6 +58,8 @@ enum Stream : uint64_t {
     STREAM_RIPPLE = 34,
     STREAM_WINDOW = 40, // and 41
     STREAM_ROUNDING = 42,
+    STREAM_STUDIO = 60,
+    STREAM_PRINT = 100,    // to 163: one an octave of a pattern, and its blots
     STREAM_SURFACE = 1000, // and up: one a layer of the surface
 };
 

@@ -55,17 +55,8 @@ void Scene::render(int frame, int threads, void *out)
         each_view([&](const Tube::View &view, int y) { shade_row(frame, view, y, *buffers_); });
     }
     shading_->window.apply(buffers_->image);
-    each_row([&](int y) { blur_along_row(y, *buffers_); });
-    each_row([&](int y) { blur_across_row(y, *buffers_); });
-    std::swap(buffers_->image, buffers_->spare);
-    for (int k = 0; k < spreads_; k++) {
-        each_row([&](int y) { spread_across_row(y, *buffers_); });
-        std::swap(buffers_->image, buffers_->spare);
-    }
-    each_row([&](int y) { develop_row(frame, y, *buffers_, out); });
-    if (spec_.sensor.jpeg_quality > 0) {
-        compress(static_cast<uint8_t *>(out));
-    }
+    film_->blur(buffers_->image, buffers_->spare, threads);
+    film_->develop(frame, buffers_->image, threads, out);
 }
 
 // As many as keep the image of the wall from moving more than half a pixel between two of them, wherever it is looked

@@ -70,9 +70,7 @@ void Scene::prepare()
     surface_.emplace(spec_.texture, spec_.markers, 0.5 * spec_.diameter, texels_around(lens_),
                      reach_.behind + reach_.ahead);
     make_pixel_table();
-    make_blur_kernel();
-    make_spread();
-    make_patterns();
+    film_.emplace(spec_.lens, lens_.circle_radius(), spec_.sensor, spec_.tone);
     make_shading();
     buffers_ = std::make_unique<Buffers>(rays_.size(), static_cast<size_t>(spec_.lens.width),
                                          static_cast<size_t>(spec_.lens.height));
@@ -101,51 +99,6 @@ void Scene::make_pixel_table()
         }
         row_from_.push_back(std::min(from, to));
         row_to_.push_back(to);
-    }
-}
-
-void Scene::make_blur_kernel()
-{
-    const double sigma = spec_.sensor.blur_px;
-    const int reach = static_cast<int>(std::ceil(3.5 * sigma));
-    double sum = 0.0;
-    for (int k = -reach; k <= reach; k++) {
-        sum += sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0;
-    }
-    for (int k = 0; k <= reach; k++) {
-        blur_.push_back(static_cast<float>((sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0) / sum));
-    }
-}
-
-// The lens's blur, share^2 rim_blur_px at the share of the field's edge, in variance share^4 rim_blur_px^2: a pass of
-// [b, 1 - 2 b, b] adds 2 b, and b stays at most 1/4 where the kernel is near a Gaussian.
-void Scene::make_spread()
-{
-    const LensSpec &camera = spec_.lens;
-    const double most = camera.rim_blur_px * camera.rim_blur_px;
-    spreads_ = static_cast<int>(std::ceil(most / 0.5));
-    for (int y = 0; y < camera.height && spreads_ > 0; y++) {
-        for (int x = 0; x < camera.width; x++) {
-            const double r = std::hypot(x - camera.c_u, y - camera.c_v) / lens_.circle_radius();
-            const double share2 = std::min(r * r, 1.0);
-            spread_.push_back(static_cast<float>(share2 * share2 * most / (2.0 * spreads_)));
-        }
-    }
-}
-
-void Scene::make_patterns()
-{
-    const SensorSpec &sensor = spec_.sensor;
-    const size_t n = static_cast<size_t>(spec_.lens.width) * static_cast<size_t>(spec_.lens.height);
-    if (sensor.offset_pattern > 0.0 || sensor.gain_pattern > 0.0 || sensor.hot_pixels > 0.0) {
-        for (size_t i = 0; i < n; i++) {
-            const bool hot = uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 2)) < sensor.hot_pixels;
-            const double heat = 20.0 + 235.0 * uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 3));
-            offset_.push_back(static_cast<float>(sensor.offset_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i) +
-                                                 (hot ? heat : 0.0)));
-            gain_.push_back(
-                static_cast<float>(1.0 + sensor.gain_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i + 1)));
-        }
     }
 }
 

@@ -117,9 +117,6 @@ private:
     bool on_sensor(const double px[2]) const;
     void prepare(); // what only drawing needs, at the first frame
     void make_pixel_table();
-    void make_blur_kernel();
-    void make_spread();
-    void make_patterns();
     int exposures(int frame) const; // how many sharp pictures make up a blurred one
     bool see_from(const Gaze &from, const double px[2], Seen &seen) const;
     bool project_from(const CameraState &camera, const double world[3], double px[2]) const;
@@ -146,11 +143,6 @@ private:
     RowPoints gather_row(const Tube::View &view, int row, Buffers &buffers) const;
     void find_shadows(const Tube::View &view, RowPoints &points) const;
     void shade_row(int frame, const Tube::View &view, int row, Buffers &buffers) const;
-    void blur_along_row(int row, Buffers &buffers) const;
-    void blur_across_row(int row, Buffers &buffers) const;
-    void spread_across_row(int row, Buffers &buffers) const;
-    void develop_row(int frame, int row, const Buffers &buffers, void *out) const;
-    void compress(uint8_t *image) const;
 
     SceneSpec spec_;
     Tube tube_;
@@ -164,10 +156,7 @@ private:
     std::vector<float> vignette_;        // of the same
     std::vector<int> row_from_, row_to_; // lit pixels of a row: columns [from, to)
     std::vector<size_t> row_offset_;     // of a row in rays_
-    std::vector<float> blur_;            // half kernel: weights of 0, 1, 2, ... pixels
-    int spreads_ = 0;                    // passes of the kernel [b, 1 - 2 b, b] that add the lens's blur at the rim,
-    std::vector<float> spread_;          // with this b, of every pixel
-    std::vector<float> offset_, gain_;   // fixed pattern, of every pixel; empty = none
+    std::optional<Film> film_;
     std::unique_ptr<Buffers> buffers_;
     std::unique_ptr<Shading> shading_;
     std::mutex rendering_;

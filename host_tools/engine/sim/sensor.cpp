@@ -1,9 +1,12 @@
 // The sensor: what becomes of the light that the optics lay on it.
-#include "sim/buffers.hpp"
+#include "sim/sensor.hpp"
+
+#include "sim/parallel.hpp"
 #include "sim/random.hpp"
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <stdexcept>
 #include <string>
 #include <turbojpeg.h>
@@ -34,11 +37,82 @@ float pixel_noise(uint32_t pixel, uint32_t key_a, uint32_t key_b)
 
 } // namespace
 
-// The blur that is the same everywhere, then the lens's. Beyond the sensor: dark.
-void Scene::blur_along_row(int row, Buffers &buffers) const
+Film::Film(const LensSpec &camera, double circle_radius, const SensorSpec &sensor, const ToneSpec &curve)
+    : spec_(sensor), tone_(curve), width_(camera.width), height_(camera.height)
 {
-    const size_t width = static_cast<size_t>(spec_.lens.width), first = static_cast<size_t>(row) * width;
-    float *const out = buffers.image.data() + first;
+    make_blur_kernel();
+    make_spread(camera, circle_radius);
+    make_patterns();
+}
+
+void Film::make_blur_kernel()
+{
+    const double sigma = spec_.blur_px;
+    const int reach = static_cast<int>(std::ceil(3.5 * sigma));
+    double sum = 0.0;
+    for (int k = -reach; k <= reach; k++) {
+        sum += sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0;
+    }
+    for (int k = 0; k <= reach; k++) {
+        blur_.push_back(static_cast<float>((sigma > 0.0 ? std::exp(-0.5 * k * k / (sigma * sigma)) : 1.0) / sum));
+    }
+}
+
+// The lens's blur, share^2 rim_blur_px at the share of the field's edge, in variance share^4 rim_blur_px^2: a pass of
+// [b, 1 - 2 b, b] adds 2 b, and b stays at most 1/4 where the kernel is near a Gaussian.
+void Film::make_spread(const LensSpec &camera, double circle_radius)
+{
+    const double most = camera.rim_blur_px * camera.rim_blur_px;
+    spreads_ = static_cast<int>(std::ceil(most / 0.5));
+    for (int y = 0; y < camera.height && spreads_ > 0; y++) {
+        for (int x = 0; x < camera.width; x++) {
+            const double r = std::hypot(x - camera.c_u, y - camera.c_v) / circle_radius;
+            const double share2 = std::min(r * r, 1.0);
+            spread_.push_back(static_cast<float>(share2 * share2 * most / (2.0 * spreads_)));
+        }
+    }
+}
+
+void Film::make_patterns()
+{
+    const SensorSpec &sensor = spec_;
+    const size_t n = static_cast<size_t>(width_) * static_cast<size_t>(height_);
+    if (sensor.offset_pattern > 0.0 || sensor.gain_pattern > 0.0 || sensor.hot_pixels > 0.0) {
+        for (size_t i = 0; i < n; i++) {
+            const bool hot = uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 2)) < sensor.hot_pixels;
+            const double heat = 20.0 + 235.0 * uniform_of(hash64(sensor.seed, STREAM_PATTERN, i, 3));
+            offset_.push_back(static_cast<float>(sensor.offset_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i) +
+                                                 (hot ? heat : 0.0)));
+            gain_.push_back(
+                static_cast<float>(1.0 + sensor.gain_pattern * normal(sensor.seed, STREAM_PATTERN, 2 * i + 1)));
+        }
+    }
+}
+
+void Film::blur(std::vector<float> &image, std::vector<float> &spare, int threads) const
+{
+    parallel_for(height_, threads, [&](int y) { blur_along_row(y, image); });
+    parallel_for(height_, threads, [&](int y) { blur_across_row(y, image, spare); });
+    std::swap(image, spare);
+    for (int k = 0; k < spreads_; k++) {
+        parallel_for(height_, threads, [&](int y) { spread_across_row(y, image, spare); });
+        std::swap(image, spare);
+    }
+}
+
+void Film::develop(int frame, const std::vector<float> &image, int threads, void *out) const
+{
+    parallel_for(height_, threads, [&](int y) { develop_row(frame, y, image, out); });
+    if (spec_.jpeg_quality > 0) {
+        compress(static_cast<uint8_t *>(out));
+    }
+}
+
+// The blur that is the same everywhere, then the lens's. Beyond the sensor: dark.
+void Film::blur_along_row(int row, std::vector<float> &image) const
+{
+    const size_t width = static_cast<size_t>(width_), first = static_cast<size_t>(row) * width;
+    float *const out = image.data() + first;
     std::vector<float> line(out, out + width);
     for (size_t x = 0; x < width; x++) {
         out[x] = blur_[0] * line[x];
@@ -62,47 +136,47 @@ void Scene::blur_along_row(int row, Buffers &buffers) const
 }
 
 // From the image to the spare.
-void Scene::blur_across_row(int row, Buffers &buffers) const
+void Film::blur_across_row(int row, const std::vector<float> &image, std::vector<float> &spare) const
 {
-    const int height = spec_.lens.height, reach = static_cast<int>(blur_.size()) - 1;
-    const size_t width = static_cast<size_t>(spec_.lens.width);
-    float *const out = buffers.spare.data() + static_cast<size_t>(row) * width;
+    const int height = height_, reach = static_cast<int>(blur_.size()) - 1;
+    const size_t width = static_cast<size_t>(width_);
+    float *const out = spare.data() + static_cast<size_t>(row) * width;
     std::fill(out, out + width, 0.0f);
     for (int k = -reach; k <= reach; k++) {
         if (row + k < 0 || row + k >= height) {
             continue;
         }
         const float weight = blur_[static_cast<size_t>(std::abs(k))];
-        const float *const in = buffers.image.data() + static_cast<size_t>(row + k) * width;
+        const float *const in = image.data() + static_cast<size_t>(row + k) * width;
         for (size_t x = 0; x < width; x++) {
             out[x] += weight * in[x];
         }
     }
 }
 
-void Scene::spread_across_row(int row, Buffers &buffers) const
+void Film::spread_across_row(int row, const std::vector<float> &image, std::vector<float> &spare) const
 {
-    const size_t width = static_cast<size_t>(spec_.lens.width), first = static_cast<size_t>(row) * width;
+    const size_t width = static_cast<size_t>(width_), first = static_cast<size_t>(row) * width;
     const std::vector<float> dark(width, 0.0f);
-    const float *const in = buffers.image.data() + first, *const b = spread_.data() + first;
+    const float *const in = image.data() + first, *const b = spread_.data() + first;
     const float *const above = row > 0 ? in - width : dark.data();
-    const float *const below = row + 1 < spec_.lens.height ? in + width : dark.data();
-    float *const out = buffers.spare.data() + first;
+    const float *const below = row + 1 < height_ ? in + width : dark.data();
+    float *const out = spare.data() + first;
     for (size_t x = 0; x < width; x++) {
         out[x] = in[x] + b[x] * ((above[x] - 2.0f * in[x]) + below[x]);
     }
 }
 
-void Scene::develop_row(int frame, int row, const Buffers &buffers, void *out) const
+void Film::develop_row(int frame, int row, const std::vector<float> &image, void *out) const
 {
-    const SensorSpec &sensor = spec_.sensor;
+    const SensorSpec &sensor = spec_;
     const uint64_t key = hash64(sensor.seed, STREAM_PIXEL, static_cast<uint64_t>(frame));
     const uint32_t key_a = static_cast<uint32_t>(key), key_b = static_cast<uint32_t>(key >> 32);
     const float read = static_cast<float>(sensor.read_noise * sensor.read_noise),
                 shot = static_cast<float>(sensor.shot_noise);
-    const size_t width = static_cast<size_t>(spec_.lens.width), first = static_cast<size_t>(row) * width;
-    std::vector<float> line(buffers.image.begin() + static_cast<std::ptrdiff_t>(first),
-                            buffers.image.begin() + static_cast<std::ptrdiff_t>(first + width));
+    const size_t width = static_cast<size_t>(width_), first = static_cast<size_t>(row) * width;
+    std::vector<float> line(image.begin() + static_cast<std::ptrdiff_t>(first),
+                            image.begin() + static_cast<std::ptrdiff_t>(first + width));
     if (!gain_.empty()) {
         for (size_t x = 0; x < width; x++) {
             line[x] = std::max(gain_[first + x] * line[x], 0.0f);
@@ -118,7 +192,7 @@ void Scene::develop_row(int frame, int row, const Buffers &buffers, void *out) c
         }
     }
     for (float &grey : line) {
-        grey = tone(spec_.tone, grey);
+        grey = tone(tone_, grey);
     }
     if (sensor.bits > 8) {
         uint16_t *const pixels = static_cast<uint16_t *>(out) + first;
@@ -136,9 +210,9 @@ void Scene::develop_row(int frame, int row, const Buffers &buffers, void *out) c
 }
 
 // Through a JPEG and back: blocking, ringing, and what the quantisation takes away.
-void Scene::compress(uint8_t *image) const
+void Film::compress(uint8_t *image) const
 {
-    const int width = spec_.lens.width, height = spec_.lens.height;
+    const int width = width_, height = height_;
     const std::unique_ptr<void, int (*)(tjhandle)> encoder(tjInitCompress(), tjDestroy);
     const std::unique_ptr<void, int (*)(tjhandle)> decoder(tjInitDecompress(), tjDestroy);
     std::vector<unsigned char> bytes(tjBufSize(width, height, TJSAMP_GRAY));
@@ -146,7 +220,7 @@ void Scene::compress(uint8_t *image) const
     unsigned long size = bytes.size();
     if (!encoder || !decoder ||
         tjCompress2(encoder.get(), image, width, width, height, TJPF_GRAY, &begin, &size, TJSAMP_GRAY,
-                    spec_.sensor.jpeg_quality, TJFLAG_NOREALLOC | TJFLAG_ACCURATEDCT) != 0 ||
+                    spec_.jpeg_quality, TJFLAG_NOREALLOC | TJFLAG_ACCURATEDCT) != 0 ||
         tjDecompress2(decoder.get(), begin, size, image, width, width, height, TJPF_GRAY, TJFLAG_ACCURATEDCT) != 0) {
         throw std::runtime_error(std::string("JPEG: ") + tjGetErrorStr2(encoder.get()));
     }
