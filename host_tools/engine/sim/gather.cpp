@@ -19,10 +19,13 @@ namespace
 constexpr int RAYS = 16; // of a pixel that is divided
 
 // A wall's normal tilted by its relief: along the pipe's axis and clockwise.
-Eigen::Vector3f tilted(const Texel &texel, const Eigen::Vector3f &normal, const Eigen::Vector3f &axis)
+inline Eigen::Vector3f tilted(const Texel &texel, const Eigen::Vector3f &normal, const Eigen::Vector3f &axis)
 {
-    const Eigen::Vector3f clockwise = normal.cross(axis).normalized(), along = clockwise.cross(normal);
-    return (normal - texel.slope_s * along - texel.slope_clock * clockwise).normalized();
+    const Eigen::Vector3f across = normal.cross(axis);
+    const Eigen::Vector3f clockwise = across * (1.0f / std::sqrt(std::max(across.squaredNorm(), 1e-12f)));
+    const Eigen::Vector3f along = clockwise.cross(normal);
+    const Eigen::Vector3f n = normal - texel.slope_s * along - texel.slope_clock * clockwise;
+    return n * (1.0f / std::sqrt(n.squaredNorm()));
 }
 
 } // namespace
