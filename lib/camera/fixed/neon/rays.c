@@ -66,20 +66,21 @@ size_t pf_fixed_lookup_fours(const pf_camera_rays *rays, size_t n, const pf_poin
                 out[k] = pf_camera_rays_at(rays, pixels[k]);
             continue;
         }
-        int32_t index[4];
-        vst1q_s32(index, pf_pairs(at, to_index));
-        four all = {.cell = {cells + index[0], cells + index[1], cells + index[2], cells + index[3]}};
+        uint32_t index[4];
+        vst1q_u32(index, vreinterpretq_u32_s32(pf_pairs(at, to_index)));
+        const ray_cell *c0 = cells + index[0], *c1 = cells + index[1], *c2 = cells + index[2], *c3 = cells + index[3];
         const int16x8_t way = vreinterpretq_s16_u16(veorq_u16(pf_even(a, b), vdupq_n_u16(32768)));
-        all.first = vreinterpretq_s32_s16(way);
-        all.second = vreinterpretq_s32_s16(pf_mul_high(way, vtrn1q_s16(way, way)));
-        all.third = vreinterpretq_s32_u32(vshrq_n_u32(vreinterpretq_u32_s16(pf_mul_high(way, way)), 16));
-        if ((all.cell[0]->shift | all.cell[1]->shift | all.cell[2]->shift | all.cell[3]->shift) >= MARKS) {
+        const int32x4_t first = vreinterpretq_s32_s16(way);
+        const int32x4_t second = vreinterpretq_s32_s16(pf_mul_high(way, vtrn1q_s16(way, way)));
+        const int32x4_t third = vreinterpretq_s32_u32(vshrq_n_u32(vreinterpretq_u32_s16(pf_mul_high(way, way)), 16));
+        if ((c0->shift | c1->shift | c2->shift | c3->shift) >= MARKS) {
+            const four all = {{c0, c1, c2, c3}, first, second, third};
             look_up_mixed(rays, pixels + i, &all, out + i);
             continue;
         }
 #define TAKE(lane)                                                                                                     \
-    put(out + i + (lane), cell_sum(all.cell[lane], vdupq_laneq_s32(all.first, lane),                                   \
-                                   vdupq_laneq_s32(all.second, lane), vdupq_laneq_s32(all.third, lane)))
+    put(out + i + (lane),                                                                                              \
+        cell_sum(c##lane, vdupq_laneq_s32(first, lane), vdupq_laneq_s32(second, lane), vdupq_laneq_s32(third, lane)))
         TAKE(0);
         TAKE(1);
         TAKE(2);
