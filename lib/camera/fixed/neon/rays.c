@@ -78,14 +78,15 @@ size_t pf_fixed_lookup_fours(const pf_camera_rays *rays, size_t n, const pf_poin
             look_up_mixed(rays, pixels + i, &all, out + i);
             continue;
         }
-#define TAKE(lane)                                                                                                     \
-    put(out + i + (lane),                                                                                              \
-        cell_sum(c##lane, vdupq_laneq_s32(first, lane), vdupq_laneq_s32(second, lane), vdupq_laneq_s32(third, lane)))
-        TAKE(0);
-        TAKE(1);
-        TAKE(2);
-        TAKE(3);
-#undef TAKE
+#define RAY(lane)                                                                                                      \
+    cell_sum(c##lane, vdupq_laneq_s32(first, lane), vdupq_laneq_s32(second, lane), vdupq_laneq_s32(third, lane))
+        /* The fourth number of a ray is written over by the next one. */
+        int32_t *o = (int32_t *)(void *)(out + i);
+        vst1q_s32(o, RAY(0));
+        vst1q_s32(o + 3, RAY(1));
+        vst1q_s32(o + 6, RAY(2));
+        put(out + i + 3, RAY(3));
+#undef RAY
     }
     return i;
 }
