@@ -157,22 +157,26 @@ static pf_camera moved_camera(const uint8_t *data, size_t size)
     return camera;
 }
 
+/* One proof for a camera that is refused, two for one that is not: they are what takes the time. */
 static void try_camera(const pf_camera *camera)
 {
     static _Alignas(16) uint8_t workspace[PF_CAMERA_FIXED_WORKSPACE_MAX];
     static uint8_t bytes[PF_PROFILE_BINARY_MAX];
-    static pf_profile profile;
+    static pf_profile profile, back;
     size_t n = 0;
-    if (pf_camera_check(camera, NULL) != PF_OK)
-        return;
     memset(&profile, 0, sizeof profile);
     profile.camera = *camera;
-    pf_status status = pf_profile_integers_make(&profile, workspace, sizeof workspace);
+    const char *why = NULL;
+    pf_status status = pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why);
+    require(status == PF_OK || strncmp(why, "self_test", 9) != 0);
+    if (status != PF_OK)
+        return;
+    require(pf_profile_decode(bytes, n, &back, NULL) == PF_OK);
+    require(memcmp(&profile, &back, sizeof profile) == 0);
+    use_camera(camera);
+    status = pf_profile_integers_make(&profile, workspace, sizeof workspace);
     require(status == PF_OK || status == PF_ERR_UNSUPPORTED);
     require(pf_profile_integers_check(&profile, workspace, sizeof workspace, NULL) == PF_OK);
-    require(pf_profile_encode(&profile, bytes, sizeof bytes, &n, NULL) == PF_OK);
-    try_bytes(bytes, n);
-    require(memcmp(&profile.camera, camera, sizeof *camera) == 0);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
@@ -180,7 +184,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     uint8_t bytes[PF_PROFILE_BINARY_MAX];
     if (size < 16 || size > sizeof bytes)
         return 0;
-    if (data[0] % 8 == 0) {
+    if (data[0] % 32 == 0) {
         const pf_camera camera = moved_camera(data, size);
         try_camera(&camera);
         return 0;
@@ -192,8 +196,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     try_bytes(bytes, size);
 
     uint32_t free_count;
-    size_t n = valid_profile(data[1] % SYMMETRIC, data[0] / 8 % 3, &free_count, bytes);
-    if (data[0] / 24 % 2)
+    size_t n = valid_profile(data[1] % SYMMETRIC, data[0] % 3, &free_count, bytes);
+    if (data[0] / 3 % 2)
         n = as_version_1(bytes, free_count);
     for (size_t i = 2; i < size && 10 + i < n - 4; i++)
         bytes[10 + i] ^= data[i];
