@@ -7,6 +7,7 @@
 #include "log.h"
 #include "pipefish/drivers/flash_file.h"
 #include "pipefish/drivers/sha256.h"
+#include "pipefish/profile_integers.h"
 #include "pipefish/profile_store.h"
 
 _Static_assert(PF_PROFILE_STORE_BYTES == PF_PROFILE_BINARY_MAX, "every profile fits a slot");
@@ -20,7 +21,8 @@ struct pf_keeper {
     pf_profile_store store; /* main thread only, after opening */
     uint32_t width, height; /* of the camera's frames; 0 = not known yet */
     uint8_t bytes[PF_PROFILE_BINARY_MAX];
-    pf_profile profile; /* what bytes hold: scratch of the main thread */
+    pf_profile profile;                                            /* what bytes hold: scratch of the main thread */
+    _Alignas(16) uint8_t workspace[PF_CAMERA_FIXED_WORKSPACE_MAX]; /* of its self-test */
 
     pthread_mutex_t mutex; /* of all below */
     job_state job_state;
@@ -47,7 +49,8 @@ static bool check_bytes(pf_keeper *k, size_t n, const char *what)
 {
     char problem[sizeof k->texts.problem];
     const char *why = NULL;
-    if (pf_profile_decode(k->bytes, n, &k->profile, &why) != PF_OK)
+    if (pf_profile_decode(k->bytes, n, &k->profile, &why) != PF_OK ||
+        pf_profile_integers_check(&k->profile, k->workspace, sizeof k->workspace, &why) != PF_OK)
         (void)snprintf(problem, sizeof problem, "%s: %s", what, why);
     else if (k->width != 0 && (k->profile.camera.width != k->width || k->profile.camera.height != k->height))
         (void)snprintf(problem, sizeof problem, "%s is for %u x %u, the camera gives %u x %u", what,

@@ -15,6 +15,7 @@
 #include "keeper.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
+#include "pipefish/profile_integers.h"
 #include "pipeline.h"
 #include "utf8.h"
 
@@ -100,6 +101,18 @@ static bool load_config(const options *o, pf_config *config, char *error, size_t
     return pf_config_check(config, o->config, error, n);
 }
 
+/* Decodes a profile and makes its self-tests. */
+static bool is_for_this_device(const uint8_t *bytes, size_t n, pf_profile *profile, const char **why)
+{
+    if (pf_profile_decode(bytes, n, profile, why) != PF_OK)
+        return false;
+    size_t size = pf_camera_fixed_workspace_size(&profile->camera);
+    void *workspace = malloc(size);
+    bool is_good = pf_profile_integers_check(profile, workspace, size, why) == PF_OK;
+    free(workspace);
+    return is_good;
+}
+
 static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
 {
     const char *path = d->config.camera.profile, *why = NULL;
@@ -123,7 +136,7 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
                        is_read ? "too large: not a binary profile" : "cannot be read");
         return false;
     }
-    if (pf_profile_decode(bytes, d->profile_size, &d->profile, &why) != PF_OK) {
+    if (!is_for_this_device(bytes, d->profile_size, &d->profile, &why)) {
         (void)snprintf(error, n, "camera.profile: %s: %s", path, why);
         return false;
     }

@@ -71,6 +71,56 @@ static inline int32x4_t pf_dot(int32x4_t sum, int16x8_t a, int16x8_t b)
 #endif
 }
 
+/* Lane i: a[2i] b[2i] + a[2i + 1] b[2i + 1]. */
+static inline int32x4_t pf_pairs(int16x8_t a, int16x8_t b)
+{
+#if defined(__aarch64__)
+    return vpaddq_s32(vmull_s16(vget_low_s16(a), vget_low_s16(b)), vmull_high_s16(a, b));
+#else
+    return PF_FROM(int32x4, simde_mm_madd_epi16(PF_M(int16x8, a), PF_M(int16x8, b)));
+#endif
+}
+
+/* a b >> 16. */
+static inline int16x8_t pf_mul_high(int16x8_t a, int16x8_t b)
+{
+#if defined(__aarch64__)
+    return vuzp2q_s16(vreinterpretq_s16_s32(vmull_s16(vget_low_s16(a), vget_low_s16(b))),
+                      vreinterpretq_s16_s32(vmull_high_s16(a, b)));
+#else
+    return PF_FROM(int16x8, simde_mm_mulhi_epi16(PF_M(int16x8, a), PF_M(int16x8, b)));
+#endif
+}
+
+/* All lanes by the same number of bits, 0..31, known at run time. */
+static inline int32x4_t pf_shift_right(int32x4_t v, int bits)
+{
+#if defined(__aarch64__)
+    return vshlq_s32(v, vdupq_n_s32(-bits));
+#else
+    return PF_FROM(int32x4, simde_mm_sra_epi32(PF_M(int32x4, v), simde_mm_cvtsi32_si128(bits)));
+#endif
+}
+
+static inline uint32x4_t pf_shift_right_u(uint32x4_t v, int bits)
+{
+#if defined(__aarch64__)
+    return vshlq_u32(v, vdupq_n_s32(-bits));
+#else
+    return PF_FROM(uint32x4, simde_mm_srl_epi32(PF_M(uint32x4, v), simde_mm_cvtsi32_si128(bits)));
+#endif
+}
+
+/* Whether all lanes of a comparison hold. */
+static inline int pf_all(uint16x8_t mask)
+{
+#if defined(__aarch64__)
+    return vminvq_u16(mask) != 0;
+#else
+    return simde_mm_movemask_epi8(PF_M(uint16x8, mask)) == 0xFFFF;
+#endif
+}
+
 /* v[0] = x x + y y, v[1] = x x - y y, v[2] = 2 x y, lanes 0..3 and 4..7. Below 2^14. */
 static inline void pf_squares(int16x8_t x, int16x8_t y, int32x4_t v[3][2])
 {

@@ -23,22 +23,21 @@
 #define AT_COVARIANCE_1 584u /* where version 1 has its covariance */
 
 /* What version 2 puts in front of the covariance; behind it come the self-test vectors. */
-#define AT_UNITS         584u
-#define AT_HELD_VIEWS    588u
-#define AT_HELD_RMS      592u
-#define AT_VIEWS         600u
-#define AT_POINTS        604u
-#define AT_LENS          608u
-#define AT_TOOL          672u
-#define AT_TOOL_VERSION  704u
-#define AT_MODEL_CHOICE  736u
-#define AT_VECTORS       800u
-#define AT_FIXED_VECTORS 804u
-#define AT_COVARIANCE_2  808u
+#define AT_UNITS        584u
+#define AT_HELD_VIEWS   588u
+#define AT_HELD_RMS     592u
+#define AT_VIEWS        600u
+#define AT_POINTS       604u
+#define AT_LENS         608u
+#define AT_TOOL         672u
+#define AT_TOOL_VERSION 704u
+#define AT_MODEL_CHOICE 736u
+#define AT_VECTORS      800u
+#define AT_INTEGERS     804u
+#define AT_COVARIANCE_2 808u
 
-#define CHECKSUM_BYTES     4u
-#define FIXED_VECTOR_BYTES 28u
-#define FIXED_VECTORS_MAX  8u
+#define CHECKSUM_BYTES 4u
+#define INTEGERS_BYTES 28u
 
 #define UNITS 1u /* pixels with the centre of the top-left one at (0, 0), radians, metres: there are no others */
 
@@ -89,7 +88,7 @@ _Static_assert(AT_SERIAL == AT_NAME + PF_PROFILE_NAME_MAX && AT_WIDTH == AT_SERI
                    AT_VECTORS == AT_MODEL_CHOICE + PF_PROFILE_NAME_MAX,
                "the layout of the images that are on devices");
 _Static_assert(AT_COVARIANCE_2 + sizeof(((pf_profile *)0)->covariance) + PF_PROFILE_VECTORS * PF_VECTOR_BYTES +
-                       FIXED_VECTORS_MAX * FIXED_VECTOR_BYTES + CHECKSUM_BYTES <=
+                       PF_PROFILE_INTEGERS * INTEGERS_BYTES + CHECKSUM_BYTES <=
                    PF_PROFILE_BINARY_MAX,
                "PF_PROFILE_BINARY_MAX");
 
@@ -129,17 +128,16 @@ static size_t covariance_bytes(uint32_t free_count)
 
 /* Where what changed with the version lies; lengths as the counts in the bytes say. */
 typedef struct layout {
-    uint32_t version, vectors, fixed_vectors;
+    uint32_t version, vectors, integers;
     size_t covariance, vectors_at, length;
 } layout;
 
-static layout layout_of(uint32_t version, uint32_t free_count, uint32_t vectors, uint32_t fixed_vectors)
+static layout layout_of(uint32_t version, uint32_t free_count, uint32_t vectors, uint32_t integers)
 {
-    layout l = {.version = version, .vectors = vectors, .fixed_vectors = fixed_vectors};
+    layout l = {.version = version, .vectors = vectors, .integers = integers};
     l.covariance = version == 1 ? AT_COVARIANCE_1 : AT_COVARIANCE_2;
     l.vectors_at = l.covariance + covariance_bytes(free_count);
-    l.length =
-        l.vectors_at + (size_t)vectors * PF_VECTOR_BYTES + (size_t)fixed_vectors * FIXED_VECTOR_BYTES + CHECKSUM_BYTES;
+    l.length = l.vectors_at + (size_t)vectors * PF_VECTOR_BYTES + (size_t)integers * INTEGERS_BYTES + CHECKSUM_BYTES;
     return l;
 }
 
@@ -272,8 +270,6 @@ static pf_status check_vectors(const uint8_t *bytes, const layout *l, const char
 {
     pf_camera camera;
     read_camera(bytes, &camera);
-    if (l->fixed_vectors > 0)
-        return refuse(PF_ERR_UNSUPPORTED, "fixed_vectors: this build has no integer camera to test", why);
     return pf_vectors_check(&camera, bytes + l->vectors_at, l->vectors, why);
 }
 
@@ -292,6 +288,28 @@ static void put_rms(uint8_t *p, double value)
         put_u64(p, NAN_BITS);
     else
         put_f64(p, value);
+}
+
+static void put_integers(uint8_t *p, const pf_profile *profile)
+{
+    for (uint32_t i = 0; i < profile->integers_count; i++) {
+        const pf_profile_integers *v = profile->integers + i;
+        const int32_t value[7] = {v->pixel.x, v->pixel.y, v->ray.x, v->ray.y, v->ray.z, v->back.x, v->back.y};
+        for (uint32_t j = 0; j < 7; j++, p += 4)
+            put_u32(p, (uint32_t)value[j]);
+    }
+}
+
+static void read_integers(const uint8_t *p, uint32_t count, pf_profile *profile)
+{
+    profile->integers_count = count;
+    for (uint32_t i = 0; i < count; i++) {
+        int32_t value[7];
+        for (uint32_t j = 0; j < 7; j++, p += 4)
+            value[j] = (int32_t)get_u32(p);
+        profile->integers[i] =
+            (pf_profile_integers){{value[0], value[1]}, {value[2], value[3], value[4]}, {value[5], value[6]}};
+    }
 }
 
 static void put_fields(const pf_profile *profile, const layout *l, uint8_t *out)
@@ -324,7 +342,7 @@ static void put_fields(const pf_profile *profile, const layout *l, uint8_t *out)
     put_u32(out + AT_VIEWS, profile->views);
     put_u32(out + AT_POINTS, profile->points);
     put_u32(out + AT_VECTORS, l->vectors);
-    put_u32(out + AT_FIXED_VECTORS, l->fixed_vectors);
+    put_u32(out + AT_INTEGERS, l->integers);
     for (size_t i = 0; i < covariance_bytes(profile->free_count) / sizeof(double); i++)
         put_f64(out + l->covariance + i * sizeof(double), profile->covariance[i]);
 }
@@ -337,7 +355,9 @@ pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capa
         return refuse(PF_ERR_ARGUMENT, "profile: a null pointer", why);
     if (profile->free_count > PF_PROFILE_FREE_MAX)
         return refuse(PF_ERR_ARGUMENT, "free_count: more than 40", why);
-    layout l = layout_of(PF_PROFILE_FORMAT, profile->free_count, PF_PROFILE_VECTORS, 0);
+    if (profile->integers_count > PF_PROFILE_INTEGERS)
+        return refuse(PF_ERR_ARGUMENT, "integers: more than 8", why);
+    layout l = layout_of(PF_PROFILE_FORMAT, profile->free_count, PF_PROFILE_VECTORS, profile->integers_count);
     if (capacity < l.length)
         return refuse(PF_ERR_SPACE, "profile: the buffer is too small", why);
 
@@ -347,6 +367,7 @@ pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capa
         return status == PF_ERR_FORMAT ? PF_ERR_ARGUMENT : status;
     if (pf_vectors_write(&profile->camera, out + l.vectors_at) != PF_OK)
         return refuse(PF_ERR_DOMAIN, "self_test: the camera cannot be evaluated", why);
+    put_integers(out + l.vectors_at + PF_PROFILE_VECTORS * PF_VECTOR_BYTES, profile);
     put_u32(out + l.length - CHECKSUM_BYTES, pf_crc32c(0, out, l.length - CHECKSUM_BYTES));
     *n = l.length;
     return refuse(PF_OK, "ok", why);
@@ -377,7 +398,7 @@ static pf_status check_envelope(const uint8_t *bytes, size_t n, const char **why
 /* The counts, which the length must agree with. */
 static pf_status check_layout(const uint8_t *bytes, size_t n, layout *l, const char **why)
 {
-    uint32_t version = get_u32(bytes + AT_VERSION), vectors = 0, fixed_vectors = 0;
+    uint32_t version = get_u32(bytes + AT_VERSION), vectors = 0, integers = 0;
     if (n < (version == 1 ? AT_COVARIANCE_1 : AT_COVARIANCE_2) + CHECKSUM_BYTES)
         return refuse(PF_ERR_FORMAT, "length: shorter than any profile of its version", why);
     uint32_t free_count = get_u32(bytes + AT_FREE_COUNT);
@@ -385,13 +406,13 @@ static pf_status check_layout(const uint8_t *bytes, size_t n, layout *l, const c
         return refuse(PF_ERR_FORMAT, "free_count: more than 40", why);
     if (version >= 2) {
         vectors = get_u32(bytes + AT_VECTORS);
-        fixed_vectors = get_u32(bytes + AT_FIXED_VECTORS);
+        integers = get_u32(bytes + AT_INTEGERS);
         if (vectors < 1 || vectors > PF_PROFILE_VECTORS)
             return refuse(PF_ERR_FORMAT, "vectors: not 1..8", why);
-        if (fixed_vectors > FIXED_VECTORS_MAX)
-            return refuse(PF_ERR_FORMAT, "fixed_vectors: more than 8", why);
+        if (integers > PF_PROFILE_INTEGERS)
+            return refuse(PF_ERR_FORMAT, "integers: more than 8", why);
     }
-    *l = layout_of(version, free_count, vectors, fixed_vectors);
+    *l = layout_of(version, free_count, vectors, integers);
     if (n != l->length)
         return refuse(PF_ERR_FORMAT, "length: does not agree with the counts", why);
     return PF_OK;
@@ -436,5 +457,6 @@ pf_status pf_profile_decode(const uint8_t *bytes, size_t n, pf_profile *profile,
     memcpy(profile->free_param, bytes + AT_FREE_PARAM, sizeof profile->free_param);
     for (size_t i = 0; i < covariance_bytes(profile->free_count) / sizeof(double); i++)
         profile->covariance[i] = get_f64(bytes + l.covariance + i * sizeof(double));
+    read_integers(bytes + l.vectors_at + l.vectors * PF_VECTOR_BYTES, l.integers, profile);
     return refuse(PF_OK, "ok", why);
 }

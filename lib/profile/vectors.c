@@ -49,32 +49,35 @@ static double rim(const pf_camera *camera, const double step[2])
     return inside;
 }
 
-pf_status pf_vectors_write(const pf_camera *camera, uint8_t *out)
+pf_status pf_vectors_at(const pf_camera *camera, uint32_t i, double value[8])
 {
     /* Farther from the pupil than the model needs (|pupil_e1| (theta_max^2 + 2 theta_max) < 17 |pupil_e1|), and near
      * enough that a shift of the pupil shows. */
     double shift = camera->pupil_e1 < 0 ? -camera->pupil_e1 : camera->pupil_e1, distance = 1 + 32 * shift;
-    for (int i = 0; i < (int)PF_PROFILE_VECTORS; i++, out += PF_VECTOR_BYTES) {
-        double step[2] = {camera->f_u * PLACE[i].u, camera->f_v * PLACE[i].v};
-        double length = PLACE[i].share > 0 ? PLACE[i].share * INSIDE * rim(camera, step) : 0;
-        double xyz[3], uv[2], ray[3], origin[3];
-        /* The image of the domain need not be convex; its centre is always inside. */
-        while (!reaches(camera, step, length, ray, origin)) {
-            if (length == 0)
-                return PF_ERR_DOMAIN;
-            length = length > 1e-3 ? 0.5 * length : 0;
-        }
-        for (int j = 0; j < 3; j++)
-            xyz[j] = origin[j] + distance * ray[j];
-        if (pf_camera_project(camera, xyz, uv, NULL, NULL) != PF_OK ||
-            pf_camera_unproject(camera, uv, ray, NULL, NULL) != PF_OK)
+    double step[2] = {camera->f_u * PLACE[i].u, camera->f_v * PLACE[i].v};
+    double length = PLACE[i].share > 0 ? PLACE[i].share * INSIDE * rim(camera, step) : 0;
+    double *xyz = value, *uv = value + 3, *ray = value + 5, origin[3];
+    /* The image of the domain need not be convex; its centre is always inside. */
+    while (!reaches(camera, step, length, ray, origin)) {
+        if (length == 0)
             return PF_ERR_DOMAIN;
-        for (int j = 0; j < 3; j++) {
-            put_f64(out + 8 * j, xyz[j]);
-            put_f64(out + 40 + 8 * j, ray[j]);
-        }
-        put_f64(out + 24, uv[0]);
-        put_f64(out + 32, uv[1]);
+        length = length > 1e-3 ? 0.5 * length : 0;
+    }
+    for (int j = 0; j < 3; j++)
+        xyz[j] = origin[j] + distance * ray[j];
+    pf_status status = pf_camera_project(camera, xyz, uv, NULL, NULL);
+    return status == PF_OK ? pf_camera_unproject(camera, uv, ray, NULL, NULL) : status;
+}
+
+pf_status pf_vectors_write(const pf_camera *camera, uint8_t *out)
+{
+    for (uint32_t i = 0; i < PF_PROFILE_VECTORS; i++) {
+        double value[8];
+        pf_status status = pf_vectors_at(camera, i, value);
+        if (status != PF_OK)
+            return status;
+        for (int j = 0; j < 8; j++, out += 8)
+            put_f64(out, value[j]);
     }
     return PF_OK;
 }

@@ -6,8 +6,11 @@
 
 #define PF_VECTOR_BYTES 64u /* xyz[3], uv[2], ray[3] */
 
-/* Writes PF_PROFILE_VECTORS vectors, spread over the domain of a checked camera. PF_ERR_DOMAIN: the camera cannot do
- * what its check promised. */
+/* The i-th vector of a checked camera, i < PF_PROFILE_VECTORS, as its eight numbers. PF_ERR_DOMAIN: the camera cannot
+ * do what its check promised. */
+pf_status pf_vectors_at(const pf_camera *camera, uint32_t i, double value[8]);
+
+/* Writes PF_PROFILE_VECTORS vectors, spread over the domain of a checked camera. Errors as pf_vectors_at. */
 pf_status pf_vectors_write(const pf_camera *camera, uint8_t *out);
 
 /* Recomputes `count` vectors. PF_OK; PF_ERR_FORMAT (not finite), PF_ERR_SELF_TEST (the camera disagrees). */

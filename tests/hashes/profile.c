@@ -1,17 +1,18 @@
-/* Encoding, decoding, and encoding again. */
-#include "pipefish/profile.h"
+/* Encoding with the integer self-test, decoding, checking, and encoding again. */
 #include "cameras.h"
 #include "hashes.h"
+#include "pipefish/profile_integers.h"
 
 #include <string.h>
 
 static pf_profile profile, back;
 static uint8_t bytes[2][PF_PROFILE_BINARY_MAX];
+static _Alignas(16) uint8_t workspace[32768];
 
 uint32_t hash_profile(size_t *ram)
 {
     uint32_t crc = 0;
-    *ram = sizeof profile + PF_PROFILE_BINARY_MAX;
+    *ram = sizeof profile + PF_PROFILE_BINARY_MAX + sizeof workspace;
     for (size_t c = 0; c < CAMERAS_COUNT; c++) {
         size_t n = 0, again = 0;
         memset(&profile, 0, sizeof profile);
@@ -24,8 +25,10 @@ uint32_t hash_profile(size_t *ram)
             profile.free_param[i] = (uint8_t)(i < 2 ? i : i + 1);
             profile.covariance[i * (i + 1) / 2 + i] = 0.125 * (i + 1);
         }
-        if (pf_profile_encode(&profile, bytes[0], sizeof bytes[0], &n, NULL) != PF_OK ||
+        if (pf_profile_integers_make(&profile, workspace, sizeof workspace) != PF_OK ||
+            pf_profile_encode(&profile, bytes[0], sizeof bytes[0], &n, NULL) != PF_OK ||
             pf_profile_decode(bytes[0], n, &back, NULL) != PF_OK ||
+            pf_profile_integers_check(&back, workspace, sizeof workspace, NULL) != PF_OK ||
             pf_profile_encode(&back, bytes[1], sizeof bytes[1], &again, NULL) != PF_OK || n != again ||
             memcmp(bytes[0], bytes[1], n) != 0)
             return 0;

@@ -133,16 +133,21 @@ def test_without_starts_on_trial_the_next_start_reverts(tmp_path: Path, crawler:
 def test_the_device_refuses_what_is_no_profile_for_it_and_says_why(crawler: Crawler):
     restart(crawler)
     changed = bytearray(NEW.to_binary())
-    changed[-4 - 64 + 24] ^= 0xFF  # the last vector's pixel; then an intact checksum
-    changed[-4 - 64 + 26] ^= 0xFF
-    changed[-4 - 64 + 29] ^= 0x01
+    pixel = len(changed) - 4 - 28 * 8 - 64 + 24  # of the last vector; then an intact checksum
+    changed[pixel] ^= 0xFF
+    changed[pixel + 2] ^= 0xFF
+    changed[pixel + 5] ^= 0x01
     changed[-4:] = crc32c(bytes(changed[:-4])).to_bytes(4, "little")
+    integers = bytearray(NEW.to_binary())
+    integers[-4 - 28 + 8] ^= 1  # one bit of the last ray
+    integers[-4:] = crc32c(bytes(integers[:-4])).to_bytes(4, "little")
     damaged = bytearray(NEW.to_binary())
     damaged[300] ^= 1
     with device(crawler) as flasher:
         flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
         for data, why in (
             (bytes(changed), "self_test: this device does not"),
+            (bytes(integers), "self_test: the fixed-point camera of this device"),
             (bytes(damaged), "checksum: the profile is damaged"),
             (camera("big", width=640).to_binary(), f"is for 640 x {HEIGHT}, the camera gives {WIDTH} x {HEIGHT}"),
             (b"JSON", "magic: this is not a profile"),

@@ -128,6 +128,7 @@ def test_stored_profiles_are_sound_and_listed(path):
     found = lensreport.check(cam)
     assert found["valid"], found["problems"]
     assert cam.name and found["round_trip_px"] < 1e-9
+    assert json.loads(path.read_text())["version"] == 2 and cam.provenance.model_choice
     assert f"| {path.name} |" in (ROOT / "calib_profiles" / "README.md").read_text()
 
 

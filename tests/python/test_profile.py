@@ -1,5 +1,6 @@
 """The forms of a profile: JSON of every version, its schema, and the binary as lib/profile/SPEC.md describes it."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 import pipefish as pf
 import spec_reader
-from pipefish import profile_json
+from pipefish import cli, profile_json
 from pipefish.errors import ProfileError
 from test_camera import make
 
@@ -135,7 +136,7 @@ def test_a_reader_made_from_the_specification_reads_the_binary_form():
     cam = make()
     data = cam.to_binary()
     read = spec_reader.read(data)
-    assert read["version"] == 2 and len(data) == 812 + 4 * 3 * 4 + 64 * 8
+    assert read["version"] == 2 and len(data) == 812 + 4 * 3 * 4 + 64 * 8 + 28 * 8
     for key in ("width", "height", "f_u", "f_v", "skew", "c_u", "c_v", "k2", "k3", "k4", "k5", "mirror", "pupil_e1"):
         assert read[key] == getattr(cam, key), key
     for key in ("theta_max", "circle_u", "circle_v", "circle_radius", "tilt", "cpoly", *spec_reader.ARRAYS):
@@ -148,7 +149,6 @@ def test_a_reader_made_from_the_specification_reads_the_binary_form():
     assert (read["views"], read["points"], read["held_out_views"]) == (origin.views, origin.points, 5)
     assert read["free"] == [pf.PARAMETERS.index(name) for name in cam.covariance_parameters]
     assert read["covariance"] == tuple(cam.covariance[np.tril_indices(3)])
-    assert read["integer_vectors"] == []
     unknown = make(rms_px=None, held_out_rms_px=None, covariance=None, covariance_parameters=(), theta_covered=None)
     read = spec_reader.read(unknown.to_binary())
     assert read["rms_px"] is None and read["held_out_rms_px"] is None and read["free"] == []
@@ -172,11 +172,39 @@ def test_the_vectors_are_what_the_model_says_and_cover_the_domain_up_to_the_rim(
 
 def test_a_profile_whose_vectors_disagree_is_refused():
     data = bytearray(make().to_binary())
-    at = len(data) - 4 - 64 + 24  # u of the last vector
+    at = len(data) - 4 - 28 * 8 - 64 + 24  # u of the last vector
     data[at : at + 8] = np.float64(np.frombuffer(data[at : at + 8])[0] + 1e-6).tobytes()
     data[-4:] = spec_reader.crc32c(bytes(data[:-4])).to_bytes(4, "little")
     with pytest.raises(ProfileError, match="self_test: this device does not project"):
         pf.Camera.from_binary(bytes(data))
+
+
+def test_the_integer_vectors_are_the_same_in_q16_and_q30():
+    read = spec_reader.read(make().to_binary())
+    vectors, integers = np.array(read["vectors"]), np.array(read["integer_vectors"])
+    assert len(integers) == 8
+    np.testing.assert_array_equal(integers[:, :2], np.floor(vectors[:, 3:5] * 2**16 + 0.5))
+    np.testing.assert_allclose(integers[:, 2:5] / 2**30, vectors[:, 5:], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(integers[:, 5:], integers[:, :2], rtol=0, atol=8)
+
+
+def test_a_profile_with_one_wrong_bit_in_an_integer_vector_is_refused(tmp_path, capsys):
+    data = bytearray(make().to_binary())
+    data[-4 - 28 + 8] ^= 1  # x of the last ray
+    data[-4:] = spec_reader.crc32c(bytes(data[:-4])).to_bytes(4, "little")
+    with pytest.raises(ProfileError, match="self_test: the fixed-point camera of this device"):
+        pf.Camera.from_binary(bytes(data))
+    path = tmp_path / "camera.profile"
+    path.write_bytes(data)
+    assert cli.main(["profile", "check", str(path)]) == 1
+    assert "self_test: the fixed-point camera of this device" in capsys.readouterr().err
+
+
+def test_a_lens_beyond_fixed_point_has_no_integer_vectors():
+    lens = make(radial="perspective", k2=0.0, k3=0.0, k4=0.0, k5=0.0, mirror=0.0, theta_max=1.5707, theta_covered=1.0)
+    lens = dataclasses.replace(lens, covariance=None, covariance_parameters=())
+    assert spec_reader.read(lens.to_binary())["integer_vectors"] == []
+    assert pf.Camera.from_binary(lens.to_binary()).theta_max == 1.5707
 
 
 def test_the_binary_of_version_1_loads(tmp_path):

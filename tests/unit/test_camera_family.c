@@ -240,6 +240,41 @@ static void test_round_trip_over_the_whole_domain(void)
     }
 }
 
+/* Proves: where the projection is so steep (r' up to 1e7) that neither a pixel 2e6 px away nor an angle in doubles is
+ * within 5e-10 px of anything, valid pixels still have their rays, as exactly as a ray can tell (4e-15 rad). */
+static void test_round_trip_where_the_plane_is_huge(void)
+{
+    for (int variant = 0; variant < 3; variant++) {
+        pf_camera camera = {.width = 1280,
+                            .height = 800,
+                            .radial = PF_RADIAL_STEREOGRAPHIC,
+                            .f_u = 354.6875,
+                            .f_v = 354.3125,
+                            .skew = -.65625,
+                            .c_u = 643.59375,
+                            .c_v = 404.75,
+                            .theta_max = 3.141,
+                            .asym_radial_phi = {.5, .5, -.5, .5}};
+        camera.asym_radial_theta[0] = variant == 1 ? -.001953125 : .0078125;
+        camera.asym_radial_theta[1] = camera.asym_radial_theta[2] = variant == 1 ? -.001953125 : 0;
+        if (variant == 2)
+            camera.tilt[0] = 1e-8;
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_check(&camera, NULL));
+        for (int i = 0; i <= 64; i++)
+            for (int j = 0; j < 32; j++) {
+                double theta = camera.theta_max * (i <= 32 ? i / 32.0 : 1 - exp2(32 - i)), phi = .1 + j * .19635;
+                double xyz[3] = {sin(theta) * cos(phi), sin(theta) * sin(phi), cos(theta)}, uv[2], back[2], slope[6];
+                double ray[3], steepest = 0;
+                TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_project(&camera, xyz, uv, slope, NULL));
+                TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_unproject(&camera, uv, ray, NULL, NULL));
+                TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_project(&camera, ray, back, NULL, NULL));
+                for (int k = 0; k < 6; k++)
+                    steepest += fabs(slope[k]);
+                TEST_ASSERT_TRUE(hypot(back[0] - uv[0], back[1] - uv[1]) <= 1e-9 + 4e-15 * steepest);
+            }
+    }
+}
+
 /* Proves: a pixel outside the image of the domain is refused, just inside accepted, whatever the asymmetry: the rim is
  * moved by 1e-6 rad. */
 static void test_unproject_refuses_beyond_the_rim(void)
@@ -575,6 +610,7 @@ int main(void)
     RUN_TEST(test_elementary_functions_equal_long_double);
     RUN_TEST(test_project_equals_the_definition);
     RUN_TEST(test_round_trip_over_the_whole_domain);
+    RUN_TEST(test_round_trip_where_the_plane_is_huge);
     RUN_TEST(test_unproject_refuses_beyond_the_rim);
     RUN_TEST(test_unproject_refuses_the_impossible);
     RUN_TEST(test_derivatives_equal_finite_differences);

@@ -1,5 +1,5 @@
 /* The profile's binary format: what is written is read, old images load, and no damage passes. */
-#include "pipefish/profile.h"
+#include "profile_samples.h"
 #include "unity.h"
 
 #include <math.h>
@@ -10,48 +10,6 @@ void tearDown(void) {}
 
 #define COVARIANCE_AT 808u
 #define VECTORS_AT    (COVARIANCE_AT + 3 * 8u) /* of sample() */
-
-static pf_profile sample(void)
-{
-    pf_profile profile;
-    memset(&profile, 0, sizeof profile);
-    profile.camera.width = 1280;
-    profile.camera.height = 800;
-    profile.camera.f_u = 356.25;
-    profile.camera.f_v = 355.875;
-    profile.camera.skew = 0.125;
-    profile.camera.c_u = 647.5;
-    profile.camera.c_v = 404.75;
-    profile.camera.k2 = -0.03125;
-    profile.camera.k3 = 0.00390625;
-    profile.camera.k4 = -0.0009765625;
-    profile.camera.k5 = 0.00006103515625;
-    profile.camera.theta_max = 1.625;
-    profile.camera.circle_u = 640.5;
-    profile.camera.circle_v = 400.5;
-    profile.camera.circle_radius = 560.25;
-    strcpy(profile.name, "Golden \xC3\xB6 1");
-    strcpy(profile.serial, "SN-42");
-    profile.source = PF_SOURCE_TARGET;
-    profile.created_unix_s = 1700000000;
-    profile.rms_px = 0.25;
-    profile.held_out_rms_px = 0.3125;
-    profile.theta_covered = 1.5;
-    strcpy(profile.lens, "f/2 1.6 mm");
-    strcpy(profile.tool, "pipefish");
-    strcpy(profile.tool_version, "0.1.0");
-    strcpy(profile.model_choice, "p9: least error on held-out views");
-    profile.views = 20;
-    profile.points = 1760;
-    profile.held_out_views = 5;
-    profile.free_count = 2;
-    profile.free_param[0] = 0;
-    profile.free_param[1] = 8;
-    profile.covariance[0] = 0.25;
-    profile.covariance[1] = -0.0625;
-    profile.covariance[2] = 0.5;
-    return profile;
-}
 
 /* What version 1 has of sample(), as it wrote it. Devices hold such images: this must never change. */
 static const char GOLDEN_1[] = "5046505201000000640200000100000000f1536500000000000000000000d03f000000000000f83f"
@@ -114,17 +72,6 @@ static size_t encode_ok(const pf_profile *profile, uint8_t *out)
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_profile_encode(profile, out, PF_PROFILE_BINARY_MAX, &n, &why), why);
     TEST_ASSERT_EQUAL_STRING("ok", why);
     return n;
-}
-
-static void put_u32(uint8_t *p, uint32_t value)
-{
-    for (int i = 0; i < 4; i++)
-        p[i] = (uint8_t)(value >> (8 * i));
-}
-
-static void repair(uint8_t *bytes, size_t n)
-{
-    put_u32(bytes + n - 4, pf_crc32c(0, bytes, n - 4));
 }
 
 /* Expects a refusal that leaves the profile as it was and names the field. */
@@ -219,6 +166,8 @@ static void assert_round_trip(const pf_profile *profile)
     TEST_ASSERT_EQUAL_UINT32(profile->free_count, back.free_count);
     TEST_ASSERT_EQUAL_MEMORY(profile->free_param, back.free_param, sizeof back.free_param);
     TEST_ASSERT_EQUAL_MEMORY(profile->covariance, back.covariance, sizeof back.covariance);
+    TEST_ASSERT_EQUAL_UINT32(profile->integers_count, back.integers_count);
+    TEST_ASSERT_EQUAL_MEMORY(profile->integers, back.integers, sizeof back.integers);
 }
 
 /* Proves: every field survives, at its extremes too, and with 0 to 40 free parameters. */
@@ -227,6 +176,11 @@ static void test_round_trip_of_every_field_and_extreme(void)
     static pf_profile profile;
     profile = sample();
     assert_round_trip(&profile);
+    for (int32_t i = 0; i < (int32_t)PF_PROFILE_INTEGERS; i++) {
+        profile.integers[i] = (pf_profile_integers){{INT32_MIN, INT32_MAX}, {i, -i, 1 << 30}, {65536 * i, -0x01020304}};
+        profile.integers_count = (uint32_t)i + 1;
+        assert_round_trip(&profile);
+    }
     for (uint32_t count = 0; count <= PF_PROFILE_FREE_MAX; count++) {
         profile = sample();
         memset(profile.covariance, 0, sizeof profile.covariance);
@@ -393,7 +347,7 @@ static void test_bad_fields_are_refused_and_named(void)
         {800, 1, 0, PF_ERR_FORMAT, "vectors"},
         {800, 1, 9, PF_ERR_FORMAT, "vectors"},
         {800, 1, 7, PF_ERR_FORMAT, "length"},
-        {804, 1, 9, PF_ERR_FORMAT, "fixed_vectors"},
+        {804, 1, 9, PF_ERR_FORMAT, "integers"},
         {804, 1, 1, PF_ERR_FORMAT, "length"},
         {COVARIANCE_AT + 7, 1, 0xBF, PF_ERR_FORMAT, "covariance"},
         {COVARIANCE_AT, 8, 0xFF, PF_ERR_FORMAT, "covariance"},
@@ -455,41 +409,6 @@ static void test_a_profile_that_disagrees_is_refused(void)
             refused(PF_ERR_FORMAT, bytes, n, "self_test");
             memcpy(p, kept, 8);
         }
-    put_u32(bytes + 804, 1); /* one integer vector */
-    memmove(bytes + n + 24, bytes + n - 4, 4);
-    memset(bytes + n - 4, 0, 28);
-    put_u32(bytes + 8, (uint32_t)n + 28);
-    repair(bytes, n + 28);
-    refused(PF_ERR_UNSUPPORTED, bytes, n + 28, "fixed_vectors");
-}
-
-/* Cameras of the whole family; the n-th. */
-static pf_camera family(uint32_t n)
-{
-    static const double unit[4] = {0.5, -0.1, 0.7, 0.5}; /* of norm 1 */
-    pf_camera c = sample().camera;
-    c.radial = n < 7 ? n : PF_RADIAL_GENERIC;
-    if (c.radial != PF_RADIAL_GENERIC)
-        c.k2 = c.k3 = c.k4 = c.k5 = 0;
-    if (c.radial == PF_RADIAL_UNIFIED)
-        c.mirror = 1.25;
-    c.theta_max = n == PF_RADIAL_PERSPECTIVE || n == PF_RADIAL_ORTHOGRAPHIC ? 1.25 : c.theta_max;
-    for (uint32_t i = 0; (n == 7 || n == 10) && i < 3; i++) {
-        c.asym_radial_theta[i] = 0.01 / (i + 1);
-        c.asym_tangential_theta[i] = -0.005 / (i + 1);
-    }
-    if (n == 7 || n == 10) {
-        memcpy(c.asym_radial_phi, unit, sizeof unit);
-        memcpy(c.asym_tangential_phi, unit, sizeof unit);
-    }
-    for (uint32_t i = 0; n >= 8 && n != 9 && i < PF_CPOLY_MAX; i++)
-        c.cpoly[i] = (i % 2 ? -1e-3 : 1e-3) * (i + 1) / 10;
-    if (n >= 9) {
-        c.tilt[0] = 0.05;
-        c.tilt[1] = -0.03;
-        c.pupil_e1 = 2e-3;
-    }
-    return c;
 }
 
 /* Proves: the self-test of every model sees each of its parameters: with one of them off by a millionth the intact
@@ -579,6 +498,9 @@ static void test_encode_refuses(void)
     memset(bytes, 0x5A, sizeof bytes);
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_profile_encode(&profile, bytes, sizeof GOLDEN_2 / 2 - 1, &n, &why));
     TEST_ASSERT_EACH_EQUAL_HEX8(0x5A, bytes, sizeof bytes);
+    profile.integers_count = 9;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
+    profile = sample();
     profile.free_count = 41;
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why));
     profile = sample();

@@ -1,6 +1,6 @@
 // The camera model and its profile for Python: _engine.Profile is pf_profile itself, so other rooms' bindings take a
 // camera as `const pf_profile &`. pipefish/camera.py is the class that people use; it checks types and names keys.
-#include "pipefish/profile.h"
+#include "pipefish/profile_integers.h"
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cstddef>
 #include <cstring>
 #include <limits>
 #include <memory>
@@ -126,11 +127,22 @@ void set_covariance(pf_profile &profile, const std::vector<uint8_t> &params, con
     std::copy(lower.begin(), lower.end(), profile.covariance);
 }
 
-nb::bytes encode(const pf_profile &profile)
+std::vector<std::max_align_t> fixed_workspace(const pf_profile &profile)
+{
+    return std::vector<std::max_align_t>(pf_camera_fixed_workspace_size(&profile.camera) / sizeof(std::max_align_t) +
+                                         1);
+}
+
+// With integer self-test vectors wherever the camera can be built in fixed point.
+nb::bytes encode(pf_profile &profile)
 {
     std::array<uint8_t, PF_PROFILE_BINARY_MAX> buffer;
     size_t n = 0;
     const char *why = nullptr;
+    if (pf_camera_check(&profile.camera, &why) != PF_OK)
+        throw nb::value_error(why);
+    std::vector<std::max_align_t> workspace = fixed_workspace(profile);
+    (void)pf_profile_integers_make(&profile, workspace.data(), workspace.size() * sizeof(std::max_align_t));
     if (pf_profile_encode(&profile, buffer.data(), buffer.size(), &n, &why) != PF_OK)
         throw nb::value_error(why);
     return nb::bytes(buffer.data(), n);
@@ -141,6 +153,10 @@ pf_profile decode(const nb::bytes &bytes)
     pf_profile profile;
     const char *why = nullptr;
     if (pf_profile_decode(static_cast<const uint8_t *>(bytes.data()), bytes.size(), &profile, &why) != PF_OK)
+        throw nb::value_error(why);
+    std::vector<std::max_align_t> workspace = fixed_workspace(profile);
+    if (pf_profile_integers_check(&profile, workspace.data(), workspace.size() * sizeof(std::max_align_t), &why) !=
+        PF_OK)
         throw nb::value_error(why);
     return profile;
 }

@@ -254,6 +254,10 @@ static pf_status make_plan(plan *p, const pf_camera *camera)
     return PF_OK;
 }
 
+_Static_assert(sizeof(pf_camera_fixed) + (INTERVALS_MAX + 1) * CHANNELS_MAX * sizeof(knot) <=
+                   PF_CAMERA_FIXED_WORKSPACE_MAX,
+               "PF_CAMERA_FIXED_WORKSPACE_MAX");
+
 static size_t plan_size(const plan *p)
 {
     return sizeof(pf_camera_fixed) + (size_t)(p->fixed.intervals + 1) * p->fixed.channels * sizeof(knot);

@@ -34,7 +34,7 @@ pf_ray_q30 pf_camera_rays_at(const pf_camera_rays *rays, pf_point_q16 pixel)
 void pf_camera_rays_lookup(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out)
 {
     size_t i = 0;
-#if defined(__SSE2__)
+#ifdef PF_SIMD
     i = pf_fixed_lookup_fours(rays, n, pixels, out);
 #endif
     for (; i < n; i++)

@@ -34,7 +34,7 @@ static inline int32_t within_cell(uint32_t at, uint32_t step_bits)
 
 pf_ray_q30 pf_fixed_cell_ray(const ray_cell *cell, int32_t s, int32_t t);
 
-#if defined(__SSE2__)
+#ifdef PF_SIMD
 /* Looks up four at a time; returns how many it did, all but up to three. */
 size_t pf_fixed_lookup_fours(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out);
 #endif

@@ -62,18 +62,19 @@ static plane_angle moved(const pf_camera *camera, plane_angle at, double radial,
 }
 
 /* Newton on the whole map in the chart (X, Y), where the axis is an ordinary point; a step that does not come closer is
- * halved. pf_camera_check has proved the map one-to-one on the disc, so what stops with a residual lies outside. */
+ * halved. pf_camera_check has proved the map one-to-one on the disc, so what stops with a residual lies outside, unless
+ * the next step is less than a ray can tell: where r' is huge, the last bit of theta is more than the slack. */
 static bool asymmetric_inverse(const pf_camera *camera, camera_kind kind, double x, double y, double slack,
                                plane_angle *out)
 {
     plane_angle at = first_order_start(camera, kind, x, y);
     lens_point lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s);
-    double e[2], cost = residual(&lens, at, x, y, e);
+    double e[2], cost = residual(&lens, at, x, y, e), step = 0;
     for (int i = 0; i < 100 && cost > 0; i++) {
         double det = lens.r_t * lens.t_p - lens.r_p * lens.t_t;
         double radial = -(lens.t_p * e[0] - lens.r_p * e[1]) / det;
         double tangential = -(lens.r_t * e[1] - lens.t_t * e[0]) / det;
-        double step = sqrt(radial * radial + tangential * tangential);
+        step = sqrt(radial * radial + tangential * tangential);
         if (step <= DBL_EPSILON * at.theta)
             break;
         /* A step of this size that does not come closer is rounding, not the wrong way. */
@@ -95,7 +96,7 @@ static bool asymmetric_inverse(const pf_camera *camera, camera_kind kind, double
         e[1] = next_e[1];
     }
     *out = at;
-    return cost <= slack * slack;
+    return cost <= slack * slack || step <= THETA_SLACK;
 }
 
 /* Derivative of the ray by the pixel: through the inverse of the lens's Jacobian at the result. */
@@ -120,6 +121,17 @@ static void by_pixel(const pf_camera *camera, camera_kind kind, plane_angle at, 
     }
 }
 
+/* How far outside the image of theta_max a plane point (x, y) may lie: RIM_SLACK_PX, and what the operations between it
+ * and the pixel round, which is more where the projection is huge or the tilt magnifies. */
+static double rim_slack(const pf_camera *camera, sensor_tilt tilt, double x, double y, double d)
+{
+    double coarsest = (camera->f_u > camera->f_v ? camera->f_u : camera->f_v) + fabs(camera->skew);
+    double size = fabs(x) + fabs(y);
+    double magnified = d * (1 + (fabs(tilt.along_x) + fabs(tilt.along_y)) * size);
+    double on_sensor = size / d + fabs(camera->c_u) / camera->f_u + fabs(camera->c_v) / camera->f_v;
+    return RIM_SLACK_PX / coarsest + 8 * DBL_EPSILON * magnified * on_sensor;
+}
+
 pf_status pf_camera_unproject(const pf_camera *camera, const double uv[2], double ray[3], double origin[3],
                               double *d_ray_d_uv)
 {
@@ -134,8 +146,7 @@ pf_status pf_camera_unproject(const pf_camera *camera, const double uv[2], doubl
     if (!(inverse_d > 0 && x * x + y * y <= POINT_MAX))
         return PF_ERR_DOMAIN;
 
-    double coarsest = (camera->f_u > camera->f_v ? camera->f_u : camera->f_v) + fabs(camera->skew);
-    double slack = RIM_SLACK_PX / coarsest;
+    double slack = rim_slack(camera, tilt, x, y, d);
     plane_angle at;
     if (kind.asymmetric || kind.cpoly) {
         if (!asymmetric_inverse(camera, kind, x, y, slack, &at))

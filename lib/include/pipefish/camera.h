@@ -106,7 +106,7 @@ pf_status pf_camera_project(const pf_camera *camera, const double xyz[3], double
 
 /* Back-projects a pixel to the ray X = origin + s ray, s > 0, |ray| = 1: the first-order rule of Paper II as the start,
  * then safeguarded Newton. The round trip is within 1e-9 px for f <= 1e4 px and sum |k_i| theta_max^(2i-1) <= 100, the
- * rim included.
+ * rim included; where a radian is more than 1e5 px, within what a ray in doubles can tell: 4e-15 rad.
  * out: ray[3]; origin[3] or NULL (zero for a central camera); d_ray_d_uv, row-major 3x2, or NULL
  * Returns PF_OK, or with the outputs untouched PF_ERR_DOMAIN: outside the image of theta <= theta_max, or not finite.
  */

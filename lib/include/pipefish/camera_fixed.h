@@ -30,8 +30,10 @@ extern "C" {
 /* Opaque; lives in the caller's workspace, read-only once built: any number of threads may use it. */
 typedef struct pf_camera_fixed pf_camera_fixed;
 
+#define PF_CAMERA_FIXED_WORKSPACE_MAX 214000u
+
 /* Bytes of workspace for this checked camera; 0 where it cannot be built, see below. 2 KB for ordinary symmetric
- * lenses, 214 KB at most. */
+ * lenses, PF_CAMERA_FIXED_WORKSPACE_MAX at most. */
 size_t pf_camera_fixed_workspace_size(const pf_camera *camera);
 
 /* Builds the tables: some 500 evaluations of r(theta). `camera` is not kept. Returns PF_OK and *fixed (inside

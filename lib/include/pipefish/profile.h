@@ -16,6 +16,7 @@ extern "C" {
 #define PF_PROFILE_FREE_MAX   40u   /* most parameters with a covariance */
 #define PF_PROFILE_BINARY_MAX 8192u /* most bytes an encoded profile can take */
 #define PF_PROFILE_VECTORS    8u    /* self-test vectors that encode writes, and the most that decode takes */
+#define PF_PROFILE_INTEGERS   8u    /* most integer self-test vectors */
 
 typedef enum pf_profile_source {
     PF_SOURCE_UNKNOWN = 0,
@@ -24,6 +25,13 @@ typedef enum pf_profile_source {
     PF_SOURCE_IMPORTED = 3,  /* converted from another tool's file */
     PF_SOURCE_SIMULATED = 4, /* fitted to a simulator's lens */
 } pf_profile_source;
+
+/* What the fixed-point camera must compute, exactly: the ray of a pixel, and the pixel that this ray projects to. */
+typedef struct pf_profile_integers {
+    pf_point_q16 pixel;
+    pf_ray_q30 ray;
+    pf_point_q16 back;
+} pf_profile_integers;
 
 typedef struct pf_profile {
     pf_camera camera;
@@ -42,17 +50,20 @@ typedef struct pf_profile {
     uint32_t free_count;                     /* 0 = no covariance */
     uint8_t free_param[PF_PROFILE_FREE_MAX]; /* pf_camera_param, increasing */
     double covariance[PF_PROFILE_FREE_MAX * (PF_PROFILE_FREE_MAX + 1) / 2]; /* lower triangle by rows */
+    uint32_t integers_count; /* 0 = no integer self-test; pipefish/profile_integers.h makes and checks it */
+    pf_profile_integers integers[PF_PROFILE_INTEGERS];
 } pf_profile;
 
-/* Encodes into out[capacity], with self-test vectors as this build computes them, and checks as decode does: what this
- * writes, decode reads. *n gets the bytes written.
+/* Encodes into out[capacity], with self-test vectors as this build computes them (the integer ones are the profile's),
+ * and checks as decode does: what this writes, decode reads. *n gets the bytes written.
  * Returns PF_OK or, with out[] undefined, PF_ERR_SPACE, PF_ERR_ARGUMENT (a value, string or count out of range),
  * PF_ERR_DOMAIN, PF_ERR_UNSUPPORTED (the camera; see pf_camera_check). `why` (may be NULL): as of decode. */
 pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capacity, size_t *n, const char **why);
 
 /* Decodes and checks everything: length, checksum, version, strings, ranges, finiteness, pf_camera_check, variances not
  * negative, correlations within -1..1, and the self-test: each vector is recomputed, and must agree within 1e-9 px and
- * 1e-12 of a unit ray. Reads exactly one profile: bytes left over are PF_ERR_FORMAT.
+ * 1e-12 of a unit ray. Integer vectors are only read: this room does not know the fixed-point camera, see
+ * pf_profile_integers_check. Reads exactly one profile: bytes left over are PF_ERR_FORMAT.
  * Returns PF_OK or, with *profile untouched:
  *      PF_ERR_TRUNCATED, PF_ERR_CHECKSUM, PF_ERR_VERSION, PF_ERR_FORMAT (not a profile, or a value out of range),
  *      PF_ERR_DOMAIN, PF_ERR_UNSUPPORTED (the camera; see pf_camera_check),
