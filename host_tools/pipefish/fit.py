@@ -246,6 +246,7 @@ def fit_camera(
         _minimise(profile, names, xyz, uv)
     if even:
         _even_out(profile, names, xyz, uv)
-    profile.theta_max = max(profile.theta_max, theta_max or 0.0)
+    if theta_max is not None:
+        profile.theta_max = max(float(theta.max()), theta_max)
     camera = Camera(**{key: getattr(profile, key) for key in _FIELDS}, **about)
     return camera, compare(xyz, uv, camera.project(xyz)[0])

@@ -15,7 +15,7 @@ from ..errors import ProfileError
 from ..lenses import Lens
 
 BYTES_MAX = 4 << 20  # a splined model of 60 x 40 control points is 120 kB
-YAML_MAX = 512 << 10  # PyYAML reads some 100 kB a second; a calibration of 50 pictures with all its points is 200 kB
+YAML_MAX = 512 << 10  # PyYAML reads some 200 kB a second; a calibration of 50 pictures with all its points is 200 kB
 
 
 class Found:
