@@ -49,7 +49,7 @@ def _accept(form: str, camera: Camera, fit: Fit, wanted: Wanted, lost: list[str]
     if camera.pupil_e1:
         near = abs(camera.pupil_e1) * fit.theta_max**2 * math.sin(fit.theta_max) * camera.f_u
         notes.append(f"the pupil shift is lost: right for far points, up to {near / 0.1:.2g} px off at 0.1 m")
-    if wanted.max_theta is not None and fit.theta_max < camera.theta_max - 1e-3:
+    if wanted.max_theta is not None and fit.theta_max > wanted.max_theta - 1e-3:
         notes.append(f"holds up to {math.degrees(fit.theta_max):.1f} degrees only")
     return notes
 
