@@ -5,7 +5,6 @@ docs/profile.md describes the parameters and the JSON form, lib/profile/SPEC.md 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import datetime
 import math
@@ -20,6 +19,7 @@ import numpy.typing as npt
 from . import _engine, profile_json
 from .camera_sources import Sources
 from .errors import ArgumentError, ProfileError
+from .files import write_atomically
 from .profile_json import (
     ARRAYS,
     CIRCLE,
@@ -334,18 +334,7 @@ class Camera(Sources):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the profile as JSON; the file appears whole or not at all. Raises OSError where it cannot."""
-        target = Path(path)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-        try:
-            with open(temporary, "w", encoding="utf-8") as file:
-                file.write(self.to_json())
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+        write_atomically(Path(path), self.to_json().encode())
 
     def to_json(self) -> str:
         """The JSON form that people read, as `save` writes it."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import lenses
-from .errors import ArgumentError
+from .errors import ArgumentError, ProfileError
 
 if TYPE_CHECKING:
     from .camera import Camera
@@ -140,6 +140,9 @@ class Sources:
 
 def _lens(kind: Any, parameters: dict[str, Any]) -> Any:
     try:
-        return kind(**parameters)
+        lens = kind(**parameters)
     except TypeError as error:
         raise ArgumentError(f"{kind.__name__}: {str(error).partition('() ')[2] or error}") from None
+    if wrong := lens.wrong():
+        raise ProfileError(None, *wrong)
+    return lens

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pipefish.cli import Result, add_command, not_negative, positive, table
-from pipefish.errors import ProfileError
+from pipefish.cli import Result, UsageError, add_command, not_negative, positive, table
+from pipefish.errors import ArgumentError, ProfileError
 
 # The forms of `profile convert --to`: formats.WRITERS, whose import costs time here, and our own two.
 WRITTEN = ("json", "binary", "opencv-fisheye", "ros", "kalibr", "colmap", "basalt", "orbslam3", "mrcal", "toolbox")
@@ -99,7 +99,6 @@ def run_profile_show(args: argparse.Namespace) -> Result:
 
 
 def run_profile_check(args: argparse.Namespace) -> Result:
-    from pipefish.errors import ProfileError
     from pipefish.lensreport import check
 
     loaded = load_profile(args)
@@ -123,24 +122,18 @@ def run_profile_check(args: argparse.Namespace) -> Result:
 
 
 def run_profile_convert(args: argparse.Namespace) -> Result:
+    from pipefish.files import write_atomically
     from pipefish.formats import write
-    from pipefish.show import write_atomically
 
     loaded, out = load_profile(args), Path(args.out)
     camera, fit, notes = loaded.camera, loaded.fit, list(loaded.notes)
     form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
     if form in ("json", "binary"):
-        if args.model != "auto" and loaded.fit is None:
-            camera, fit = camera.to_generic(args.model, max_theta=_radians(args.max_theta))
-            if not fit.max_px <= args.max_error:
-                raise ProfileError(
-                    args.profile, None, f"{args.model} does not fit: {fit}; see --max-error, --max-theta"
-                )
         write_atomically(out, camera.to_json().encode() if form == "json" else camera.to_binary())
-        written_fit = None
+        written_fit, reach = None, camera.theta_max
     else:
         written = write(camera, out, form, max_error=args.max_error, max_theta=_radians(args.max_theta))
-        written_fit = written.fit
+        written_fit, reach = written.fit, written.fit.theta_max  # other formats do not say where they end
         notes += written.notes
     document = {
         "file": str(out),
@@ -149,14 +142,14 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
         "read_as": loaded.form,
         "read_fit": fit_document(fit),
         "written_fit": fit_document(written_fit),
+        "field_of_view_deg": 2 * math.degrees(reach),
         "notes": notes,
     }
-    field = f"{2 * math.degrees(camera.theta_max):.1f} deg"
     rows = [
         ("written", f"{out}: {form}, {document['bytes']} bytes"),
         ("read as", f"{loaded.form}, {fit}" if fit else loaded.form),
         ("written as", f"{form}, {written_fit}" if written_fit else None),
-        ("field of view", field),
+        ("field of view", f"{2 * math.degrees(reach):.1f} deg"),
         *(("note", note) for note in notes if note not in loaded.notes),
     ]
     return document, table(rows)
@@ -170,19 +163,24 @@ def run_undistort(args: argparse.Namespace) -> Result:
     from pipefish.undistort import undistort
     from pipefish.views import FAR
 
+    if args.view == "cube" and args.fov is not None:
+        raise UsageError("undistort: --fov does not go with --view cube, whose faces cover 90 degrees each")
     camera = load_profile(args).camera
-    document = undistort(
-        Path(args.input),
-        Path(args.output),
-        camera,
-        view=args.view,
-        fov=args.fov,
-        size=args.size,
-        turn=args.rotate,
-        distance=args.distance or FAR,
-        mask=None if args.mask is None else Path(args.mask),
-        quiet=args.json,
-    )
+    try:
+        document = undistort(
+            Path(args.input),
+            Path(args.output),
+            camera,
+            view=args.view,
+            fov=args.fov,
+            size=args.size,
+            turn=args.rotate,
+            distance=FAR if args.distance is None else args.distance,
+            mask=None if args.mask is None else Path(args.mask),
+            quiet=args.json,
+        )
+    except ArgumentError as error:  # a field of view, size or file name that no view can have
+        raise UsageError(f"undistort: {error}") from None
     at = document["exact_at_m"]
     exact = f"at {at:g} m from the camera" if at else "for far points; --distance for near ones"
     rows = [
@@ -201,6 +199,14 @@ def size_of(text: str) -> tuple[int, int]:
     return positive(width), positive(height or width)
 
 
+def above_zero(text: str) -> float:
+    """An argument that is a finite number above zero."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{value:g} is not a number above zero")
+    return value
+
+
 def angles(text: str) -> tuple[float, float, float]:
     """An argument like 30,0,-5: yaw, pitch and roll in degrees; what is left out is zero."""
     parts = [float(part) for part in text.split(",")]
@@ -211,7 +217,7 @@ def angles(text: str) -> tuple[float, float, float]:
 
 def add_profile_input(parser: argparse.ArgumentParser) -> None:
     """Options of everything that reads a profile: how to take another program's file."""
-    group = parser.add_argument_group("for calibrations of other programs")
+    group = parser.add_argument_group("how to take the profile, or another program's calibration")
     group.add_argument("--from", metavar="FORMAT", help="what the file is [told by its content]; docs/formats.md")
     group.add_argument("--camera", metavar="NAME", help="which camera, by name or number, of a file of several [first]")
     group.add_argument("--camera-size", type=size_of, metavar="WxH", help="picture size, where the file does not say")
@@ -219,7 +225,7 @@ def add_profile_input(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--max-error", type=not_negative, default=0.1, metavar="PX", help="largest error allowed of a fit [0.1]"
     )
-    group.add_argument("--max-theta", type=not_negative, metavar="DEG", help="take no more than DEG off the axis")
+    group.add_argument("--max-theta", type=above_zero, metavar="DEG", help="take no more than DEG off the axis")
 
 
 def add_profile(commands: Any) -> None:
@@ -286,7 +292,7 @@ def add_profile(commands: Any) -> None:
     )
     p.add_argument(
         "--distance",
-        type=not_negative,
+        type=above_zero,
         metavar="M",
         help="where the view of a camera with a pupil shift is exact, metres [far]",
     )

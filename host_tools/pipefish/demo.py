@@ -230,8 +230,8 @@ def demo(
     Raises PipefishError, with the log of the program that failed; OSError.
     """
     from pipefish.evaluate import evaluate
+    from pipefish.files import write_atomically
     from pipefish.page import write_page
-    from pipefish.show import write_atomically
     from pipefish.simulate import Scene
     from pipefish.survey import Survey
 

@@ -100,7 +100,7 @@ def _linear_start(points: Array, pixels: Array, radial: int) -> dict[str, float]
 
 
 def _asymmetric_start(profile: Any, points: Array, residual: Array) -> None:
-    """CALIBRATION-free start of the 14 asymmetric terms (their zero is a saddle): the unfactored 3 x 4 coefficients of
+    """Start values of the 14 asymmetric terms, whose zero is a saddle: the unfactored 3 x 4 coefficients of
     the radial and the tangential residual are linear; their best rank-one parts are the factors."""
     theta = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
     phi = np.arctan2(points[:, 1], points[:, 0])
@@ -246,6 +246,7 @@ def fit_camera(
         _minimise(profile, names, xyz, uv)
     if even:
         _even_out(profile, names, xyz, uv)
-    profile.theta_max = max(profile.theta_max, theta_max or 0.0)
+    if theta_max is not None:
+        profile.theta_max = max(float(theta.max()), theta_max)
     camera = Camera(**{key: getattr(profile, key) for key in _FIELDS}, **about)
     return camera, compare(xyz, uv, camera.project(xyz)[0])

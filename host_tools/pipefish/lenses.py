@@ -30,6 +30,17 @@ class Lens:
     width: int
     height: int
 
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        """What the model's definition wants of its parameters: name -> (value, whether it is in range)."""
+        return {}
+
+    def wrong(self) -> tuple[str, str] | None:
+        """The first parameter outside the model's definition, and the reason; None if all are within."""
+        for name, (value, fine) in self.ranges().items():
+            if not fine:
+                return name, f"{value:g} is outside the definition of the model {type(self).__name__}"
+        return None
+
     def project(self, points: Array) -> tuple[Array, Mask]:
         """(N, 3) -> (N, 2) pixels, (N,) whether the model holds there."""
         raise NotImplementedError
@@ -48,6 +59,9 @@ class CentredLens(Lens):
     cx: float
     cy: float
     skew: float = 0.0
+
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {"fx": (self.fx, self.fx > 0), "fy": (self.fy, self.fy > 0)}
 
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         """The image point before focal length and principal point, and where it is valid."""
@@ -144,6 +158,9 @@ class FieldOfView(CentredLens):
 
     omega: float
 
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {**super().ranges(), "omega": (self.omega, 0 < self.omega < math.pi)}
+
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         theta, a, b = _angles(x, y, z)
         r = np.arctan(2 * math.tan(self.omega / 2) * np.tan(theta)) / self.omega
@@ -157,6 +174,9 @@ class Unified(CentredLens):
     xi: float
     radial: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
+
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {**super().ranges(), "xi": (self.xi, self.xi > -1)}
 
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         length = np.sqrt(x * x + y * y + z * z)
@@ -179,6 +199,9 @@ class DoubleSphere(CentredLens):
     xi: float
     alpha: float
 
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {**super().ranges(), "xi": (self.xi, self.xi > -1), "alpha": (self.alpha, 0 <= self.alpha <= 1)}
+
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         d1 = np.sqrt(x * x + y * y + z * z)
         shifted = self.xi * d1 + z
@@ -199,6 +222,9 @@ class ExtendedUnified(CentredLens):
 
     alpha: float
     beta: float
+
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {**super().ranges(), "alpha": (self.alpha, 0 <= self.alpha <= 1), "beta": (self.beta, self.beta > 0)}
 
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         denominator = self.alpha * np.sqrt(self.beta * (x * x + y * y) + z * z) + (1 - self.alpha) * z
@@ -236,6 +262,9 @@ class RadialPolynomial(CentredLens):
 
     coefficients: tuple[float, ...]
 
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        return {**super().ranges(), "k1": (self.coefficients[0], self.coefficients[0] > 0)}
+
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         theta, a, b = _angles(x, y, z)
         r = theta * np.polyval(self.coefficients[::-1], theta)
@@ -258,6 +287,10 @@ class OCam(Lens):
     cx: float
     cy: float
     stretch: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
+
+    def ranges(self) -> dict[str, tuple[float, bool]]:
+        (a, b), (c, d) = self.stretch
+        return {"stretch": (a * d - b * c, a * d - b * c > 0)}
 
     def _rho(self, theta: Array) -> tuple[Array, Mask]:
         """The smallest rho > 0 whose ray makes the angle theta with the axis, and whether there is one."""

@@ -16,8 +16,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .camera import Camera
 from .errors import PipefishError, ProfileError
+from .files import write_atomically
 from .lenses import rays
-from .show import write_atomically
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,8 @@ import numpy as np
 from pipefish import __version__
 from pipefish.colours import AGE_MAX, scale_colours
 from pipefish.errors import PipefishError
-from pipefish.show import Painter, Style, animation, spread, write_atomically
+from pipefish.files import write_atomically
+from pipefish.show import Painter, Style, animation, spread
 from pipefish.survey import Survey
 from pipefish.trackstats import charts as statistics_charts
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pipefish.colours import AGE_MAX, QUALITY_LOW, age_position, quality_position, scale_colours
-from pipefish.errors import PipefishError, file_error
+from pipefish.errors import PipefishError
+from pipefish.files import write_atomically
 from pipefish.progress import track as progress_over
 from pipefish.scene import states_of
 from pipefish.survey import Keyframe, Survey, Tracks
@@ -205,19 +204,6 @@ def animation(
             pictures = [
                 p.resize((p.width * 4 // 5, p.height * 4 // 5), Image.Resampling.LANCZOS) for p in pictures[::2]
             ]
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file that is there as a whole or not at all. Raises OSError that names `path`."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise file_error(error, path) from error
-    finally:
-        with contextlib.suppress(OSError):  # the folder may be no folder
-            temporary.unlink(missing_ok=True)
 
 
 def show(

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from .camera import Camera
-from .errors import FormatError, PipefishError, file_error
+from .errors import ArgumentError, FormatError, PipefishError, file_error
+from .files import write_atomically
 from .progress import Progress, track
-from .show import write_atomically
 from .views import FAR, Remap, remap, rotation, view_rays
 
 Picture = npt.NDArray[np.uint8]
@@ -44,10 +44,17 @@ def undistort(
     fov: across the view's width, degrees [90; cylinder and equirect: 180]; size: width, height [that of the picture;
     cube: the edge of a face, half the picture's smaller side]; turn: yaw, pitch, roll of the view, degrees; mask: a
     picture to write, white where the camera sees.
-    Returns what was written. Raises FormatError for input that is no picture or not of the camera's size, OSError.
+    Returns what was written. Raises ArgumentError, before all work, for a view that cannot be and for a name to write
+    that is no picture's; FormatError for input that is no picture or not of the camera's size, OSError.
     """
+    if view == "cube" and size is not None and size[0] != size[1]:
+        raise ArgumentError(f"the faces of a cube are square, not {size[0]} x {size[1]}")
     if fov is None:
         fov = 90.0 if view in ("perspective", "cube") else 180.0
+    one = not source.is_dir() and source.suffix.lower() != ".y4m"
+    for path in ([out] if one else []) + ([mask] if mask is not None else []):
+        if path.suffix.lower() not in SUFFIXES:
+            raise ArgumentError(f"{path}: a picture's name ends in {', '.join(SUFFIXES)}")
     width, height = size or (camera.width, camera.height)
     if view == "cube" and size is None:
         width = height = min(camera.width, camera.height) // 2
@@ -80,8 +87,6 @@ def undistort(
 
 
 def _encode(picture: Picture, path: Path) -> bytes:
-    if path.suffix.lower() not in SUFFIXES:
-        raise PipefishError(f"{path}: a picture's name ends in {', '.join(SUFFIXES)}")
     out = io.BytesIO()
     options = {"quality": 95} if path.suffix.lower() in (".jpg", ".jpeg", ".webp") else {}
     Image.fromarray(picture).save(out, Image.registered_extensions()[path.suffix.lower()], **options)

@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 KINDS = ("perspective", "cube", "cylinder", "equirect")
 FAR = 1e6  # metres; where the rays of a camera with a pupil shift are followed to when no distance is given
-_SUPERSAMPLES = 16  # along each side of a pixel at most
+_SUPERSAMPLES = 16  # along each side of a pixel at most; beyond, the picture is halved first
 
 # Places of a cube's faces in the cross (column, row) and their turns (yaw, pitch) in degrees.
 _FACES = {
@@ -110,18 +110,20 @@ def view_rays(kind: str, width: int, height: int, fov: float) -> Array:
 class Remap:
     """Where each pixel of a view comes from. uv (rows, columns, 2); valid (rows, columns): the camera sees it;
     footprint (rows, columns, 2, 2): pixels of the picture per pixel of the view, to first order; count: how many
-    samples a side the pixel takes."""
+    samples a side the pixel takes; level: from the picture halved so many times."""
 
     uv: Array
     valid: npt.NDArray[np.bool_]
     footprint: Array
     count: npt.NDArray[np.int64]
+    level: npt.NDArray[np.int64]
 
     def apply(self, picture: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         """(H, W) or (H, W, C) uint8 -> the view, 0 where it is not valid.
 
         Each pixel is the mean of n x n bilinear samples over its own footprint in the picture, n = the footprint's
         longest side in pixels, rounded up: plain bilinear where the view magnifies, no aliasing where it shrinks.
+        Footprints of more than 16 pixels are sampled from the picture halved, by means of 2 x 2, until they have 16.
         """
         picture = np.asarray(picture)
         if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
@@ -130,20 +132,32 @@ class Remap:
         source = picture.reshape(picture.shape[0], picture.shape[1], channels)
         out = np.zeros((self.valid.size, channels), dtype=np.uint8)
         uv, footprint = self.uv.reshape(-1, 2), self.footprint.reshape(-1, 2, 2)
-        flat = np.where(self.valid, self.count, 0).ravel()
-        for n in np.unique(flat[flat > 0]):
-            chosen = np.flatnonzero(flat == n)
-            for part in np.array_split(chosen, max(1, len(chosen) // 200_000)):
-                total = np.zeros((len(part), channels), dtype=np.float32)
-                steps = (np.arange(n) + 0.5) / n - 0.5
-                for dy in steps:
-                    for dx in steps:
-                        total += _bilinear(source, uv[part] + footprint[part] @ np.array([dx, dy]))
-                out[part] = np.clip(np.rint(total / n**2), 0, 255).astype(np.uint8)
+        count, level = self.count.ravel(), self.level.ravel()
+        for halved in range(int(self.level.max()) + 1):
+            if halved:
+                source = _halve(source)
+            here = np.flatnonzero(self.valid.ravel() & (level == halved))
+            for n in np.unique(count[here]):
+                chosen = here[count[here] == n]
+                for part in np.array_split(chosen, max(1, len(chosen) // 200_000)):
+                    total = np.zeros((len(part), channels), dtype=np.float32)
+                    steps = (np.arange(n) + 0.5) / n - 0.5
+                    for dy in steps:
+                        for dx in steps:
+                            place = uv[part] + footprint[part] @ np.array([dx, dy])
+                            total += _bilinear(source, (place + 0.5) / 2**halved - 0.5)
+                    out[part] = np.clip(np.rint(total / n**2), 0, 255).astype(np.uint8)
         return out.reshape(*self.valid.shape, *picture.shape[2:])
 
 
-def _bilinear(source: npt.NDArray[np.uint8], uv: Array) -> npt.NDArray[np.float32]:
+def _halve(source: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Means of 2 x 2 pixels; an odd last row or column counts twice."""
+    height, width = source.shape[:2]
+    padded = np.pad(source, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").astype(np.float32)
+    return (padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]) / 4
+
+
+def _bilinear(source: npt.NDArray[Any], uv: Array) -> npt.NDArray[np.float32]:
     height, width = source.shape[:2]
     u, v = np.clip(uv[:, 0], 0, width - 1), np.clip(uv[:, 1], 0, height - 1)
     left, top = np.minimum(u.astype(np.int64), max(width - 2, 0)), np.minimum(v.astype(np.int64), max(height - 2, 0))
@@ -176,8 +190,11 @@ def remap(camera: Camera, rays: Array, turn: Array | None = None, distance: floa
         longest = np.sqrt((footprint**2).sum(axis=-2)).max(axis=-1)
     longest = np.where(np.isfinite(longest), longest, 1.0)
     footprint = np.where(np.isfinite(footprint).all(axis=(-1, -2))[..., None, None], footprint, 0.0)
-    count = np.clip(np.ceil(longest - 1e-6), 1, _SUPERSAMPLES).astype(np.int64)
-    return Remap(uv, ok.reshape(shape), footprint, count)
+    valid = ok.reshape(shape)
+    longest = np.where(valid, longest, 1.0)
+    level = np.ceil(np.log2(np.maximum(longest / _SUPERSAMPLES, 1.0)) - 1e-9).astype(np.int64)
+    count = np.clip(np.ceil(longest / 2.0**level - 1e-6), 1, _SUPERSAMPLES).astype(np.int64)
+    return Remap(uv, valid, footprint, count, level)
 
 
 def _difference(uv: Array, axis: int) -> Array:

@@ -256,8 +256,9 @@ def test_unified_cameras_stay_unified_in_kalibr(tmp_path):
 def test_formats_that_end_at_90_degrees_say_so_and_what_to_do(tmp_path):
     wide = pf.Camera.load(DATA / "kalibr.yaml")
     for form in ("opencv-fisheye", "ros", "kalibr", "colmap", "orbslam3"):
-        with pytest.raises(ProfileError, match=r"90 degrees.*--max-theta"):
+        with pytest.raises(ProfileError, match=r"90 degrees.*--max-theta") as caught:
             formats.write(wide, tmp_path / "x", form)
+        assert ("divides by z" in caught.value.reason) is (form != "orbslam3")  # which projects with atan2
         assert not (tmp_path / "x").exists()
     written = formats.write(wide, tmp_path / "x", "colmap", max_theta=math.radians(89))
     assert any("89.0 degrees only" in note for note in written.notes)
@@ -293,6 +294,15 @@ def test_what_does_not_fit_is_refused_with_the_angle_that_does():
     assert formats.from_lens(lens, max_theta=math.radians(degrees)).fit.max_px <= 0.1
 
 
+CHAIN = "cam0: {{camera_model: {}, intrinsics: [{}, 300, 300, 320, 240], resolution: [640, 480]}}"
+WOODSCAPE = (
+    '{{"intrinsic": {{"model": "radial_poly", "width": 640, "height": 480, "cx_offset": 0, "cy_offset": 0, '
+    '"poly_order": {}, "k1": -3}}}}'
+)
+ROS = (
+    "width: 640\nheight: 480\ndistortion_model: equidistant\nd: [0, 0, 0, 0]\n"
+    "k: [300.0, 0.0, 322.5, 0.0, 300.0, 238.25, 0.0, 0.0, 1.0]\n"
+)
 BAD = [
     ("a: [1, 2", "line"),
     ("nothing: here", "not a camera calibration"),
@@ -315,6 +325,24 @@ BAD = [
     ('{"value0": {"intrinsics": [{}], "resolution": []}}', "not as many"),
     ('{"intrinsic": {"model": "cylindrical"}}', "radial_poly"),
     ("Camera: {model: equirectangular, cols: 9, rows: 9}", "no lens"),
+    ("a: &a [1, 2]\nb: [*a, *a]", "line 2: the alias *a"),
+    ("camera_matrix: &m {data: [1,0,0,0,1,0,0,0,1]}\nK: *m", "line 2: the alias *m"),
+    ("a: [" + "1," * 300_000 + "1]", "YAML longer than"),
+    ("distortion_model: [1, 2]", "not a camera calibration"),
+    (CHAIN.format("ds", "-1, 0.5"), "cam0.xi: -1 is outside"),
+    (CHAIN.format("ds", "0.1, 1.2"), "cam0.alpha: 1.2 is outside"),
+    (CHAIN.format("ds", "0.1, -0.2"), "cam0.alpha: -0.2 is outside"),
+    (CHAIN.format("eucm", "1.5, 1"), "cam0.alpha: 1.5 is outside"),
+    (CHAIN.format("eucm", "0.5, 0"), "cam0.beta: 0 is outside"),
+    (CHAIN.replace("300, 300", "-300, 300").format("ds", "0.1, 0.5"), "cam0.fx: -300 is outside"),
+    (CHAIN.format("omni", "-1"), "cam0.xi: -1 is outside"),
+    ("7 FOV 640 480 300 300 320 240 0", "7.omega: 0 is outside"),
+    ("7 FOV 640 480 300 300 320 240 3.2", "7.omega: 3.2 is outside"),
+    (WOODSCAPE.format("0"), "intrinsic.poly_order: 0 is not"),
+    (WOODSCAPE.format("1.5"), "intrinsic.poly_order: 1.5 is not"),
+    (WOODSCAPE.format("1"), "camera.k1: -3 is outside"),
+    (ROS + "binning_x: 2", "binning_x: binned pictures"),
+    (ROS + "roi: {x_offset: 8, y_offset: 0, width: 100, height: 90}", "roi: cropped pictures"),
 ]
 
 
@@ -325,6 +353,79 @@ def test_bad_files_are_refused_with_place_and_reason(text, expected, tmp_path):
     with pytest.raises(ProfileError) as caught:
         formats.load(file)
     assert expected in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_a_bomb_of_aliases_is_refused_at_its_first_alias(tmp_path):
+    """Nine levels of nine: its repr alone would be gigabytes."""
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
+    (tmp_path / "bomb").write_text("\n".join([*lines, "camera_matrix: *a8", "D: [1]"]))
+    with pytest.raises(ProfileError, match=r"line 2: the alias \*a0 is not read"):
+        formats.load(tmp_path / "bomb")
+
+
+def test_a_value_in_an_error_is_short_however_deep_it_is(tmp_path):
+    deep = "[" * 400 + "]" * 400
+    (tmp_path / "deep").write_text(
+        f'{{"distortion_model": "fisheye", "K": [{deep},0,0,0,1,0,0,0,1], "width": 9, "d": [0]}}'
+    )
+    with pytest.raises(ProfileError) as caught:
+        formats.load(tmp_path / "deep")
+    assert len(caught.value.reason) < 120
+
+
+def test_whole_pictures_of_ros_are_read(tmp_path):
+    for more in ("binning_x: 1\n", "roi: {x_offset: 0, y_offset: 0, width: 640, height: 480, do_rectify: false}\n"):
+        (tmp_path / "info").write_text(ROS + more)
+        assert formats.load(tmp_path / "info").fit.exact
+
+
+def test_models_by_their_parameters_are_refused_outside_their_definition():
+    size = {"width": 512, "height": 512, "fx": 158, "fy": 158, "cx": 255, "cy": 257}
+    with pytest.raises(ProfileError, match=r"alpha: 1\.7 is outside"):
+        pf.Camera.from_double_sphere(**size, xi=0.1, alpha=1.7)
+    with pytest.raises(ProfileError, match="beta: -1 is outside"):
+        pf.Camera.from_eucm(**size, alpha=0.5, beta=-1)
+    with pytest.raises(ProfileError, match="xi: -1 is outside"):
+        pf.Camera.from_mei(**size, xi=-1)
+
+
+# ---- options
+
+
+@pytest.mark.parametrize("suffix", ["json", "profile"])
+def test_options_count_for_profiles_as_for_other_files(front, suffix, tmp_path):
+    file = tmp_path / f"own.{suffix}"
+    file.write_bytes(front.to_binary() if suffix == "profile" else front.to_json().encode())
+    assert formats.load(file, max_theta=math.radians(60)).camera.theta_max == math.radians(60)
+    assert formats.load(file, max_theta=math.radians(120)).camera.theta_max == front.theta_max
+    assert formats.load(file, camera=0).camera_name == formats.load(file, camera="front").camera_name == "front"
+    with pytest.raises(ProfileError, match="no camera 'cam1'; there are front"):
+        formats.load(file, camera="cam1")
+    with pytest.raises(ProfileError, match="image size: 800 x 600 in the file, 640 x 480 given"):
+        formats.load(file, size=(640, 480))
+    assert formats.load(file, size=(800, 600)).fit is None
+    assert formats.load(file, model="p6", max_error=9, max_theta=1.0).fit.max_px > 0.01
+    with pytest.raises(ProfileError, match="p6 does not fit"):
+        formats.load(file, model="p6", max_error=1e-9)
+
+
+def test_a_size_that_is_not_the_files_is_refused():
+    with pytest.raises(ProfileError, match="512 x 512 in the file"):
+        formats.load(DATA / "kalibr.yaml", size=(640, 480))
+
+
+@pytest.mark.parametrize("camera", ["²", "٣", "-1", "9" * 5000, 7])
+def test_cameras_that_are_not_there_are_refused_by_name(camera):
+    with pytest.raises(ProfileError, match="there are cam0, cam1"):
+        formats.load(DATA / "kalibr.yaml", camera=camera)
+
+
+@pytest.mark.parametrize("which", ["cam0", "cam2", "cam6"])  # exact, fitted, exact in another family
+def test_no_camera_goes_beyond_max_theta(which):
+    for degrees in (40.0, 61.0):
+        camera = formats.load(DATA / "kalibr.yaml", camera=which, max_theta=math.radians(degrees)).camera
+        assert 0.99 * math.radians(degrees) < camera.theta_max <= math.radians(degrees)
 
 
 @pytest.mark.parametrize("file", sorted(p.name for p in DATA.iterdir()))

@@ -98,6 +98,25 @@ def test_convert_reads_and_writes_every_form_it_lists(camera, tmp_path, capsys):
             capsys.readouterr()
 
 
+@pytest.mark.parametrize(("form", "degrees"), [("opencv-fisheye", 89), ("json", 70), ("binary", 70), ("mrcal", 60)])
+def test_convert_tells_the_field_of_view_that_it_wrote(form, degrees, tmp_path, capsys):
+    for name in ("stella.yaml", "own.json"):
+        source = FORMATS / name
+        if name == "own.json":
+            source = tmp_path / name
+            pf.Camera.load(FORMATS / "kalibr.yaml").save(source)
+        options = ["--to", form, "--max-theta", degrees]
+        assert run("convert", source, tmp_path / "out", *options, "--json") == 0
+        document = json.loads(capsys.readouterr().out)
+        told = document["field_of_view_deg"]
+        if name == "own.json" and form == "opencv-fisheye":
+            assert document["notes"] == ["holds up to 89.0 degrees only"]
+        reach = min(degrees, math.degrees(pf.Camera.load(source).theta_max))  # stella's picture ends at 80 degrees
+        assert 2 * reach * 0.997 < told <= 2 * degrees
+        assert run("convert", source, tmp_path / "out", *options) == 0
+        assert f"field of view  {told:.1f} deg" in capsys.readouterr().out
+
+
 def test_convert_makes_a_polynomial_of_another_family_with_the_error_told(tmp_path, capsys):
     source = ROOT / "calib_profiles" / "ideal-equisolid-180.json"
     assert run("convert", source, tmp_path / "p9.json", "--model", "p9", "--json") == 0

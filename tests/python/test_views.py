@@ -128,6 +128,35 @@ def test_shrinking_does_not_alias(camera):
     assert single.apply(stripes)[table.valid].std() > 60  # what one sample a pixel would give
 
 
+@pytest.mark.parametrize("pattern", ["columns", "rows", "checks"])
+def test_shrinking_a_large_picture_fifty_times_does_not_alias(pattern):
+    """Stripes of one pixel become their mean in a view 80 pixels wide of a picture 4000 wide."""
+    camera = pf.Camera(
+        width=4000, height=3000, f_u=1400.0, f_v=1400.0, c_u=1999.5, c_v=1499.5, theta_max=1.6, radial="equidistant"
+    )
+    v, u = np.mgrid[0:3000, 0:4000]
+    bright = {"columns": u % 2, "rows": v % 2, "checks": (u + v) % 2}[pattern]
+    table = views.remap(camera, views.perspective_rays(80, 60, 100))
+    assert table.level.min() >= 1 and table.valid.all()
+    small = table.apply((bright * 255).astype(np.uint8)).astype(float)
+    assert np.abs(small - 127.5).max() < 1
+
+
+def test_halved_pictures_are_not_shifted():
+    """The middle of a soft blob stays where its ray is, at every level, on sides that do not halve evenly."""
+    camera = pf.Camera(
+        width=1999, height=1501, f_u=1400.0, f_v=1400.0, c_u=999.0, c_v=750.0, theta_max=1.2, radial="perspective"
+    )
+    v, u = np.mgrid[0:1501, 0:1999]
+    blob = np.rint(255 * np.exp(-((u - 1207.0) ** 2 + (v - 611.0) ** 2) / (2 * 150.0**2))).astype(np.uint8)
+    for width, halved in ((99, 1), (60, 2), (30, 3)):
+        table = views.remap(camera, views.perspective_rays(width, width * 3 // 4, 70))
+        assert table.level.max() == halved
+        small = table.apply(blob).astype(float)
+        middle = (small[..., None] * table.uv).sum(axis=(0, 1)) / small.sum()
+        np.testing.assert_allclose(middle, [1207, 611], atol=1.0)
+
+
 def test_an_unscaled_view_returns_the_picture():
     """A perspective camera through its own perspective view: the same pixels to the grey level."""
     f = 300.0
@@ -256,6 +285,36 @@ def test_bad_input_leaves_nothing_behind(files, capsys, name, content, expected)
     told = capsys.readouterr().err
     assert expected in told and name in told
     assert not [p for p in files.iterdir() if "out" in p.name]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--view", "cube", "--fov", 80], "--fov does not go with --view cube"),
+        (["--view", "cube", "--size", "200x100"], "square, not 200 x 100"),
+        (["--distance", 0], "0 is not a number above zero"),
+        (["--distance", "inf"], "inf is not a number above zero"),
+        (["--fov", 180], "less than 180 degrees, not 180"),
+        (["--fov", "nan"], "not nan"),
+        (["--view", "cylinder", "--fov", 361], "up to 360 degrees, not 361"),
+        (["--view", "equirect", "--fov", 360, "--size", "100x80"], "360 x 180 degrees, not 360 x 288"),
+        (["--size", "20000x10"], "sides of 1 to 16384"),
+        (["--mask", "mask.txt"], "mask.txt: a picture's name ends in"),
+        (["--max-theta", 0], "0 is not a number above zero"),
+    ],
+)
+def test_options_that_make_no_view_are_usage_errors_before_any_work(files, capsys, options, reason):
+    assert run(files / "grey.png", "-o", files / "o.png", "--profile", files / "camera.json", *options) == 2
+    assert reason in capsys.readouterr().err and not (files / "o.png").exists()
+
+
+def test_max_theta_ends_the_view_of_a_profile(files, capsys):
+    common = [files / "grey.png", "-o", files / "o.png", "--profile", files / "camera.json", "--fov", 100, "--json"]
+    seen = []
+    for more in ([], ["--max-theta", 30]):
+        assert run(*common, *more) == 0
+        seen.append(json.loads(capsys.readouterr().out)["valid"])
+    assert seen[1] < 0.5 < seen[0]
 
 
 def test_a_view_that_sees_nothing_and_a_folder_that_is_there_are_refused(files, camera, capsys):

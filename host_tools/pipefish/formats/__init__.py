@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
-from ..errors import PipefishError, ProfileError
-from ..fit import Fit
+from ..errors import ArgumentError, PipefishError, ProfileError
+from ..files import write_atomically
+from ..fit import MODELS, Fit
 from ..lenses import KannalaBrandt, Lens, Unified
 from . import readers, texts
 from .convert import MAX_ERROR, camera_of, lens_field
@@ -80,7 +81,7 @@ def _guess_mapping(document: Any) -> str | None:
         ("stella", isinstance(document.get("Camera"), dict)),
         ("woodscape", isinstance(document.get("intrinsic"), dict)),
         ("pyocamcalib", "taylor_coefficient" in keys),
-        ("ros", "distortion_model" in keys and document["distortion_model"] in readers.ROS_MODELS),
+        ("ros", str(document.get("distortion_model")) in readers.ROS_MODELS),
         ("opencv-any", bool({"camera_matrix", "K", "cameraMatrix", "intrinsic_matrix"} & keys)),
     )
     return next((form for form, fits in tests if fits), None)
@@ -115,12 +116,12 @@ def _read(data: bytes, form: str | None, size: tuple[int, int] | None) -> tuple[
     return form, found
 
 
-def _choose(found: list[Found], camera: int | str) -> Found:
-    names = [f.name for f in found]
-    if isinstance(camera, str) and camera in names:
-        return found[names.index(camera)]
-    if str(camera).isdigit() and int(camera) < len(found):
-        return found[int(camera)]
+def _choose(names: list[str], camera: int | str) -> int:
+    """The place of a camera that is given by its name or its place."""
+    numbers = [str(i) for i in range(len(names))]
+    for known in (names if isinstance(camera, str) else [], numbers):
+        if str(camera) in known:
+            return known.index(str(camera))
     raise ProfileError(None, None, f"no camera {camera!r:.40}; there are {', '.join(names)} (or 0 to {len(names) - 1})")
 
 
@@ -137,10 +138,15 @@ def load(
     """Reads a profile or another program's calibration file.
 
     camera: name or number of the camera in a file of several [the first, with a note]; size: width and height, for
-    formats that do not hold it; form: one of READERS [told by the content]; max_error: largest allowed difference of a
-    fit, pixels; max_theta: take no more of the field than this, radians; model: of the fit, see convert.camera_of.
-    Raises ProfileError with file, place and reason.
+    formats that do not hold it, and refused where the file says another one; form: one of READERS [told by the
+    content]; max_error: largest allowed difference of a fit, pixels; max_theta: take no more of the field than this,
+    radians, above zero; model: of the fit, see convert.camera_of: also a profile is fitted where it is not "auto".
+    Raises ProfileError with file, place and reason, ArgumentError for an option that is wrong in itself.
     """
+    if model != "auto" and model not in MODELS:
+        raise ArgumentError(f"model {model!r:.40} is none of auto, {', '.join(MODELS)}")
+    if max_theta is not None and not max_theta > 0:
+        raise ArgumentError(f"max_theta must be above zero, not {max_theta:g}")
     try:
         with open(path, "rb") as stream:
             data = stream.read(BYTES_MAX + 1)
@@ -148,13 +154,12 @@ def load(
         raise ProfileError(path, None, error.strerror or str(error)) from None
     try:
         if form in (None, "binary") and (data[:4] == b"PFPR" or form == "binary"):
-            own = Camera.from_binary(data)
-            return Conversion(own, "binary", (own.name,), own.name, None, ())
+            return _own("binary", Camera.from_binary(data), camera, size, model, max_error, max_theta)
         if form == "json" or (form is None and _own_json(data)):
-            own = Camera.load_json(path)
-            return Conversion(own, "json", (own.name,), own.name, None, ())
+            return _own("json", Camera.load_json(path), camera, size, model, max_error, max_theta)
         form, found = _read(data, form, size)
-        chosen = _choose(found, 0 if camera is None else camera)
+        chosen = found[_choose([f.name for f in found], 0 if camera is None else camera)]
+        _check_size(size, chosen.lens.width, chosen.lens.height)
         made, fit = _within(form, chosen.lens, model, max_error, max_theta)
         notes = list(chosen.notes)
         if camera is None and len(found) > 1:
@@ -163,6 +168,33 @@ def load(
     except ProfileError as error:
         raise ProfileError(path, error.position, error.reason) from None
     return Conversion(made, form, tuple(f.name for f in found), chosen.name, fit, tuple(notes))
+
+
+def _own(
+    form: str,
+    own: Camera,
+    camera: int | str | None,
+    size: tuple[int, int] | None,
+    model: str,
+    max_error: float,
+    max_theta: float | None,
+) -> Conversion:
+    """A profile with the options of load: they mean the same as for other programs' files."""
+    _choose([own.name], 0 if camera is None else camera)
+    _check_size(size, own.width, own.height)
+    fit = None
+    if model != "auto":
+        own, fit = own.to_generic(model, max_theta=max_theta)
+        if not fit.max_px <= max_error:
+            raise ProfileError(None, None, f"{model} does not fit: {fit}; see --max-error, --max-theta")
+    elif max_theta is not None and max_theta < own.theta_max:
+        own = dataclasses.replace(own, theta_max=max_theta)
+    return Conversion(own, form, (own.name,), own.name, fit, ())
+
+
+def _check_size(size: tuple[int, int] | None, width: int, height: int) -> None:
+    if size is not None and tuple(size) != (width, height):
+        raise ProfileError(None, "image size", f"{width} x {height} in the file, {size[0]} x {size[1]} given")
 
 
 def from_lens(
@@ -174,7 +206,10 @@ def from_lens(
 
 
 def _within(form: str, lens: Lens, model: str, max_error: float, max_theta: float | None) -> tuple[Camera, Fit]:
-    made, fit = camera_of(lens, model, max_theta)
+    try:
+        made, fit = camera_of(lens, model, max_theta)
+    except ArgumentError as error:  # of the fit: a lens that is none
+        raise ProfileError(None, None, f"{form}: {error}") from None
     if not fit.max_px <= max_error:
         raise ProfileError(None, None, _does_not_fit(form, lens, model, fit, max_error))
     return made, fit
@@ -228,8 +263,6 @@ def write(
     max_error: largest allowed difference, pixels; max_theta: the angle up to which it must hold, radians.
     Raises ProfileError where the format cannot express the camera; OSError.
     """
-    from ..show import write_atomically
-
     try:
         written = WRITERS[to](camera, Wanted(max_error, max_theta))
     except ProfileError as error:

@@ -11,11 +11,11 @@ import numpy as np
 from ..camera import Camera
 from ..errors import ArgumentError, ProfileError
 from ..fit import MODELS, Fit, compare, fit_camera
-from ..lenses import THETA_END, Array, Field, Lens, field_of
+from ..lenses import THETA_END, Field, Lens, field_of
 
 MAX_ERROR = 0.1  # pixels; what a good calibration's own residual is
 _FIT = (36, 32)  # azimuths, angles of the fit
-_CHECK = (77, 91, 0.013)  # and of the check: other rays, among them the edge of the picture
+CHECK = (77, 91, 0.013)  # and of the check: other rays, among them the edge of the picture
 _ASYMMETRIC_BELOW = 0.5  # "cpoly" is taken where it at least halves the error ...
 _GOOD_ENOUGH = 0.005  # ... of more than this many pixels
 
@@ -40,19 +40,21 @@ def camera_of(
     field = field or lens_field(lens)
     if max_theta is not None:
         field = field.within(max_theta)
+    end = THETA_END if max_theta is None else min(max_theta, THETA_END)
     fields = lens.exact() if model == "auto" else None
-    points = field.sample(*_CHECK)
+    points = field.sample(*CHECK)
     expected, ok = lens.project(points)
     points, expected = points[ok], expected[ok]
     if fields is not None:
-        camera = _widest(field, lambda theta: _build(lens, fields, theta))
+        camera = _widest(field, end, lambda theta: _build(lens, fields, theta))
         got, ok = camera.project(points)
         return camera, compare(points[ok], expected[ok], got[ok], exact=True)
+    size = (lens.width, lens.height)
     skew = bool(getattr(lens, "skew", 0.0)) or hasattr(lens, "stretch")
-    camera, fit = _fitted(lens.project, (lens.width, lens.height), field, "p9" if model == "auto" else model, skew)
+    camera, fit = _fitted(lens.project, size, field, end, "p9" if model == "auto" else model, skew)
     if model == "auto" and fit.max_px > _GOOD_ENOUGH:
         try:
-            other = _fitted(lens.project, (lens.width, lens.height), field, "cpoly", skew)
+            other = _fitted(lens.project, size, field, end, "cpoly", skew)
         except ProfileError:  # cpoly not one-to-one: p9 stays
             return camera, fit
         if other[1].max_px < _ASYMMETRIC_BELOW * fit.max_px:
@@ -64,22 +66,24 @@ def _build(lens: Lens, fields: dict[str, Any], theta_max: float) -> Camera:
     return Camera(width=lens.width, height=lens.height, theta_max=theta_max, source="imported", **fields)
 
 
-def _widest(field: Field, build: Any) -> Camera:
-    """The camera with the largest theta_max that is proved one-to-one: a little beyond the picture's edge, or a little
-    less where the model itself ends at the edge."""
+def _widest(field: Field, end: float, build: Any) -> Camera:
+    """The camera with the largest theta_max, at most `end`, that is proved one-to-one: a little beyond the picture's
+    edge, or a little less where the model itself ends at the edge."""
     edge = float(field.theta_edge.max())
     ends = bool(field.model_ends[np.argmax(field.theta_edge)])
     factors = (0.9999, 0.999, 0.99) if ends else (1.001, 1.0, 0.9999, 0.999, 0.99)
     for factor in factors:
         try:
-            return build(min(edge * factor, THETA_END))
+            return build(min(edge * factor, end))
         except ProfileError as error:
             if error.key != "theta_max" or factor == factors[-1]:
                 raise
     raise AssertionError("unreachable")
 
 
-def _fitted(project: Any, size: tuple[int, int], field: Field, model: str, skew: bool) -> tuple[Camera, Fit]:
+def _fitted(
+    project: Any, size: tuple[int, int], field: Field, end: float, model: str, skew: bool
+) -> tuple[Camera, Fit]:
     points = np.vstack([[[0.0, 0.0, 1.0]], field.sample(*_FIT)])
     pixels, ok = project(points)
     points, pixels = points[ok], pixels[ok]
@@ -91,8 +95,8 @@ def _fitted(project: Any, size: tuple[int, int], field: Field, model: str, skew:
             points[use], pixels[use], size, model, skew=skew, theta_max=theta_max, even=True, source="imported"
         )[0]
 
-    camera = _widest(field, build)
-    points = field.sample(*_CHECK)
+    camera = _widest(field, end, build)
+    points = field.sample(*CHECK)
     expected, ok = project(points)
     got, seen = camera.project(points)
     both = ok & seen
@@ -132,7 +136,9 @@ def generic(
     far = dataclasses.replace(camera, pupil_e1=0.0) if camera.pupil_e1 else camera
     field = camera_field(far, max_theta)
     skew = bool(camera.skew) if skew is None else skew
-    made, fit = _fitted(far.project, (camera.width, camera.height), field, model, skew)
+    made, fit = _fitted(
+        far.project, (camera.width, camera.height), field, min(max_theta or math.pi, THETA_END), model, skew
+    )
     keep = {key: getattr(camera, key) for key in ("name", "serial", "created", "circle_u", "circle_v", "circle_radius")}
     return dataclasses.replace(made, source=camera.source, **keep), fit
 
@@ -144,10 +150,6 @@ def plain_polynomial(camera: Camera, max_theta: float | None = None) -> tuple[Ca
         made, fit = generic(camera, "p9", max_theta, skew=False)
         return made, fit, lost
     made = camera if camera.radial == "generic" else dataclasses.replace(camera, radial="generic")
-    points = _samples(camera, max_theta)
+    points = camera_field(camera, max_theta).sample(*CHECK)
     pixels, _ = camera.project(points)
     return made, compare(points, pixels, made.project(points)[0], exact=True), []
-
-
-def _samples(camera: Camera, max_theta: float | None = None) -> Array:
-    return camera_field(camera, max_theta).sample(*_CHECK)

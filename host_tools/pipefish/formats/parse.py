@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import reprlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,13 +15,17 @@ from ..errors import ProfileError
 from ..lenses import Lens
 
 BYTES_MAX = 4 << 20  # a splined model of 60 x 40 control points is 120 kB
+YAML_MAX = 512 << 10  # PyYAML reads some 200 kB a second; a calibration of 50 pictures with all its points is 200 kB
 
 
 class Found:
-    """One camera of a file: its name there, its lens, and what to tell people about it."""
+    """One camera of a file: its name there, its lens, and what to tell people about it. Raises ProfileError, with the
+    camera and the parameter, where the lens's model is not defined."""
 
     def __init__(self, name: str, lens: Lens, *notes: str) -> None:
         self.name, self.lens, self.notes = name, lens, list(notes)
+        if wrong := lens.wrong():
+            raise ProfileError(None, f"{name}.{wrong[0]}", wrong[1])
 
 
 class Node:
@@ -73,12 +78,17 @@ class Node:
         return whole(self.get(width), self.place(width)), whole(self.get(height), self.place(height))
 
 
+def shown(value: Any) -> str:
+    """A value for an error's text: short, however large it is."""
+    return reprlib.repr(value)[:60]
+
+
 def finite(value: Any, where: str) -> float:
     """A finite number out of a number or its text (YAML 1.1 takes 1e-05 for a text)."""
     try:
         result = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
-        raise ProfileError(None, where, f"not a number: {value!r:.60}") from None
+        raise ProfileError(None, where, f"not a number: {shown(value)}") from None
     if not math.isfinite(result):
         raise ProfileError(None, where, "not a finite number")
     return result
@@ -88,7 +98,7 @@ def whole(value: Any, where: str) -> int:
     """A positive whole number; 966.0 too."""
     result = finite(value, where)
     if result != int(result) or not 1 <= result <= 16384:
-        raise ProfileError(None, where, f"not a number of pixels, 1 to 16384: {value!r:.60}")
+        raise ProfileError(None, where, f"not a number of pixels, 1 to 16384: {shown(value)}")
     return int(result)
 
 
@@ -106,6 +116,12 @@ def number_list(value: Any, where: str, counts: int | Sequence[int] | None = Non
 
 class _Loader(yaml.SafeLoader):
     """YAML as OpenCV, ROS and Kalibr write it; a key twice is an error."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):  # a few lines of them stand for terabytes, and no calibration has one
+            event = self.peek_event()
+            raise ProfileError(None, f"line {event.start_mark.line + 1}", f"the alias *{event.anchor:.40} is not read")
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -139,6 +155,8 @@ def decode(data: bytes) -> str:
 
 def parse_yaml(text: str) -> Any:
     """A YAML document; OpenCV's first line `%YAML:1.0` is no YAML and is left out."""
+    if len(text) > YAML_MAX:
+        raise ProfileError(None, None, f"YAML longer than {YAML_MAX} bytes: this is not a calibration")
     text = re.sub(r"\A%YAML:[^\n]*\n", "\n", text)
     try:
         return yaml.load(text.replace("\t", "  "), Loader=_Loader)

@@ -21,7 +21,7 @@ from ..lenses import (
     RadialPolynomial,
     Unified,
 )
-from .parse import Found, Node, number_list, whole
+from .parse import Found, Node, number_list, shown, whole
 
 Size = tuple[int, int]
 
@@ -133,6 +133,20 @@ def read_opencv_any(document: Any, size: Size | None) -> list[Found]:
 ROS_MODELS = {"equidistant": (4,), "fisheye": (4,), "plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14)}
 
 
+def _ros_whole(node: Node, core: dict[str, Any]) -> None:
+    """Refuses binned and cropped pictures: K is of the whole sensor at its full resolution, and the message does not
+    say where a binned pixel's centre lies."""
+    for key in ("binning_x", "binning_y"):
+        if node.number(key, 0.0) not in (0, 1):
+            raise ProfileError(None, node.place(key), "binned pictures are not read: the numbers are of the full size")
+    if "roi" not in node:
+        return
+    roi = node.child("roi")
+    x, y, width, height = (roi.number(key, 0.0) for key in ("x_offset", "y_offset", "width", "height"))
+    if (x, y) != (0, 0) or (width, height) not in ((0, 0), (core["width"], core["height"])):
+        raise ProfileError(None, node.place("roi"), "cropped pictures are not read: the numbers are of the whole one")
+
+
 def read_ros(document: Any, size: Size | None) -> list[Found]:
     """sensor_msgs/CameraInfo as YAML. K is used; R and P belong to rectified images."""
     node = Node(document)
@@ -140,8 +154,9 @@ def read_ros(document: Any, size: Size | None) -> list[Found]:
     core, d = _opencv_parts(node, size)
     name = node.text("camera_name", "camera")
     where = node.place(d)
+    _ros_whole(node, core)
     if kind not in ROS_MODELS:
-        raise ProfileError(None, node.place("distortion_model"), f"{kind!r} is not read: {', '.join(ROS_MODELS)}")
+        raise ProfileError(None, node.place("distortion_model"), f"{shown(kind)} is not read: {', '.join(ROS_MODELS)}")
     k = node.numbers(d, ROS_MODELS[kind])
     if kind in ("equidistant", "fisheye"):
         return [Found(name, KannalaBrandt(k=k, **core))]
@@ -157,12 +172,12 @@ def _kalibr_camera(node: Node) -> Any:
     d = node.numbers("distortion_coeffs") if "distortion_coeffs" in node else ()
     count = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}.get(model)
     if count is None:
-        raise ProfileError(None, node.place("camera_model"), f"{model!r} is not read: pinhole, omni, ds, eucm")
+        raise ProfileError(None, node.place("camera_model"), f"{shown(model)} is not read: pinhole, omni, ds, eucm")
     *extra, fx, fy, cx, cy = node.numbers("intrinsics", count)
     core = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **image(size)}  # type: ignore[arg-type]
     lengths = {"none": (0, 4), "radtan": (4,), "equidistant": (4,), "fov": (1,)}
     if len(d) not in lengths.get(distortion, ()):
-        raise ProfileError(None, node.place("distortion_coeffs"), f"{len(d)} numbers do not make {distortion!r}")
+        raise ProfileError(None, node.place("distortion_coeffs"), f"{len(d)} numbers do not make {shown(distortion)}")
     radtan = {"radial": d[:2], "tangential": d[2:4]} if distortion == "radtan" else {}
     if distortion == "none" and any(d):
         raise ProfileError(None, node.place("distortion_coeffs"), "not zero, but distortion_model is none")
@@ -203,7 +218,7 @@ def _basalt_camera(kind: str, node: Node, size: Size) -> Any:
         eight = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         k = tuple(node.number(key) for key in eight) if kind != "pinhole" else (0.0,) * 4
         return Perspective(**core, **opencv_distortion(k, node.place("k1")))
-    raise ProfileError(None, node.place("camera_type"), f"{kind!r} is not read")
+    raise ProfileError(None, node.place("camera_type"), f"{shown(kind)} is not read")
 
 
 def read_basalt(document: Any, size: Size | None) -> list[Found]:
@@ -242,7 +257,7 @@ def read_orbslam3(document: Any, size: Size | None) -> list[Found]:
             k = tuple(node.number(f"{name}.{key}", 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
             lens = Perspective(**core, **opencv_distortion(k, name))
         else:
-            raise ProfileError(None, "Camera.type", f"{kind!r} is not read: KannalaBrandt8, PinHole")
+            raise ProfileError(None, "Camera.type", f"{shown(kind)} is not read: KannalaBrandt8, PinHole")
         found.append(Found(name, lens))
     notes = ["newWidth: the system scales its images; the profile is for the camera's own size"]
     if found and "Camera.newWidth" in node:
@@ -269,7 +284,7 @@ def read_stella(document: Any, size: Size | None) -> list[Found]:
         return [Found(name, Perspective(**core, **opencv_distortion(k, node.place("k1"))))]
     if model == "radial_division":
         raise ProfileError(None, node.place("model"), "the division model is not read")
-    raise ProfileError(None, node.place("model"), f"{model!r} is not read: fisheye, perspective")
+    raise ProfileError(None, node.place("model"), f"{shown(model)} is not read: fisheye, perspective")
 
 
 def scaramuzza(size: Size, polynomial: tuple[float, ...], centre: tuple[float, float], stretch: Any) -> OCam:
@@ -305,9 +320,9 @@ def read_svo(document: Any, size: Size | None) -> list[Found]:
             elif distortion in ("radial-tangential", "none") and len(k) in (4, 5):
                 lens = Perspective(**core, **opencv_distortion(k, where))  # type: ignore[arg-type]
             else:
-                raise ProfileError(None, where, f"{distortion!r} with {len(k)} numbers is not read")
+                raise ProfileError(None, where, f"{shown(distortion)} with {len(k)} numbers is not read")
         else:
-            raise ProfileError(None, node.place("type"), f"{kind!r} is not read: pinhole, omni")
+            raise ProfileError(None, node.place("type"), f"{shown(kind)} is not read: pinhole, omni")
         found.append(Found(node.text("label", f"cam{i}"), lens))
     if not found:
         raise ProfileError(None, "cameras", "no camera")
@@ -360,7 +375,7 @@ def read_boofcv(document: Any, size: Size | None) -> list[Found]:
         symmetric, *asymmetric = (node.numbers(key) if node.value.get(key) else () for key in lists)
         polynomial = (*symmetric, *(0.0,) * (5 - len(symmetric)))
         return [Found("camera", generic_lens(core, polynomial, *asymmetric))]
-    raise ProfileError(None, "model", f"{model!r} is not read")
+    raise ProfileError(None, "model", f"{shown(model)} is not read")
 
 
 def generic_lens(core: dict[str, Any], k: tuple[float, ...], *asymmetric: tuple[float, ...]) -> Generic:
@@ -409,8 +424,10 @@ def read_woodscape(document: Any, size: Size | None) -> list[Found]:
         "cx": (width - 1) / 2 + node.number("cx_offset"),
         "cy": (height - 1) / 2 + node.number("cy_offset"),
     }
-    order = int(node.number("poly_order", 4))
-    k = tuple(node.number(f"k{i}") for i in range(1, order + 1))
+    order = node.number("poly_order", 4)
+    if order not in range(1, 17):
+        raise ProfileError(None, node.place("poly_order"), f"{order:g} is not a whole number from 1 to 16")
+    k = tuple(node.number(f"k{i}") for i in range(1, int(order) + 1))
     return [Found(top.text("name", "camera"), RadialPolynomial(coefficients=k, **core, **image((width, height))))]
 
 

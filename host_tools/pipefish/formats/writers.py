@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..errors import ProfileError
 from ..fit import Fit, compare
 from ..lenses import SplinedStereographic, rays
-from .convert import camera_field, lost_terms, plain_polynomial
+from .convert import CHECK, camera_field, lost_terms, plain_polynomial
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,26 +49,30 @@ def _accept(form: str, camera: Camera, fit: Fit, wanted: Wanted, lost: list[str]
     if camera.pupil_e1:
         near = abs(camera.pupil_e1) * fit.theta_max**2 * math.sin(fit.theta_max) * camera.f_u
         notes.append(f"the pupil shift is lost: right for far points, up to {near / 0.1:.2g} px off at 0.1 m")
-    if wanted.max_theta is not None and fit.theta_max < camera.theta_max - 1e-3:
+    if wanted.max_theta is not None and fit.theta_max > wanted.max_theta - 1e-3:
         notes.append(f"holds up to {math.degrees(fit.theta_max):.1f} degrees only")
     return notes
 
 
-def _front(form: str, camera: Camera, wanted: Wanted) -> None:
+_DIVIDES = "it divides by z"
+
+
+def _front(form: str, camera: Camera, wanted: Wanted, why: str) -> None:
     """Refuses a camera that sees beyond what the program's functions reach."""
     edge = float(camera_field(camera, wanted.max_theta).theta_edge.max())
     if edge >= math.radians(90):
         raise ProfileError(
             None,
             None,
-            f"{form} ends at 90 degrees (it divides by z) and this camera sees {math.degrees(edge):.1f}: "
+            f"{form} ends at 90 degrees ({why}) and this camera sees {math.degrees(edge):.1f}: "
             f"--max-theta 89 writes a file that is right up to 89 degrees only",
         )
 
 
-def _kb4(form: str, camera: Camera, wanted: Wanted, front: bool) -> tuple[Camera, Fit, list[str]]:
+def _kb4(form: str, camera: Camera, wanted: Wanted, front: str | None) -> tuple[Camera, Fit, list[str]]:
+    """front: why the program ends at 90 degrees; None: it does not."""
     if front:
-        _front(form, camera, wanted)
+        _front(form, camera, wanted, front)
     made, fit, lost = plain_polynomial(camera, wanted.max_theta)
     return made, fit, _accept(form, camera, fit, wanted, lost)
 
@@ -91,7 +95,7 @@ def _text(value: str) -> str:
 
 def opencv_fisheye(camera: Camera, wanted: Wanted) -> Written:
     """cv::FileStorage YAML for cv::fisheye."""
-    made, fit, notes = _kb4("opencv-fisheye", camera, wanted, front=True)
+    made, fit, notes = _kb4("opencv-fisheye", camera, wanted, _DIVIDES)
 
     def matrix(name: str, rows: int, columns: int, data: object) -> str:
         return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: {_list(data)}\n"
@@ -106,7 +110,7 @@ def opencv_fisheye(camera: Camera, wanted: Wanted) -> Written:
 
 def ros(camera: Camera, wanted: Wanted) -> Written:
     """sensor_msgs/CameraInfo as camera_info_manager reads it; R is the identity and P has K's numbers."""
-    made, fit, notes = _kb4("ros", camera, wanted, front=True)
+    made, fit, notes = _kb4("ros", camera, wanted, _DIVIDES)
 
     def matrix(name: str, rows: int, columns: int, data: object) -> str:
         return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: {_list(data)}\n"
@@ -126,7 +130,7 @@ def kalibr(camera: Camera, wanted: Wanted) -> Written:
     """A camchain with one camera: pinhole-equi, or omni-none for the unified model."""
     core = f"  resolution: [{camera.width}, {camera.height}]\n  rostopic: /cam0/image_raw\n"
     if camera.radial == "unified" and lost_terms(camera) == ["the unified radial function"]:
-        points = camera_field(camera, wanted.max_theta).sample(77, 91, 0.013)
+        points = camera_field(camera, wanted.max_theta).sample(*CHECK)
         pixels, _ = camera.project(points)
         scale = 1 + camera.mirror
         intrinsics = (camera.mirror, camera.f_u * scale, camera.f_v * scale, camera.c_u, camera.c_v)
@@ -135,7 +139,7 @@ def kalibr(camera: Camera, wanted: Wanted) -> Written:
             f"  intrinsics: {_list(intrinsics)}\n{core}"
         )
         return Written(text, compare(points, pixels, pixels, exact=True), [])
-    made, fit, notes = _kb4("kalibr", camera, wanted, front=True)
+    made, fit, notes = _kb4("kalibr", camera, wanted, _DIVIDES)
     text = (
         f"cam0:\n  camera_model: pinhole\n  distortion_coeffs: {_list(_k(made))}\n  distortion_model: equidistant\n"
         f"  intrinsics: {_list((made.f_u, made.f_v, made.c_u, made.c_v))}\n{core}"
@@ -145,7 +149,7 @@ def kalibr(camera: Camera, wanted: Wanted) -> Written:
 
 def colmap(camera: Camera, wanted: Wanted) -> Written:
     """cameras.txt with one OPENCV_FISHEYE; its pixel centres are at half integers."""
-    made, fit, notes = _kb4("colmap", camera, wanted, front=True)
+    made, fit, notes = _kb4("colmap", camera, wanted, _DIVIDES)
     values = (made.f_u, made.f_v, made.c_u + 0.5, made.c_v + 0.5, *_k(made))
     text = (
         "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
@@ -156,7 +160,7 @@ def colmap(camera: Camera, wanted: Wanted) -> Written:
 
 def basalt(camera: Camera, wanted: Wanted) -> Written:
     """basalt's calibration.json, the camera part: kb4."""
-    made, fit, notes = _kb4("basalt", camera, wanted, front=False)
+    made, fit, notes = _kb4("basalt", camera, wanted, None)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
     values = (made.f_u, made.f_v, made.c_u, made.c_v, *_k(made))
     document = {
@@ -171,7 +175,7 @@ def basalt(camera: Camera, wanted: Wanted) -> Written:
 
 def orbslam3(camera: Camera, wanted: Wanted) -> Written:
     """The camera part of ORB-SLAM3's settings."""
-    made, fit, notes = _kb4("orbslam3", camera, wanted, front=True)
+    made, fit, notes = _kb4("orbslam3", camera, wanted, "its back-projection gives rays with z = 1")
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
     values = (made.f_u, made.f_v, made.c_u, made.c_v, *_k(made))
     lines = [f"Camera1.{name}: {value!r}" for name, value in zip(names, values, strict=True)]
@@ -196,7 +200,7 @@ def toolbox(camera: Camera, wanted: Wanted) -> Written:
         made, fit, lost = plain_polynomial(camera, wanted.max_theta)
     else:
         made = camera
-        points = camera_field(camera, wanted.max_theta).sample(77, 91, 0.013)
+        points = camera_field(camera, wanted.max_theta).sample(*CHECK)
         pixels, _ = camera.project(points)
         fit = compare(points, pixels, pixels, exact=True)
     notes = _accept("toolbox", camera, fit, wanted, lost)
@@ -213,12 +217,13 @@ def mrcal(camera: Camera, wanted: Wanted) -> Written:
     stereographic one, whose control points come from linear least squares."""
     simple = {"perspective": "LENSMODEL_PINHOLE", "stereographic": "LENSMODEL_STEREOGRAPHIC"}
     field = camera_field(camera, wanted.max_theta)
-    points = field.sample(77, 91, 0.013)
+    points = field.sample(*CHECK)
     pixels, _ = camera.project(points)
     notes: list[str] = []
     region = ""
     if field.model_ends.any():
         contour, _ = camera.project(rays(field.theta_edge, field.phi)[::4])
+        contour = np.vstack([contour, contour[:1]])  # mrcal drops a region that is not closed
         region = f"    'valid_intrinsics_region': {np.round(contour, 3).tolist()},\n\n"
     if lost_terms(camera) == [f"the {camera.radial} radial function"] and camera.radial in simple:
         model, extra = simple[camera.radial], np.zeros(0)
