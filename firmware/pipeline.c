@@ -47,8 +47,8 @@ static double circle_radius(const pf_daemon *d, double *u, double *v)
         *v = c->tracker.circle_v;
         return c->tracker.circle_radius;
     }
-    *u = d->profile.camera.circle_u;
-    *v = d->profile.camera.circle_v;
+    *u = d->has_profile ? d->profile.camera.circle_u : 0.0;
+    *v = d->has_profile ? d->profile.camera.circle_v : 0.0;
     return d->has_profile ? d->profile.camera.circle_radius : 0.0;
 }
 
@@ -249,6 +249,24 @@ static void release(pf_pipeline *p)
     free(p);
 }
 
+static bool open_parts(pf_pipeline *p, char *error, size_t n)
+{
+    return open_tracker(p, error, n) && open_bearings(p, error, n) && open_jpeg(p, error, n);
+}
+
+bool pf_pipeline_can_open(pf_daemon *daemon, char *error, size_t n)
+{
+    pf_pipeline *p = calloc(1, sizeof *p);
+    if (p == NULL) {
+        (void)snprintf(error, n, "no memory");
+        return false;
+    }
+    p->daemon = daemon;
+    bool can = open_parts(p, error, n);
+    release(p);
+    return can;
+}
+
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
                       const pf_survey *before, char *error, size_t n)
 {
@@ -265,8 +283,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!open_tracker(p, error, n) || !open_bearings(p, error, n) || !open_jpeg(p, error, n) ||
-        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
+    if (!open_parts(p, error, n) || (before->boots > 0 && !store_end_of(p, before, error, n)) ||
+        !store_start(p, error, n)) {
         release(p);
         return false;
     }
