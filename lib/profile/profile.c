@@ -44,8 +44,6 @@
 /* 9999-12-31T23:59:59Z: the last second that the JSON form can write. */
 #define CREATED_MAX 253402300799
 
-#define THETA_MAX 3.1415926535897927 /* the last number before pi */
-
 static const uint8_t MAGIC[4] = {'P', 'F', 'P', 'R'};
 
 /* The doubles of pf_camera in the order of the file. */
@@ -275,7 +273,7 @@ static pf_status check_fields(const uint8_t *bytes, const layout *l, const char 
     if (!is_rms(bytes + AT_RMS))
         return refuse(PF_ERR_FORMAT, "rms_px: neither a residual nor unknown", why);
     double covered = get_f64(bytes + AT_COVERED);
-    if (!(covered >= 0 && covered <= THETA_MAX))
+    if (!(covered >= 0 && covered <= PF_CAMERA_THETA_MAX))
         return refuse(PF_ERR_FORMAT, "theta_covered: not within 0..pi radians, pi excluded", why);
     for (size_t i = 0; i < TEXT_COUNT; i++)
         if (TEXTS[i].since <= l->version && !is_text(bytes + TEXTS[i].at, TEXTS[i].size))

@@ -1,6 +1,8 @@
 /* Building a fixed camera: the only place in camera/fixed with floating point, IEEE + - * / alone. */
 #include "fixed.h"
 
+#include "../real/real.h"
+
 #define TABLE_ERROR_PX  1e-5
 #define TABLE_ERROR_RAD 1e-8 /* of the plane, which is in radians near the axis */
 #define EXTENT_PX       32768.0
@@ -14,14 +16,14 @@ typedef struct lens_sample {
     double value[PARTS], slope[PARTS];
 } lens_sample;
 
-static uint32_t part_of(int harmonic, bool imaginary)
+static uint32_t part_of(int number, bool imaginary)
 {
-    return (uint32_t)(2 * (harmonic + 3)) + (imaginary ? 1u : 0u);
+    return (uint32_t)(2 * (number + 3)) + (imaginary ? 1u : 0u);
 }
 
-static void add(lens_sample *h, int harmonic, double re, double im, double value, double slope)
+static void add(lens_sample *h, int number, double re, double im, double value, double slope)
 {
-    uint32_t part = part_of(harmonic, false);
+    uint32_t part = part_of(number, false);
     h->value[part] += re * value;
     h->slope[part] += re * slope;
     h->value[part + 1] += im * value;
@@ -29,7 +31,7 @@ static void add(lens_sample *h, int harmonic, double re, double im, double value
 }
 
 /* e^(i phi) (re + i im) a(theta) (b0 cos phi + b1 sin phi + b2 cos 2 phi + b3 sin 2 phi) */
-static void add_asymmetry(lens_sample *h, double re, double im, const double a[3], const double b[4], double theta)
+static void add_factors(lens_sample *h, double re, double im, const double a[3], const double b[4], double theta)
 {
     double s = theta * theta;
     double value = theta * (a[0] + s * (a[1] + s * a[2])), slope = a[0] + s * (3 * a[1] + s * (5 * a[2]));
@@ -43,15 +45,15 @@ static void add_asymmetry(lens_sample *h, double re, double im, const double a[3
 
 static lens_sample sample_lens(const pf_camera *camera, double theta)
 {
-    static const int8_t power[7] = {1, 2, 2, 2, 3, 3, 3}, harmonic[7] = {-1, 2, 0, -2, 3, -1, -3};
     lens_sample h = {{0}, {0}};
     double slope, r = pf_camera_radius(camera, theta, &slope);
     add(&h, 1, 1, 0, r, slope);
-    add_asymmetry(&h, 1, 0, camera->asym_radial_theta, camera->asym_radial_phi, theta);
-    add_asymmetry(&h, 0, 1, camera->asym_tangential_theta, camera->asym_tangential_phi, theta);
-    for (int k = 0; k < 7; k++) {
-        double lower = power[k] == 1 ? 1 : power[k] == 2 ? theta : theta * theta;
-        add(&h, harmonic[k], camera->cpoly[2 * k], camera->cpoly[2 * k + 1], lower * theta, power[k] * lower);
+    add_factors(&h, 1, 0, camera->asym_radial_theta, camera->asym_radial_phi, theta);
+    add_factors(&h, 0, 1, camera->asym_tangential_theta, camera->asym_tangential_phi, theta);
+    for (int k = 0; k < CPOLY_TERMS; k++) { /* camera/real has their harmonics in the frame that turns with phi */
+        const int power = pf_cpoly_power[k];
+        double lower = power == 1 ? 1 : power == 2 ? theta : theta * theta;
+        add(&h, pf_cpoly_harmonic[k] + 1, camera->cpoly[2 * k], camera->cpoly[2 * k + 1], lower * theta, power * lower);
     }
     return h;
 }
@@ -148,14 +150,6 @@ static bool table_suffices(const plan *p, const pf_camera *camera, double pixel_
     return clear < TILT_CLEAR || worst * pixel_scale / (clear * clear) <= TABLE_ERROR_PX;
 }
 
-/* tan of the sensor's tilt, by the lens whose r it is. */
-static double tangent(double angle)
-{
-    pf_camera perspective = {.radial = PF_RADIAL_PERSPECTIVE, .theta_max = 1};
-    double t = pf_camera_radius(&perspective, magnitude_of(angle), NULL);
-    return angle < 0 ? -t : t;
-}
-
 /* The parts of H that are not zero at some knot. */
 static void choose_channels(plan *p, const pf_camera *camera)
 {
@@ -180,8 +174,9 @@ static pf_status plan_table(plan *p, const pf_camera *camera)
     pf_camera_fixed *f = &p->fixed;
     double focal = camera->f_u > camera->f_v ? camera->f_u : camera->f_v, steepest;
     p->pixel_scale = focal + magnitude_of(camera->skew);
-    p->tilt[0] = tangent(camera->tilt[1]);
-    p->tilt[1] = -tangent(camera->tilt[0]);
+    const sensor_tilt tilt = pf_camera_sensor_tilt(camera);
+    p->tilt[0] = tilt.along_x;
+    p->tilt[1] = tilt.along_y;
     uint32_t intervals = 64;
     do {
         intervals *= 2;
