@@ -43,8 +43,9 @@ static const setting settings[] = {
      "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
     {"camera", "profile_store", TEXT, AT(camera.profile_store), "", "", 0, 0, NULL,
      "instead of profile: file that keeps profiles which the host sends (pipefish flash); made at the first start"},
-    {"camera", "trial_starts", INTEGER, AT(camera.trial_starts), "", "1", 0, 255, NULL,
-     "starts with a new profile that nobody confirmed before the one before comes back"},
+    {"camera", "trial_starts", INTEGER, AT(camera.trial_starts), "", "1", 1, 4, NULL,
+     "starts with a new profile that nobody confirmed before the one before comes back; fewer than the service's "
+     "tries"},
 
     {"tracker", "max_tracks", INTEGER, AT(tracker.max_tracks), "", "400", 8, 2048, NULL, "tracks alive at once"},
     {"tracker", "levels", INTEGER, AT(tracker.levels), "", "4", 1, 6, NULL, "pyramid levels; more = faster motion"},

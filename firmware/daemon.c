@@ -7,6 +7,7 @@
 
 #include "clock.h"
 #include "keeper.h"
+#include "pipefish/profile_integers.h"
 
 void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 {
@@ -22,6 +23,19 @@ void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 static float mean_us(uint64_t sum_ns, uint64_t n)
 {
     return n ? (float)((double)sum_ns / (double)n / 1e3) : 0.0f;
+}
+
+bool pf_daemon_read_profile(const uint8_t *bytes, size_t n, pf_profile *profile, void *workspace, size_t size,
+                            const char **why)
+{
+    const pf_camera_fixed *fixed;
+    if (pf_profile_decode(bytes, n, profile, why) != PF_OK)
+        return false;
+    if (pf_camera_fixed_init(&fixed, &profile->camera, workspace, size) != PF_OK) {
+        *why = "camera: this device cannot build it in fixed point";
+        return false;
+    }
+    return pf_profile_integers_check(profile, workspace, size, why) == PF_OK;
 }
 
 pf_msg_profile pf_daemon_profile(pf_daemon *d)
@@ -97,7 +111,15 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
                   t->quality_median, t->static_blocks);
 }
 
-static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store)
+static void print_problem(FILE *out, const char *text)
+{
+    (void)fputs(",\n  \"profile_problem\": \"", out);
+    for (; *text != '\0'; text++)
+        (void)fputc(*text == '"' || *text == '\\' || (unsigned char)*text < 0x20 ? '?' : *text, out);
+    (void)fputc('"', out);
+}
+
+static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const char *problem)
 {
     (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
                   PF_SOFTWARE, s->time.boot_id);
@@ -138,6 +160,8 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
         (void)fprintf(out, "\", \"crc32c\": \"%08" PRIx32 "\", \"trial\": %s}", s->profile.crc32c,
                       s->profile.is_trial ? "true" : "false");
     }
+    if (problem[0] != '\0')
+        print_problem(out, problem);
     if (s->has_clock)
         (void)fprintf(out, ",\n  \"clock\": {\"offset_ns\": %" PRId64 ", \"error_ns\": %" PRIu64 "}",
                       s->clock.offset_ns, s->clock.error_ns);
@@ -149,6 +173,8 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     char draft[PF_CONFIG_TEXT_MAX + 8];
     pf_msg_status status;
     pf_store_stats store;
+    pf_msg_profile_state profile;
+    pf_keeper_texts texts = {.problem = ""};
     FILE *out;
     bool ok;
     (void)snprintf(draft, sizeof draft, "%s.new", path);
@@ -156,7 +182,9 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     if (out != NULL) {
         pf_daemon_status(d, &status);
         pf_store_get_stats(d->store, &store);
-        print_status(out, &status, &store);
+        if (d->keeper != NULL)
+            pf_keeper_state(d->keeper, &profile, &texts);
+        print_status(out, &status, &store, texts.problem);
         ok = ferror(out) == 0;
         ok = fclose(out) == 0 && ok;
         if (ok && rename(draft, path) == 0)

@@ -71,6 +71,12 @@ typedef struct pf_daemon {
 /* Asks for the end of the survey; the first reason counts, but a shutdown also follows a stop by the operator. */
 void pf_daemon_stop(pf_daemon *daemon, pf_stop stop);
 
+/* Decodes a profile, recomputes its self-tests and builds its camera in integers, which the pipeline lives on: what
+ * this device could not run with is refused before it counts. `workspace` as of pf_profile_integers_check. False: *why.
+ */
+bool pf_daemon_read_profile(const uint8_t *bytes, size_t n, pf_profile *profile, void *workspace, size_t size,
+                            const char **why);
+
 /* The profile in use, of a daemon that has one. The texts are the daemon's. Any thread. */
 pf_msg_profile pf_daemon_profile(pf_daemon *daemon);
 

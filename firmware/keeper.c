@@ -5,9 +5,9 @@
 #include <unistd.h>
 
 #include "log.h"
+#include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/flash_file.h"
 #include "pipefish/drivers/sha256.h"
-#include "pipefish/profile_integers.h"
 #include "pipefish/profile_store.h"
 
 _Static_assert(PF_PROFILE_STORE_BYTES == PF_PROFILE_BINARY_MAX, "every profile fits a slot");
@@ -49,8 +49,7 @@ static bool check_bytes(pf_keeper *k, size_t n, const char *what)
 {
     char problem[sizeof k->texts.problem];
     const char *why = NULL;
-    if (pf_profile_decode(k->bytes, n, &k->profile, &why) != PF_OK ||
-        pf_profile_integers_check(&k->profile, k->workspace, sizeof k->workspace, &why) != PF_OK)
+    if (!pf_daemon_read_profile(k->bytes, n, &k->profile, k->workspace, sizeof k->workspace, &why))
         (void)snprintf(problem, sizeof problem, "%s: %s", what, why);
     else if (k->width != 0 && (k->profile.camera.width != k->width || k->profile.camera.height != k->height))
         (void)snprintf(problem, sizeof problem, "%s is for %u x %u, the camera gives %u x %u", what,
@@ -184,6 +183,24 @@ void pf_keeper_set_size(pf_keeper *k, uint32_t width, uint32_t height)
         take_into_use(k);
 }
 
+void pf_keeper_reject(pf_keeper *k, const char *why)
+{
+    pf_daemon *d = k->daemon;
+    bool is_trial = k->stored.is_trial;
+    char problem[sizeof k->texts.problem];
+    (void)snprintf(problem, sizeof problem, "the stored profile: %.150s", why);
+    set_problem(k, problem);
+    if (is_trial && pf_profile_store_revert(&k->store) == PF_OK) {
+        pf_log(PF_LOG_WARNING, "the profile on trial is dropped");
+        take_into_use(k);
+        return;
+    }
+    d->has_profile = false;
+    d->profile_size = 0;
+    memset(d->profile_sha256, 0, sizeof d->profile_sha256);
+    pf_log(PF_LOG_WARNING, "no profile is used: no prediction, no parallax");
+}
+
 /* ---- jobs */
 
 static bool is_stored(const pf_keeper *k, const uint8_t sha256[32])
@@ -232,6 +249,11 @@ static bool confirm_profile(pf_keeper *k, const pf_keeper_job *job)
     }
     if (!k->stored.is_trial)
         return true;
+    /* Jobs are done while a survey runs: what is in use then has come through a start and the pipeline's opening. */
+    if (!k->daemon->has_profile || memcmp(k->daemon->profile_sha256, job->sha256, 32) != 0) {
+        set_problem(k, "the profile on trial is not in use yet: restart the device, then confirm");
+        return false;
+    }
     pf_status status = pf_profile_store_confirm(&k->store);
     if (status != PF_OK)
         return fail_store(k, status);

@@ -28,6 +28,10 @@ void pf_keeper_close(pf_keeper *keeper);
 /* The camera's frame size is known: a profile of another one is not used. */
 void pf_keeper_set_size(pf_keeper *keeper, uint32_t width, uint32_t height);
 
+/* The pipeline cannot work with the profile in use: a trial is over and the profile before comes back, else none is
+ * used. Before the threads start. */
+void pf_keeper_reject(pf_keeper *keeper, const char *why);
+
 /* Main thread: does the job that waits, if there is one. */
 void pf_keeper_work(pf_keeper *keeper);
 

@@ -14,8 +14,8 @@
 #include "courier.h"
 #include "keeper.h"
 #include "log.h"
+#include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/sha256.h"
-#include "pipefish/profile_integers.h"
 #include "pipeline.h"
 #include "utf8.h"
 
@@ -101,24 +101,12 @@ static bool load_config(const options *o, pf_config *config, char *error, size_t
     return pf_config_check(config, o->config, error, n);
 }
 
-/* Decodes a profile and makes its self-tests. */
-static bool is_for_this_device(const uint8_t *bytes, size_t n, pf_profile *profile, const char **why)
-{
-    if (pf_profile_decode(bytes, n, profile, why) != PF_OK)
-        return false;
-    size_t size = pf_camera_fixed_workspace_size(&profile->camera);
-    void *workspace = malloc(size);
-    bool is_good = pf_profile_integers_check(profile, workspace, size, why) == PF_OK;
-    free(workspace);
-    return is_good;
-}
-
 static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
 {
     const char *path = d->config.camera.profile, *why = NULL;
     uint8_t bytes[PF_PROFILE_BINARY_MAX + 1];
     FILE *in;
-    bool is_read;
+    bool is_read, is_good;
     if (d->config.camera.profile_store[0] != '\0')
         return is_check ? pf_keeper_check(d, error, n) : pf_keeper_open(d, error, n);
     if (path[0] == '\0')
@@ -136,7 +124,11 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
                        is_read ? "too large: not a binary profile" : "cannot be read");
         return false;
     }
-    if (!is_for_this_device(bytes, d->profile_size, &d->profile, &why)) {
+    void *workspace = malloc(PF_CAMERA_FIXED_WORKSPACE_MAX);
+    is_good =
+        pf_daemon_read_profile(bytes, d->profile_size, &d->profile, workspace, PF_CAMERA_FIXED_WORKSPACE_MAX, &why);
+    free(workspace);
+    if (!is_good) {
         (void)snprintf(error, n, "camera.profile: %s: %s", path, why);
         return false;
     }
@@ -169,6 +161,22 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
         return false;
     }
     return true;
+}
+
+/* A stored profile that the pipeline cannot open with must not end the daemon, or the host could never send another.
+ * The settings' own mistakes are not the profile's: they fail without it too. */
+static void settle_profile(pf_daemon *d)
+{
+    char error[512];
+    while (d->keeper != NULL && d->has_profile && !pf_pipeline_can_open(d, error, sizeof error)) {
+        char other[512];
+        d->has_profile = false;
+        bool is_profiles = pf_pipeline_can_open(d, other, sizeof other);
+        d->has_profile = true;
+        if (!is_profiles)
+            return;
+        pf_keeper_reject(d->keeper, error);
+    }
 }
 
 static bool open_transport(pf_daemon *d, char *error, size_t n)
@@ -334,6 +342,7 @@ static int open_and_run(pf_daemon *d, int signals)
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
+    settle_profile(d);
     if (!hash_setup(d, setup))
         (void)snprintf(error, sizeof error, "the setup cannot be hashed");
     else if (pf_gpio_none_open(&d->gpio) == PF_OK) {

@@ -163,6 +163,26 @@ static void release(pf_pipeline *p)
     free(p);
 }
 
+static bool open_parts(pf_pipeline *p, char *error, size_t n)
+{
+    return pf_tracking_open(&p->tracking, p->daemon, error, n) && open_shots(p, error, n) && open_jpeg(p, error, n) &&
+           (p->daemon->config.daemon.threads <= 1 ||
+            pf_worker_open(&p->worker, pf_tracking_shot, p->tracking, error, n));
+}
+
+bool pf_pipeline_can_open(pf_daemon *daemon, char *error, size_t n)
+{
+    pf_pipeline *p = calloc(1, sizeof *p);
+    if (p == NULL) {
+        (void)snprintf(error, n, "no memory");
+        return false;
+    }
+    p->daemon = daemon;
+    bool can = open_parts(p, error, n);
+    release(p);
+    return can;
+}
+
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,
                       const pf_survey *before, char *error, size_t n)
 {
@@ -179,9 +199,8 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
-    if (!pf_tracking_open(&p->tracking, daemon, error, n) || !open_shots(p, error, n) || !open_jpeg(p, error, n) ||
-        (daemon->config.daemon.threads > 1 && !pf_worker_open(&p->worker, pf_tracking_shot, p->tracking, error, n)) ||
-        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
+    if (!open_parts(p, error, n) || (before->boots > 0 && !store_end_of(p, before, error, n)) ||
+        !store_start(p, error, n)) {
         release(p);
         return false;
     }

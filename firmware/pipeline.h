@@ -12,6 +12,9 @@ typedef struct pf_pipeline pf_pipeline;
 /* Most bytes of a keyframe message with this configuration and camera: what the store's jobs must hold. */
 size_t pf_pipeline_object_max(const pf_daemon *daemon);
 
+/* Whether all that depends on the settings, the camera and the profile opens; it is closed again. False: error[n]. */
+bool pf_pipeline_can_open(pf_daemon *daemon, char *error, size_t n);
+
 /* Takes all memory; hands the store the SurveyEnd of an interrupted survey (`before`, if it has had boots) and the
  * SurveyStart. False: error[n] says what failed. */
 bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *courier, const pf_survey *survey,

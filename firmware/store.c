@@ -13,6 +13,7 @@
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
 
+#define HURRY_NS 2000000000u
 #define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
 
 enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
@@ -390,6 +391,14 @@ pf_job *pf_store_take(pf_store *s)
     pthread_mutex_lock(&s->mutex);
     while (s->free_count == 0 && s->config.is_patient && !s->is_hurried)
         pthread_cond_wait(&s->change, &s->mutex);
+    if (s->config.is_patient) {
+        /* In a hurry: the last keyframes may wait for a batch that is being written, not for a disk that hangs. */
+        const uint64_t due = pf_now() + HURRY_NS;
+        const struct timespec until = {(time_t)(due / 1000000000u), (long)(due % 1000000000u)};
+        while (s->free_count == 0 && !s->is_blocked && !s->is_failing &&
+               pthread_cond_timedwait(&s->change, &s->mutex, &until) == 0) {
+        }
+    }
     if (s->free_count > 0) {
         job = s->free_job[--s->free_count];
         *job = (pf_job){.bytes = job->bytes};

@@ -57,7 +57,8 @@ void pf_store_give_back(pf_store *store, pf_job *job);
 /* Counts and remembers a keyframe that will not be stored. */
 void pf_store_lose(pf_store *store, uint32_t index);
 
-/* From now on take() does not wait: the survey is being stopped. */
+/* From now on take() waits two seconds at most, and not for a disk that is full or fails: the survey is being stopped.
+ */
 void pf_store_hurry(pf_store *store);
 
 /* From now on nothing waits for room in the spool: what does not fit is lost, and counted. */

@@ -34,8 +34,8 @@ double pf_tracking_circle(const pf_daemon *d, double *u, double *v)
         *v = c->tracker.circle_v;
         return c->tracker.circle_radius;
     }
-    *u = d->profile.camera.circle_u;
-    *v = d->profile.camera.circle_v;
+    *u = d->has_profile ? d->profile.camera.circle_u : 0.0;
+    *v = d->has_profile ? d->profile.camera.circle_v : 0.0;
     return d->has_profile ? d->profile.camera.circle_radius : 0.0;
 }
 

@@ -294,20 +294,19 @@ def run_flash(args: argparse.Namespace) -> Result:
     from pipefish.flash import Flasher
     from pipefish.transport import open_transport
 
-    if args.revert and (args.profile or args.confirm is not None):
-        raise UsageError("flash: --revert goes with neither a profile nor --confirm")
-    if not args.profile and not args.revert and not args.confirm:
-        raise UsageError("flash: give a profile, or --confirm or --revert")
+    if sum(map(bool, (args.profile, args.confirm, args.revert))) != 1:
+        raise UsageError("flash: give either a profile, or --confirm, or --revert")
     data = load_profile(args).camera.to_binary() if args.profile else None
     with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
         if args.revert:
             state = device.revert()
+        elif data:
+            state = device.send(data)
         else:
-            state = device.send(data) if data else device.state()
+            state = device.state()
             if not state.HasField("stored"):
                 raise PipefishError("the device has no profile that could be confirmed")
-            if args.confirm is not False:
-                state = device.confirm(state.stored.sha256)
+            state = device.confirm(state.stored.sha256)
     document = {
         name: MessageToDict(profile, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
         | {"sha256": profile.sha256.hex(), "crc32c": f"{profile.crc32c:08x}"}
@@ -323,6 +322,8 @@ def run_flash(args: argparse.Namespace) -> Result:
         ("stored", stored + ("" if in_use == stored else "; the next start of the device takes it")),
         ("written", f"{state.slot_erases_a + state.slot_erases_b} times"),
     ]
+    if data and state.stored.trial:
+        rows.append(("then", f"restart the device, then: pipefish flash {args.device} --confirm"))
     return document, table(rows)
 
 
@@ -506,18 +507,13 @@ def build_parser() -> argparse.ArgumentParser:
         commands,
         "flash",
         run_flash,
-        "Put a camera profile on a device. It is stored on trial, read back, tested and confirmed; the device's next "
-        "start takes it.",
+        "Put a camera profile on a device. It is tested, stored on trial and read back; the device's next start takes "
+        "it. Then --confirm it, or the device goes back to the one before.",
         "pipefish flash tcp://127.0.0.1:7447 camera.json",
     )
     add_device(p)
     p.add_argument("profile", metavar="PROFILE", nargs="?", help="a profile, or another program's calibration")
-    p.add_argument(
-        "--confirm",
-        action=argparse.BooleanOptionalAction,
-        help="without PROFILE: confirm the one on trial; --no-confirm with one: leave it on trial, and the device goes "
-        "back to the one before unless it is confirmed in time",
-    )
+    p.add_argument("--confirm", action="store_true", help="keep the profile on trial, with which the device runs now")
     p.add_argument("--revert", action="store_true", help="drop the profile on trial, or go back to the one before")
     add_profile_input(p)
     p.add_argument(

@@ -44,8 +44,6 @@
 /* 9999-12-31T23:59:59Z: the last second that the JSON form can write. */
 #define CREATED_MAX 253402300799
 
-#define THETA_MAX 3.1415926535897927 /* the last number before pi */
-
 static const uint8_t MAGIC[4] = {'P', 'F', 'P', 'R'};
 
 /* The doubles of pf_camera in the order of the file. */
@@ -206,6 +204,50 @@ static void read_camera(const uint8_t *bytes, pf_camera *camera)
         }
 }
 
+/* 2^-k with 2^2k <= v < 2^(2k + 2): brings a variance of any size to 1..4. */
+static double half_scale(double v)
+{
+    uint64_t bits;
+    memcpy(&bits, &v, sizeof bits);
+    int32_t exponent = (int32_t)(bits >> 52 & 0x7FFu) - 1023,
+            half = exponent >= 0 ? exponent / 2 : -((1 - exponent) / 2);
+    bits = (uint64_t)(1023 - half) << 52;
+    memcpy(&v, &bits, sizeof v);
+    return v;
+}
+
+/* Finite, and positive semidefinite up to rounding: with the variances scaled to 1..4 and 1e-9 on the diagonal, more
+ * than the rounding of 40 rows by far, Cholesky's pivots (of L D L^T, for this room has no sqrt) are positive. */
+static pf_status check_matrix(const uint8_t *row, uint32_t count, const char **why)
+{
+    double factor[PF_PROFILE_FREE_MAX * (PF_PROFILE_FREE_MAX + 1) / 2], pivot[PF_PROFILE_FREE_MAX],
+        scale[PF_PROFILE_FREE_MAX], variance[PF_PROFILE_FREE_MAX], *at = factor;
+    for (uint32_t i = 0; i < count; row += (i + 1) * sizeof(double), at += i + 1, i++) {
+        for (uint32_t j = 0; j <= i; j++)
+            if (!is_finite(row + j * sizeof(double)))
+                return refuse(PF_ERR_FORMAT, "covariance: not finite", why);
+        double v = get_f64(row + i * sizeof(double));
+        if (!(v >= 0))
+            return refuse(PF_ERR_FORMAT, "covariance: a negative variance", why);
+        scale[i] = half_scale(v);
+        variance[i] = v * scale[i] * scale[i];
+        pivot[i] = variance[i] + 1e-9;
+        for (uint32_t j = 0; j < i; j++) {
+            const double *other = factor + j * (j + 1) / 2;
+            double c = get_f64(row + j * sizeof(double)) * scale[i] * scale[j], sum = c;
+            if (!(c * c <= variance[i] * variance[j] * (1 + 1e-9))) /* 1e-9: a correlation of 1 after rounding */
+                return refuse(PF_ERR_FORMAT, "covariance: a correlation beyond 1", why);
+            for (uint32_t k = 0; k < j; k++)
+                sum -= at[k] * pivot[k] * other[k];
+            at[j] = sum / pivot[j];
+            pivot[i] -= at[j] * sum;
+        }
+        if (!(pivot[i] > 0))
+            return refuse(PF_ERR_FORMAT, "covariance: not positive semidefinite", why);
+    }
+    return PF_OK;
+}
+
 static pf_status check_covariance(const uint8_t *bytes, const uint8_t *row, const char **why)
 {
     uint32_t count = get_u32(bytes + AT_FREE_COUNT);
@@ -218,22 +260,7 @@ static pf_status check_covariance(const uint8_t *bytes, const uint8_t *row, cons
         if (i > 0 && i < count && param[i] <= param[i - 1])
             return refuse(PF_ERR_FORMAT, "free_param: not in increasing order", why);
     }
-    double variance[PF_PROFILE_FREE_MAX];
-    for (uint32_t i = 0; i < count; i++) {
-        for (uint32_t j = 0; j <= i; j++)
-            if (!is_finite(row + j * sizeof(double)))
-                return refuse(PF_ERR_FORMAT, "covariance: not finite", why);
-        variance[i] = get_f64(row + i * sizeof(double));
-        if (!(variance[i] >= 0))
-            return refuse(PF_ERR_FORMAT, "covariance: a negative variance", why);
-        for (uint32_t j = 0; j < i; j++) {
-            double c = get_f64(row + j * sizeof(double));
-            if (c * c > variance[i] * variance[j] * (1 + 1e-9)) /* 1e-9: a correlation of 1 after rounding */
-                return refuse(PF_ERR_FORMAT, "covariance: a correlation beyond 1", why);
-        }
-        row += (i + 1) * sizeof(double);
-    }
-    return PF_OK;
+    return check_matrix(row, count, why);
 }
 
 /* Everything between the length and the vectors, for bytes as long as the layout says. */
@@ -246,7 +273,7 @@ static pf_status check_fields(const uint8_t *bytes, const layout *l, const char 
     if (!is_rms(bytes + AT_RMS))
         return refuse(PF_ERR_FORMAT, "rms_px: neither a residual nor unknown", why);
     double covered = get_f64(bytes + AT_COVERED);
-    if (!(covered >= 0 && covered <= THETA_MAX))
+    if (!(covered >= 0 && covered <= PF_CAMERA_THETA_MAX))
         return refuse(PF_ERR_FORMAT, "theta_covered: not within 0..pi radians, pi excluded", why);
     for (size_t i = 0; i < TEXT_COUNT; i++)
         if (TEXTS[i].since <= l->version && !is_text(bytes + TEXTS[i].at, TEXTS[i].size))
@@ -407,8 +434,8 @@ static pf_status check_layout(const uint8_t *bytes, size_t n, layout *l, const c
     if (version >= 2) {
         vectors = get_u32(bytes + AT_VECTORS);
         integers = get_u32(bytes + AT_INTEGERS);
-        if (vectors < 1 || vectors > PF_PROFILE_VECTORS)
-            return refuse(PF_ERR_FORMAT, "vectors: not 1..8", why);
+        if (vectors != PF_PROFILE_VECTORS)
+            return refuse(PF_ERR_FORMAT, "vectors: not 8", why);
         if (integers > PF_PROFILE_INTEGERS)
             return refuse(PF_ERR_FORMAT, "integers: more than 8", why);
     }

@@ -67,6 +67,15 @@ def flash(crawler: Crawler, capsys, *arguments: object) -> dict:
     return json.loads(out)
 
 
+def install(crawler: Crawler, cam: pf.Camera) -> pb.ProfileState:
+    """Sends a profile, restarts the device with it and confirms it; what the device then says."""
+    with device(crawler) as flasher:
+        flasher.send(cam.to_binary())
+    sha256 = restart(crawler).stored.sha256
+    with device(crawler) as flasher:
+        return flasher.confirm(sha256)
+
+
 def name_of(profile: pb.Profile | dict | None) -> str | None:
     name = profile.get("name") if isinstance(profile, dict) else profile and profile.name
     return name or None
@@ -76,11 +85,15 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
     assert name_of(restart(crawler).in_use) is None
     OLD.save(tmp_path / "old.json")
     document = flash(crawler, capsys, tmp_path / "old.json")
-    assert document["in_use"] is None and document["stored"]["name"] == "old" and not document["stored"]["trial"]
+    assert document["in_use"] is None and document["stored"]["name"] == "old" and document["stored"]["trial"]
     assert document["stored"]["sha256"] == hashlib.sha256(OLD.to_binary()).hexdigest()
     assert sum(document["slot_erases"]) == 1
     state = restart(crawler)
-    assert (state.in_use.name, state.in_use.serial, state.in_use.trial) == ("old", "S1", False)
+    assert (state.in_use.name, state.in_use.serial, state.in_use.trial) == ("old", "S1", True)
+    flash(crawler, capsys, "--confirm")
+    with device(crawler) as flasher:
+        state = flasher.state()
+    assert not state.in_use.trial and not state.stored.trial
     assert state.in_use.crc32c == int.from_bytes(OLD.to_binary()[-4:], "little")
     store = Store(crawler.port)
     with store.client() as client:
@@ -99,16 +112,17 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
 
 def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawler: Crawler, capsys):
     restart(crawler)
-    (tmp_path / "old.bin").write_bytes(OLD.to_binary())
+    install(crawler, OLD)
     NEW.save(tmp_path / "new.json")
-    flash(crawler, capsys, tmp_path / "old.bin")
-    document = flash(crawler, capsys, tmp_path / "new.json", "--no-confirm")
+    document = flash(crawler, capsys, tmp_path / "new.json")
     assert document["stored"]["trial"] and document["stored"]["starts_left"] == 1
     state = restart(crawler)  # one start on trial: camera.trial_starts
     assert state.in_use.name == "new" and state.in_use.trial and state.in_use.starts_left == 0
     assert restart(crawler).in_use.name == "old"
 
-    flash(crawler, capsys, tmp_path / "new.json", "--no-confirm")
+    flash(crawler, capsys, tmp_path / "new.json")
+    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", "--confirm"]) == 1
+    assert "not in use yet: restart the device" in capsys.readouterr().err
     restart(crawler)
     document = flash(crawler, capsys, "--confirm")
     assert document["stored"]["name"] == document["in_use"]["name"] == "new" and not document["in_use"]["trial"]
@@ -118,16 +132,58 @@ def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawl
     assert restart(crawler).in_use.name == "old"
 
 
-def test_without_starts_on_trial_the_next_start_reverts(tmp_path: Path, crawler: Crawler):
-    with crawler.config.open("a") as config:
-        config.write("[camera]\ntrial_starts = 0\n")
+def test_flash_says_what_to_do_next_and_a_trial_can_be_dropped(tmp_path: Path, crawler: Crawler, capsys):
+    restart(crawler)
+    install(crawler, OLD)
+    NEW.save(tmp_path / "new.json")
+    address = f"tcp://127.0.0.1:{crawler.port}"
+    assert cli.main(["flash", address, str(tmp_path / "new.json")]) == 0
+    assert f"restart the device, then: pipefish flash {address} --confirm" in capsys.readouterr().out
+    assert name_of(flash(crawler, capsys, "--revert")["stored"]) == "old"
+    flash(crawler, capsys, tmp_path / "new.json")
+    done = run("--config", crawler.config, "--check-config", "--set", "camera.trial_starts=5")
+    assert done.returncode == 1 and "camera.trial_starts" in done.stderr  # the service gives up after five
+
+
+def test_a_lens_beyond_fixed_point_is_refused_when_it_is_flashed(crawler: Crawler):
+    restart(crawler)
+    install(crawler, OLD)
+    steep = camera("steep", theta_max=1.57, radial="perspective")
+    with device(crawler) as flasher, pytest.raises(PipefishError, match="cannot build it in fixed point"):
+        flasher.send(steep.to_binary())
+    assert restart(crawler).in_use.name == "old"
+
+
+def test_a_stored_profile_that_the_pipeline_cannot_use_does_not_end_the_daemon(crawler: Crawler):
+    """An image circle that no tracker can work with passes every check of the profile by itself."""
+    far = camera("far", circle_u=20000.0, circle_v=0.0, circle_radius=10.0)
     restart(crawler)
     with device(crawler) as flasher:
-        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
-        assert flasher.send(NEW.to_binary()).stored.trial
-        assert flasher.revert().stored.name == "old"
-        assert flasher.send(NEW.to_binary()).stored.trial
-    assert restart(crawler).in_use.name == "old"
+        flasher.send(far.to_binary())
+    state = restart(crawler)  # without one before: it runs on with none
+    assert not state.HasField("in_use") and "image circle" in state.problem
+    install(crawler, OLD)
+    with device(crawler) as flasher:
+        flasher.send(far.to_binary())
+    for _ in range(2):
+        state = restart(crawler)
+        assert state.in_use.name == "old" and not state.in_use.trial
+    with device(crawler) as flasher:  # confirmed with a circle of its own settings, then used without
+        flasher.send(far.to_binary())
+    circle = ("--set", "tracker.circle_radius=70", "--set", "tracker.circle_u=96", "--set", "tracker.circle_v=80")
+    crawler.kill()
+    crawler.log.unlink()
+    crawler.start(*circle)
+    with device(crawler) as flasher:
+        assert not flasher.confirm(flasher.state().in_use.sha256).in_use.trial
+    state = restart(crawler)
+    assert not state.HasField("in_use") and "image circle" in state.problem
+    end = time.monotonic() + 10
+    while not crawler.status():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert "image circle" in crawler.status()["profile_problem"]
+    assert install(crawler, NEW).in_use.name == "new"
 
 
 def test_the_device_refuses_what_is_no_profile_for_it_and_says_why(crawler: Crawler):
@@ -143,8 +199,8 @@ def test_the_device_refuses_what_is_no_profile_for_it_and_says_why(crawler: Craw
     integers[-4:] = crc32c(bytes(integers[:-4])).to_bytes(4, "little")
     damaged = bytearray(NEW.to_binary())
     damaged[300] ^= 1
+    install(crawler, OLD)
     with device(crawler) as flasher:
-        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
         for data, why in (
             (bytes(changed), "self_test: this device does not"),
             (bytes(integers), "self_test: the fixed-point camera of this device"),
@@ -173,7 +229,7 @@ def test_a_device_without_a_store_says_so(tmp_path: Path, crawler: Crawler, caps
 
 
 def test_flash_arguments_that_do_not_go_together_are_wrong_usage(capsys):
-    for arguments in ([], ["--no-confirm"], ["a.json", "--revert"], ["--confirm", "--revert"]):
+    for arguments in ([], ["a.json", "--confirm"], ["a.json", "--revert"], ["--confirm", "--revert"]):
         assert cli.main(["flash", "tcp://127.0.0.1:1", *arguments]) == 2
         assert "flash: " in capsys.readouterr().err
 
@@ -189,9 +245,7 @@ def flip(path: Path, at: int) -> None:
 def test_a_damaged_store_is_told_and_can_be_written_again(tmp_path: Path, crawler: Crawler):
     assert run("--config", crawler.config, "--check-config").returncode == 0 and not crawler.store.exists()
     restart(crawler)
-    with device(crawler) as flasher:
-        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
-    restart(crawler)
+    install(crawler, OLD)
     assert run("--config", crawler.config, "--check-config").returncode == 0
     crawler.kill()
     flip(crawler.store, 2 * 16384 + 200)  # in slot A
@@ -199,8 +253,7 @@ def test_a_damaged_store_is_told_and_can_be_written_again(tmp_path: Path, crawle
     assert done.returncode == 1 and "the stored profile is damaged" in done.stderr
     state = restart(crawler)  # it runs, for the host must be able to send another one
     assert not state.HasField("in_use") and "damaged" in state.problem
-    with device(crawler) as flasher:
-        flasher.confirm(flasher.send(NEW.to_binary()).stored.sha256)
+    install(crawler, NEW)
     crawler.kill()
     for log in (0, 16384):
         flip(crawler.store, log + 100)  # behind the record: does no harm
@@ -217,8 +270,8 @@ def test_a_damaged_store_is_told_and_can_be_written_again(tmp_path: Path, crawle
 
 def test_a_profile_of_another_frame_size_does_not_keep_the_device_from_starting(tmp_path: Path, crawler: Crawler):
     restart(crawler)
+    install(crawler, OLD)
     with device(crawler) as flasher:
-        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
         flasher.send(NEW.to_binary())
     crawler.kill()
     narrow = bytearray()  # the camera now gives frames of half the height
@@ -231,9 +284,7 @@ def test_a_profile_of_another_frame_size_does_not_keep_the_device_from_starting(
     (tmp_path / "survey.y4m").write_bytes(narrow)
     state = restart(crawler)
     assert not state.HasField("in_use") and f"the camera gives {WIDTH} x {HEIGHT // 2}" in state.problem
-    with device(crawler) as flasher:
-        fitting = camera("fitting", height=HEIGHT // 2)
-        flasher.confirm(flasher.send(fitting.to_binary()).stored.sha256)
+    install(crawler, camera("fitting", height=HEIGHT // 2))
     assert restart(crawler).in_use.name == "fitting"
 
 
@@ -266,27 +317,31 @@ def test_kill_at_any_moment_of_flashing_leaves_the_old_profile_or_the_new_one(cr
     """kill -9 while a profile is on its way, being written, or being confirmed; and it can be flashed again."""
     rng = random.Random(SEED)
     restart(crawler)
-    with device(crawler) as flasher:
-        flasher.confirm(flasher.send(OLD.to_binary()).stored.sha256)
+    install(crawler, OLD)
     stored, seen = OLD, set()
-    for round_ in range(8):
-        wanted = camera(f"round {round_}", f_u=70 + round_)
+
+    def cut(what: str, act) -> pb.ProfileState:
         with device(crawler) as flasher:
             timer = threading.Timer(rng.uniform(0.0, 0.12), crawler.process.kill)
             timer.start()
             flasher._timeout_s = 0.3
             try:
-                flasher.confirm(flasher.send(wanted.to_binary()).stored.sha256)
-                seen.add("confirmed")
+                act(flasher)
+                seen.add(what)
             except PipefishError:
                 seen.add("cut")
             timer.join()
         crawler.process.wait()
-        state = restart(crawler)
+        return restart(crawler)
+
+    for round_ in range(8):
+        wanted = camera(f"round {round_}", f_u=70 + round_)
         allowed = {hashlib.sha256(cam.to_binary()).digest(): cam for cam in (stored, wanted)}
+        state = cut("sent", lambda flasher, wanted=wanted: flasher.send(wanted.to_binary()))
         assert state.in_use.sha256 in allowed, (round_, state)
-        with device(crawler) as flasher:
-            stored = camera(f"after {round_}", f_u=90 + round_)
-            flasher.confirm(flasher.send(stored.to_binary()).stored.sha256)
-    assert "cut" in seen
+        state = cut("confirmed", lambda flasher, state=state: flasher.confirm(state.in_use.sha256))
+        assert state.in_use.sha256 in allowed and not state.in_use.trial, (round_, state)
+        stored = camera(f"after {round_}", f_u=90 + round_)
+        install(crawler, stored)
+    assert seen == {"sent", "confirmed", "cut"}
     assert restart(crawler).in_use.name == stored.name

@@ -129,7 +129,7 @@ static inline void true_jacobian(const pf_camera *camera, long double complex z,
 static inline long double complex true_inverse(const pf_camera *camera, const long double pixel[2],
                                                long double complex z)
 {
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 8; i++) {
         long double uv[2], j[2][2];
         true_pixel(camera, z, uv);
         true_jacobian(camera, z, j);
@@ -153,6 +153,65 @@ static inline uint32_t next_random(uint32_t *state)
 {
     *state = *state * 1664525u + 1013904223u;
     return *state >> 8; /* 24 bits */
+}
+
+static inline double random_share(uint32_t *state) /* 0..1 */
+{
+    return next_random(state) / 16777216.0;
+}
+
+static inline double random_sign(uint32_t *state) /* -1..1 */
+{
+    return 2 * random_share(state) - 1;
+}
+
+static inline double random_scale(uint32_t *state, double low, double high)
+{
+    return low * pow(high / low, random_share(state));
+}
+
+/* A camera from all over the legal ranges: most are ordinary in most ways and extreme in some. pf_camera_check decides
+ * whether it is one. */
+static inline pf_camera random_camera(uint32_t *state)
+{
+    static const double reach[10] = {1e-6, 1e-3, .05, .3, .9, 1.2, 1.5, 1.92, 2.6, 3.1415};
+    pf_camera c = {.width = 1 + next_random(state) % 16384, .height = 1 + next_random(state) % 16384};
+    c.radial = next_random(state) % 7;
+    c.theta_max = reach[next_random(state) % 10] * (1 - .01 * random_share(state));
+    if ((c.radial == PF_RADIAL_PERSPECTIVE || c.radial == PF_RADIAL_ORTHOGRAPHIC) && c.theta_max > 1.5)
+        c.theta_max = 1.5 + .07 * random_share(state);
+    c.f_u = next_random(state) % 2 ? random_scale(state, 50, 2000) : random_scale(state, .1, 1e5);
+    c.f_v = next_random(state) % 2 ? c.f_u * (1 + .02 * random_sign(state)) : random_scale(state, .1, 1e5);
+    c.skew = next_random(state) % 4 ? 0 : random_sign(state) * c.f_u;
+    c.c_u = next_random(state) % 4 ? c.width * .5 : 1e5 * random_sign(state);
+    c.c_v = next_random(state) % 4 ? c.height * .5 : 1e5 * random_sign(state);
+    if (next_random(state) % 2) {
+        double most = next_random(state) % 2 ? .7 : .1;
+        c.tilt[0] = most * random_sign(state);
+        c.tilt[1] = most * random_sign(state);
+    }
+    double square = c.theta_max * c.theta_max, size = random_scale(state, 1e-3, 3), power = square;
+    for (int i = 0; i < 4 && c.radial == PF_RADIAL_GENERIC; i++, power *= square)
+        *pf_camera_param_at(&c, PF_PARAM_K2 + (uint32_t)i) = size * random_sign(state) / power;
+    if (c.radial == PF_RADIAL_UNIFIED)
+        c.mirror = random_scale(state, .01, 1000);
+    size = random_scale(state, 1e-5, .3);
+    for (int k = 0; k < 2; k++) {
+        double *a = k ? c.asym_tangential_theta : c.asym_radial_theta,
+               *b = k ? c.asym_tangential_phi : c.asym_radial_phi, norm = 0;
+        if (next_random(state) % 3)
+            continue;
+        for (int i = 0; i < 4; i++)
+            b[i] = random_sign(state), norm += b[i] * b[i];
+        for (int i = 0; i < 4; i++)
+            b[i] /= sqrt(norm);
+        for (int i = 0; i < 3; i++)
+            a[i] = size * random_sign(state) / pow(c.theta_max, 2 * i);
+    }
+    if (next_random(state) % 3 == 0)
+        for (int i = 0; i < PF_CPOLY_MAX; i++)
+            c.cpoly[i] = .3 * size * random_sign(state) / pow(c.theta_max, i < 2 ? 0 : i < 8 ? 1 : 2);
+    return c;
 }
 
 #endif

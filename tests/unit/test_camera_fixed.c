@@ -57,10 +57,23 @@ static long double complex z_of(long double x, long double y, long double z)
     return rho > 0 ? atan2l(rho, z) * (x + y * I) / rho : 0;
 }
 
-static double projection_bound(const pf_camera *camera, const long double uv[2])
+/* The largest factor by which the pixel moves with Z, pixels per radian. */
+static double largest_magnification(const pf_camera *camera, long double complex z)
+{
+    long double j[2][2];
+    true_jacobian(camera, z, j);
+    return (double)sqrtl(j[0][0] * j[0][0] + j[0][1] * j[0][1] + j[1][0] * j[1][0] + j[1][1] * j[1][1]);
+}
+
+static double projection_bound(const pf_camera *camera, const pf_camera_fixed *fixed, long double complex z,
+                               const long double uv[2])
 {
     double way = (double)hypotl(uv[0] - camera->c_u, uv[1] - camera->c_v);
-    return 2.2e-5 + 1e-9 * way + 3.5e-10 * fmax(camera->f_u, camera->f_v);
+    double r_max = (double)fixed->plane_max / (double)((uint64_t)1 << fixed->plane_q);
+    double clear = 1 - (fabs(tan(camera->tilt[0])) + fabs(tan(camera->tilt[1]))) * r_max;
+    double extent = r_max / clear * (fmax(camera->f_u, camera->f_v) + fabs(camera->skew));
+    return 2.2e-5 + 1e-9 * way + 3.5e-10 * largest_magnification(camera, z) +
+           (fixed->channels > 1 || clear < 1 ? 3e-9 * extent / clear : 0);
 }
 
 /* Proves: every ray of the domain projects, within the stated error, for all lenses; the rim included. */
@@ -83,7 +96,7 @@ static void test_projection_is_within_the_stated_error(void)
             true_pixel(camera, z, uv);
             double error = (double)hypotl(as_pixels(pixel.x) - uv[0], as_pixels(pixel.y) - uv[1]);
             worst = fmax(worst, error);
-            share = fmax(share, error / projection_bound(camera, uv));
+            share = fmax(share, error / projection_bound(camera, fixed, z, uv));
         }
         printf("    %-30s %.2e px, %.2f of the bound\n", LENSES[l].name, worst, share);
         TEST_ASSERT_TRUE_MESSAGE(share <= 1, LENSES[l].name);
@@ -91,15 +104,37 @@ static void test_projection_is_within_the_stated_error(void)
     }
 }
 
-/* The least factor by which the plane moves with Z, and the largest |W| / f, for the bound. */
-static double least_magnification(const pf_camera *camera, long double complex z)
+static double least_singular_value(long double j[2][2])
 {
-    long double j[2][2];
-    true_jacobian(camera, z, j);
-    j[0][0] /= camera->f_u, j[0][1] /= camera->f_u, j[1][0] /= camera->f_v, j[1][1] /= camera->f_v;
     long double sum = j[0][0] * j[0][0] + j[0][1] * j[0][1] + j[1][0] * j[1][0] + j[1][1] * j[1][1];
     long double det = j[0][0] * j[1][1] - j[0][1] * j[1][0];
     return (double)sqrtl(fmaxl(0, (sum - sqrtl(fmaxl(0, sum * sum - 4 * det * det))) / 2));
+}
+
+/* The least factor by which the plane moves with Z: before the sensor's tilt or behind it, where it is smaller. */
+static double least_magnification(const pf_camera *camera, long double complex z)
+{
+    long double j[2][2];
+    pf_camera plain = *camera;
+    plain.f_u = plain.f_v = 1;
+    plain.skew = plain.c_u = plain.c_v = 0;
+    if (camera->tilt[0] != 0 || camera->tilt[1] != 0) {
+        plain.tilt[0] = plain.tilt[1] = 0;
+        double before = least_magnification(&plain, z);
+        plain.tilt[0] = camera->tilt[0];
+        plain.tilt[1] = camera->tilt[1];
+        true_jacobian(&plain, z, j);
+        return fmin(before, least_singular_value(j));
+    }
+    true_jacobian(&plain, z, j);
+    return least_singular_value(j);
+}
+
+static double back_projection_bound(const pf_camera *camera, const pf_camera_fixed *fixed, double slope)
+{
+    const double r_max = (double)fixed->plane_max / (double)((uint64_t)1 << fixed->plane_q);
+    const bool plain = fixed->channels == 1 && camera->tilt[0] == 0 && camera->tilt[1] == 0 && camera->skew == 0;
+    return 2e-9 + (1e-8 + (plain ? 2.5e-9 : 5e-9) * r_max * (1 + fabs(camera->skew) / camera->f_u)) / slope;
 }
 
 /* Proves: the ray of a pixel, taken as exact, is within the stated error, 2e-7 rad where r' >= 0.18; what projection
@@ -109,7 +144,6 @@ static void test_back_projection_is_within_the_stated_error(void)
     for (size_t l = 0; l < LENSES_COUNT; l++) {
         const pf_camera *camera = &LENSES[l].camera;
         const pf_camera_fixed *fixed = build(&LENSES[l]);
-        const double r_max = (double)fixed->plane_max / (double)((uint64_t)1 << fixed->plane_q);
         uint32_t state = 2;
         double worst = 0, share = 0;
         for (int i = 0; i < POINTS; i++) {
@@ -130,11 +164,11 @@ static void test_back_projection_is_within_the_stated_error(void)
             double error =
                 (double)hypotl(hypotl(as_unit(ray.x) - scale * creall(z), as_unit(ray.y) - scale * cimagl(z)),
                                as_unit(ray.z) - cosl(at));
-            double slope = least_magnification(camera, z),
-                   bound = 2e-9 + (fixed->channels > 1 || fixed->tilt[0] != 0 ? 5e-9 : 2.5e-9) * r_max / slope;
+            double slope = least_magnification(camera, z), bound = back_projection_bound(camera, fixed, slope);
             if (at > camera->theta_max)
                 continue;
-            if (slope >= 0.18) {
+            if (slope >=
+                0.18) { /* none of these lenses reaches beyond r_max = 5, but the one to 85 degrees, of r' >= 1 */
                 TEST_ASSERT_TRUE_MESSAGE(error <= 2e-7, LENSES[l].name);
                 worst = fmax(worst, error);
             }
@@ -143,6 +177,77 @@ static void test_back_projection_is_within_the_stated_error(void)
         printf("    %-30s %.2e rad, %.2f of the bound\n", LENSES[l].name, worst, share);
         TEST_ASSERT_TRUE_MESSAGE(share <= 1, LENSES[l].name);
     }
+}
+
+static void print_camera(const char *what, double share, const pf_camera *c, double theta)
+{
+    printf("    %s %.2f: radial %u f %g %g skew %g tilt %g %g theta %g of %g asymmetry %g %g cpoly %g mirror %g\n",
+           what, share, c->radial, c->f_u, c->f_v, c->skew, c->tilt[0], c->tilt[1], theta, c->theta_max,
+           c->asym_radial_theta[0], c->asym_tangential_theta[0], c->cpoly[0], c->mirror);
+}
+
+/* Proves: whatever camera is accepted, over all the legal ranges, keeps the stated errors in both directions, and what
+ * it projects comes back. */
+static void test_random_cameras_keep_the_stated_errors(void)
+{
+    enum { CAMERAS = 4000, RAYS = 24 };
+    uint32_t state = 8, built = 0, legal = 0, refused = 0, n_tilted = 0, n_narrow = 0;
+    double projection = 0, back = 0;
+    for (int l = 0; l < CAMERAS; l++) {
+        pf_camera camera = random_camera(&state);
+        const pf_camera_fixed *fixed;
+        if (pf_camera_check(&camera, NULL) != PF_OK)
+            continue;
+        legal++;
+        if (pf_camera_fixed_init(&fixed, &camera, workspace, sizeof workspace) != PF_OK)
+            continue;
+        built++;
+        n_tilted += fabs(camera.tilt[0]) + fabs(camera.tilt[1]) > .1;
+        n_narrow += fmax(camera.f_u, camera.f_v) > 8 * fmin(camera.f_u, camera.f_v);
+        for (int i = 0; i < RAYS; i++) {
+            long double theta = sample_theta(&camera, i, &state), phi = next_random(&state) / 2670176.9L, uv[2];
+            pf_ray_q30 ray = ray_of(theta, phi);
+            pf_point_q16 pixel;
+            long double complex z = z_of(ray.x, ray.y, ray.z);
+            if (cabsl(z) > camera.theta_max)
+                z *= camera.theta_max / cabsl(z);
+            true_pixel(&camera, z, uv);
+            if (fabsl(uv[0]) > 32767 || fabsl(uv[1]) > 32767)
+                continue;
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_fixed_project(fixed, ray, &pixel));
+            double error = (double)hypotl(as_pixels(pixel.x) - uv[0], as_pixels(pixel.y) - uv[1]),
+                   share = error / projection_bound(&camera, fixed, z, uv);
+            if (share > projection)
+                print_camera("projection", share, &camera, (double)theta), projection = share;
+            if (pf_camera_fixed_unproject(fixed, pixel, &ray, NULL) != PF_OK) {
+                if (least_magnification(&camera, z) >= 1e-3 && refused++ < 5)
+                    print_camera("refused", 0, &camera, (double)theta);
+                continue;
+            }
+            if (i % 10 == 0 || theta < 1e-3L * camera.theta_max)
+                continue;
+            uv[0] = as_pixels(pixel.x), uv[1] = as_pixels(pixel.y);
+            z = true_inverse(&camera, uv, z);
+            long double at = cabsl(z), scale = sinl(at) / at;
+            long double again[2];
+            true_pixel(&camera, z, again);
+            if (!(at <= camera.theta_max && hypotl(again[0] - uv[0], again[1] - uv[1]) < 1e-9L))
+                continue; /* the pixel was rounded out of the domain, or so coarsely that Newton is lost */
+            error = (double)hypotl(hypotl(as_unit(ray.x) - scale * creall(z), as_unit(ray.y) - scale * cimagl(z)),
+                                   as_unit(ray.z) - cosl(at));
+            double slope = least_magnification(&camera, z);
+            share = error / back_projection_bound(&camera, fixed, slope);
+            if (share > back)
+                print_camera("back-projection", share, &camera, (double)theta), back = share;
+        }
+    }
+    printf("    %u built of %u legal, %u tilted, %u with aspects above 8; %u refused; %.2f and %.2f of the bounds\n",
+           built, legal, n_tilted, n_narrow, refused, projection, back);
+    TEST_ASSERT_TRUE(projection <= 1);
+    TEST_ASSERT_TRUE(back <= 1);
+    TEST_ASSERT_EQUAL_UINT32(0, refused);
+    TEST_ASSERT_GREATER_THAN_UINT32(300, n_tilted);
+    TEST_ASSERT_GREATER_THAN_UINT32(300, n_narrow);
 }
 
 /* Proves: with a shifted pupil, points at all distances and scales project as the model says, and the origin of the
@@ -177,7 +282,7 @@ static void test_points_of_a_shifted_pupil(void)
             true_pixel(camera, theta * cexpl(I * phi), uv);
             TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_fixed_project_point(fixed, xyz, bits, &pixel));
             TEST_ASSERT_TRUE(hypotl(as_pixels(pixel.x) - uv[0], as_pixels(pixel.y) - uv[1]) <=
-                             projection_bound(camera, uv));
+                             projection_bound(camera, fixed, theta * cexpl(I * phi), uv));
             pf_ray_q30 ray;
             int32_t origin_q27;
             TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_fixed_unproject(fixed, pixel, &ray, &origin_q27));
@@ -262,6 +367,7 @@ static void test_what_cannot_be_kept_is_refused_when_built(void)
         {"perspective to 89.99 degrees", {F300, .radial = PF_RADIAL_PERSPECTIVE, .theta_max = 1.5706}},
         {"40000 px from the principal point", {SENSOR, .f_u = 30000, .f_v = 30000, .theta_max = 1.4}},
         {"tilt that magnifies tenfold", {F300, .tilt = {.44, 0}, .theta_max = 1.92}},
+        {"tilt that magnifies fivefold", {F300, .tilt = {.35, 0}, .theta_max = 2.2}},
         {"image circle of 40000 px", {F300, .theta_max = 1.5, .circle_radius = 40000}},
     };
     const pf_camera_fixed *fixed = NULL;
@@ -299,6 +405,17 @@ static void test_in_image_agrees_with_the_double_camera_at_the_rims(void)
     TEST_ASSERT_UINT32_WITHIN(n / 4, n / 2, inside);
 }
 
+/* Proves: an image circle of less than Q16.16 can tell is a point, not the whole image. */
+static void test_the_smallest_image_circle_is_not_the_whole_image(void)
+{
+    lens_case lens = {"circle", {P9, .theta_max = 1.92, .circle_u = 630.25, .circle_v = 411.5, .circle_radius = 1e-6}};
+    const pf_camera_fixed *fixed = build(&lens);
+    const int32_t u = 630 * 65536 + 16384, v = 411 * 65536 + 32768;
+    TEST_ASSERT_TRUE(pf_camera_fixed_in_image(fixed, (pf_point_q16){u, v}));
+    TEST_ASSERT_FALSE(pf_camera_fixed_in_image(fixed, (pf_point_q16){u + 1, v}));
+    TEST_ASSERT_FALSE(pf_camera_fixed_in_image(fixed, (pf_point_q16){100 * 65536, 100 * 65536}));
+}
+
 /* Proves: square root, angle, sine and cosine within what fixed.h states, at all magnitudes. */
 static void test_elementary_functions(void)
 {
@@ -330,11 +447,13 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_projection_is_within_the_stated_error);
     RUN_TEST(test_back_projection_is_within_the_stated_error);
+    RUN_TEST(test_random_cameras_keep_the_stated_errors);
     RUN_TEST(test_points_of_a_shifted_pupil);
     RUN_TEST(test_a_central_camera_does_not_mind_the_scale);
     RUN_TEST(test_outside_the_domain_is_refused);
     RUN_TEST(test_what_cannot_be_kept_is_refused_when_built);
     RUN_TEST(test_in_image_agrees_with_the_double_camera_at_the_rims);
+    RUN_TEST(test_the_smallest_image_circle_is_not_the_whole_image);
     RUN_TEST(test_elementary_functions);
     return UNITY_END();
 }

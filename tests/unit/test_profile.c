@@ -346,7 +346,7 @@ static void test_bad_fields_are_refused_and_named(void)
         {736, 1, 9, PF_ERR_FORMAT, "model_choice"},
         {800, 1, 0, PF_ERR_FORMAT, "vectors"},
         {800, 1, 9, PF_ERR_FORMAT, "vectors"},
-        {800, 1, 7, PF_ERR_FORMAT, "length"},
+        {800, 1, 7, PF_ERR_FORMAT, "vectors"},
         {804, 1, 9, PF_ERR_FORMAT, "integers"},
         {804, 1, 1, PF_ERR_FORMAT, "length"},
         {COVARIANCE_AT + 7, 1, 0xBF, PF_ERR_FORMAT, "covariance"},
@@ -373,6 +373,43 @@ static void test_bad_fields_are_refused_and_named(void)
     }
     put_u32(tiny + 8, 15);
     refused(PF_ERR_FORMAT, tiny, 15, "length");
+}
+
+/* Proves: vectors that are right but all in one place, which would show nothing, are refused. */
+static void test_vectors_that_lie_elsewhere_are_refused(void)
+{
+    pf_profile profile = sample();
+    uint8_t bytes[PF_PROFILE_BINARY_MAX];
+    size_t n = encode_ok(&profile, bytes);
+    for (uint32_t vector = 1; vector < PF_PROFILE_VECTORS; vector++)
+        memcpy(bytes + VECTORS_AT + 64 * vector, bytes + VECTORS_AT, 64);
+    repair(bytes, n);
+    refused(PF_ERR_SELF_TEST, bytes, n, "self_test");
+}
+
+/* Proves: a covariance that no variables can have is refused, whatever its scale; one of rank 1 is not. */
+static void test_a_covariance_that_cannot_be_is_refused(void)
+{
+    static const double scales[3] = {1e-300, 1, 1e300};
+    for (int i = 0; i < 9; i++) {
+        const double scale = scales[i / 3], r = i % 3 == 0 ? 1 : i % 3 == 1 ? -0.9 : 2;
+        const double lower[6] = {scale, r * scale, scale, r * scale, r * scale, scale};
+        pf_profile profile = sample();
+        uint8_t bytes[PF_PROFILE_BINARY_MAX];
+        size_t n;
+        const char *why = "";
+        memset(profile.free_param, 0, sizeof profile.free_param);
+        memset(profile.covariance, 0, sizeof profile.covariance);
+        memcpy(profile.covariance, lower, sizeof lower);
+        profile.free_count = 3;
+        for (uint32_t k = 0; k < 3; k++)
+            profile.free_param[k] = (uint8_t)k;
+        pf_status status = pf_profile_encode(&profile, bytes, sizeof bytes, &n, &why);
+        TEST_ASSERT_EQUAL_INT_MESSAGE(i % 3 == 0 ? PF_OK : PF_ERR_ARGUMENT, status, why);
+        if (i % 3)
+            TEST_ASSERT_EQUAL_STRING(
+                i % 3 == 1 ? "covariance: not positive semidefinite" : "covariance: a correlation beyond 1", why);
+    }
 }
 
 /* Proves: intact bytes whose vectors this device does not compute are refused as that, and by no more than the
@@ -536,6 +573,8 @@ int main(void)
     RUN_TEST(test_other_versions_are_named_as_such);
     RUN_TEST(test_bad_fields_are_refused_and_named);
     RUN_TEST(test_a_profile_that_disagrees_is_refused);
+    RUN_TEST(test_vectors_that_lie_elsewhere_are_refused);
+    RUN_TEST(test_a_covariance_that_cannot_be_is_refused);
     RUN_TEST(test_the_vectors_see_every_parameter_of_every_model);
     RUN_TEST(test_text_must_be_utf8);
     RUN_TEST(test_garbage);

@@ -1,10 +1,14 @@
 /* Building a fixed camera: the only place in camera/fixed with floating point, IEEE + - * / alone. */
 #include "fixed.h"
 
-#define TABLE_ERROR_PX 1e-5
-#define EXTENT_PX      32768.0
-#define SLOPE_MAX      268435456.0 /* 2^28: products in the cubic stay within 63 bits */
-#define TILT_CLEAR     0.125
+#include "../real/real.h"
+
+#define TABLE_ERROR_PX  1e-5
+#define TABLE_ERROR_RAD 1e-8 /* of the plane, which is in radians near the axis */
+#define EXTENT_PX       32768.0
+#define ERROR_PX        1e-4        /* of a projection */
+#define SLOPE_MAX       268435456.0 /* 2^28: products in the cubic stay within 63 bits */
+#define TILT_CLEAR      0.25
 
 /* H_n at one theta, n = -3..3: real and imaginary parts, and their derivatives by theta. */
 #define PARTS 14
@@ -12,14 +16,14 @@ typedef struct lens_sample {
     double value[PARTS], slope[PARTS];
 } lens_sample;
 
-static uint32_t part_of(int harmonic, bool imaginary)
+static uint32_t part_of(int number, bool imaginary)
 {
-    return (uint32_t)(2 * (harmonic + 3)) + (imaginary ? 1u : 0u);
+    return (uint32_t)(2 * (number + 3)) + (imaginary ? 1u : 0u);
 }
 
-static void add(lens_sample *h, int harmonic, double re, double im, double value, double slope)
+static void add(lens_sample *h, int number, double re, double im, double value, double slope)
 {
-    uint32_t part = part_of(harmonic, false);
+    uint32_t part = part_of(number, false);
     h->value[part] += re * value;
     h->slope[part] += re * slope;
     h->value[part + 1] += im * value;
@@ -27,7 +31,7 @@ static void add(lens_sample *h, int harmonic, double re, double im, double value
 }
 
 /* e^(i phi) (re + i im) a(theta) (b0 cos phi + b1 sin phi + b2 cos 2 phi + b3 sin 2 phi) */
-static void add_asymmetry(lens_sample *h, double re, double im, const double a[3], const double b[4], double theta)
+static void add_factors(lens_sample *h, double re, double im, const double a[3], const double b[4], double theta)
 {
     double s = theta * theta;
     double value = theta * (a[0] + s * (a[1] + s * a[2])), slope = a[0] + s * (3 * a[1] + s * (5 * a[2]));
@@ -41,15 +45,15 @@ static void add_asymmetry(lens_sample *h, double re, double im, const double a[3
 
 static lens_sample sample_lens(const pf_camera *camera, double theta)
 {
-    static const int8_t power[7] = {1, 2, 2, 2, 3, 3, 3}, harmonic[7] = {-1, 2, 0, -2, 3, -1, -3};
     lens_sample h = {{0}, {0}};
     double slope, r = pf_camera_radius(camera, theta, &slope);
     add(&h, 1, 1, 0, r, slope);
-    add_asymmetry(&h, 1, 0, camera->asym_radial_theta, camera->asym_radial_phi, theta);
-    add_asymmetry(&h, 0, 1, camera->asym_tangential_theta, camera->asym_tangential_phi, theta);
-    for (int k = 0; k < 7; k++) {
-        double lower = power[k] == 1 ? 1 : power[k] == 2 ? theta : theta * theta;
-        add(&h, harmonic[k], camera->cpoly[2 * k], camera->cpoly[2 * k + 1], lower * theta, power[k] * lower);
+    add_factors(&h, 1, 0, camera->asym_radial_theta, camera->asym_radial_phi, theta);
+    add_factors(&h, 0, 1, camera->asym_tangential_theta, camera->asym_tangential_phi, theta);
+    for (int k = 0; k < CPOLY_TERMS; k++) { /* camera/real has their harmonics in the frame that turns with phi */
+        const int power = pf_cpoly_power[k];
+        double lower = power == 1 ? 1 : power == 2 ? theta : theta * theta;
+        add(&h, pf_cpoly_harmonic[k] + 1, camera->cpoly[2 * k], camera->cpoly[2 * k + 1], lower * theta, power * lower);
     }
     return h;
 }
@@ -64,7 +68,8 @@ typedef struct plan {
     pf_camera_fixed fixed;
     double per_theta;            /* intervals per radian, as exactly as scale has it */
     double bound, steepest;      /* of |W|; of all channels' change in an interval */
-    double tilt[2], pixel_scale; /* of the sensor's homography; largest factor from W to pixels */
+    double tilt[2], pixel_scale; /* of the sensor's homography; largest factor from its plane to pixels */
+    double error;                /* of a projection, pixels */
 } plan;
 
 static double theta_of(const plan *p, uint32_t index)
@@ -109,12 +114,19 @@ static void set_intervals(plan *p, const pf_camera *camera, uint32_t intervals)
     f->step = to_mantissa(2 / p->per_theta, 31, &f->step_shift);
 }
 
+/* The least d = 1 + tilt . W of the sensor's tilt, |W| <= bound. W / d changes by up to 1 / d^2 times as much as W. */
+static double clear_of(const plan *p, double bound)
+{
+    return 1 - (magnitude_of(p->tilt[0]) + magnitude_of(p->tilt[1])) * bound;
+}
+
 /* Whether the cubics through the knots stay within TABLE_ERROR_PX in the middle of their intervals, where Hermite's
  * remainder is largest; *bound gets the largest |W| there can be, as a sum of moduli. */
 static bool table_suffices(const plan *p, const pf_camera *camera, double pixel_scale, double *bound, double *steepest)
 {
     double h = 1 / p->per_theta;
     lens_sample low = sample_knot(p, camera, 0);
+    double worst = 0;
     *bound = *steepest = 0;
     for (uint32_t k = 1; k <= p->fixed.intervals; k++) {
         lens_sample high = sample_knot(p, camera, k);
@@ -128,94 +140,14 @@ static bool table_suffices(const plan *p, const pf_camera *camera, double pixel_
             *steepest = steep > *steepest ? steep : *steepest;
             *steepest = rise > *steepest ? rise : *steepest;
         }
-        if (!(error * pixel_scale <= TABLE_ERROR_PX))
+        if (!(error <= TABLE_ERROR_RAD))
             return false;
+        worst = error > worst ? error : worst;
         *bound = size > *bound ? size : *bound;
         low = high;
     }
-    return true;
-}
-
-/* tan of the sensor's tilt, by the lens whose r it is. */
-static double tangent(double angle)
-{
-    pf_camera perspective = {.radial = PF_RADIAL_PERSPECTIVE, .theta_max = 1};
-    double t = pf_camera_radius(&perspective, magnitude_of(angle), NULL);
-    return angle < 0 ? -t : t;
-}
-
-/* Chooses the number of intervals and the scale of the plane. */
-static pf_status plan_table(plan *p, const pf_camera *camera)
-{
-    pf_camera_fixed *f = &p->fixed;
-    double focal = camera->f_u > camera->f_v ? camera->f_u : camera->f_v, steepest;
-    p->pixel_scale = focal + magnitude_of(camera->skew);
-    p->tilt[0] = tangent(camera->tilt[1]);
-    p->tilt[1] = -tangent(camera->tilt[0]);
-    uint32_t intervals = 64;
-    do {
-        intervals *= 2;
-        if (intervals > INTERVALS_MAX)
-            return PF_ERR_UNSUPPORTED;
-        set_intervals(p, camera, intervals);
-    } while (!table_suffices(p, camera, p->pixel_scale, &p->bound, &steepest));
-
-    p->steepest = steepest;
-    double clear = 1 - (magnitude_of(p->tilt[0]) + magnitude_of(p->tilt[1])) * p->bound;
-    if (clear < TILT_CLEAR || p->bound / clear * p->pixel_scale > EXTENT_PX)
-        return PF_ERR_UNSUPPORTED;
-    double limit = 2147483000.0; /* a little below 2^31 */
-    f->plane_q = 0;
-    while (2 * p->bound / clear < limit && 2 * steepest < SLOPE_MAX && f->plane_q < 60) {
-        limit /= 2;
-        steepest *= 2;
-        f->plane_q++;
-    }
-    if (p->pixel_scale * EXTENT_PX > (double)((uint64_t)1 << f->plane_q)) /* a unit of the plane above 2^-15 px */
-        return PF_ERR_UNSUPPORTED;
-    f->pixel_q = 16;
-    while (f->pixel_q < 24 &&
-           p->bound / clear * p->pixel_scale * (double)((uint64_t)1 << (f->pixel_q + 1)) < 2147483000.0)
-        f->pixel_q++;
-    return PF_OK;
-}
-
-static affine_row make_row(double a, double b)
-{
-    affine_row row = {0, 0, 0};
-    double largest = magnitude_of(a) > magnitude_of(b) ? magnitude_of(a) : magnitude_of(b);
-    (void)to_mantissa(largest, 30, &row.shift);
-    double scale = (double)((uint64_t)1 << row.shift);
-    row.a = (int32_t)rounded(a * scale);
-    row.b = (int32_t)rounded(b * scale);
-    return row;
-}
-
-static void set_sensor(plan *p, const pf_camera *camera)
-{
-    pf_camera_fixed *f = &p->fixed;
-    double plane = (double)((uint64_t)1 << f->plane_q), pixel = (double)((uint64_t)1 << f->pixel_q);
-    f->to_pixel[0] = make_row(camera->f_u * pixel / plane, camera->skew * pixel / plane);
-    f->to_pixel[1] = make_row(0, camera->f_v * pixel / plane);
-    f->from_pixel[0] =
-        make_row(plane / pixel / camera->f_u, -(plane / pixel) * (camera->skew / camera->f_u) / camera->f_v);
-    f->from_pixel[1] = make_row(0, plane / pixel / camera->f_v);
-    f->center[0] = rounded(camera->c_u * pixel);
-    f->center[1] = rounded(camera->c_v * pixel);
-    double focal = camera->f_u < camera->f_v ? camera->f_u : camera->f_v;
-    f->rim_slack = rounded(plane / focal / 16384) + 2;
-    /* Z in Q30 is half a unit off in both directions, a slope of (steepest) plane units to the interval; and each
-     * channel rounds. */
-    f->rounding = (int64_t)f->channels * 4 + rounded(p->per_theta * p->steepest * plane / (double)ONE_Q30) * 2;
-    f->tilt[0] = (int32_t)rounded(p->tilt[0] * (double)ONE_Q30);
-    f->tilt[1] = (int32_t)rounded(p->tilt[1] * (double)ONE_Q30);
-    f->plane_max = rounded(p->bound * plane);
-    f->width = camera->width;
-    f->height = camera->height;
-    f->circle[0] = rounded(camera->circle_u * 65536);
-    f->circle[1] = rounded(camera->circle_v * 65536);
-    int64_t radius = rounded(camera->circle_radius * 65536);
-    f->circle_radius2 = radius * radius;
+    double clear = clear_of(p, *bound);
+    return clear < TILT_CLEAR || worst * pixel_scale / (clear * clear) <= TABLE_ERROR_PX;
 }
 
 /* The parts of H that are not zero at some knot. */
@@ -236,6 +168,96 @@ static void choose_channels(plan *p, const pf_camera *camera)
                 f->channel[f->channels++] = (channel){(int8_t)n, im != 0};
 }
 
+/* Chooses the number of intervals and the scale of the plane. */
+static pf_status plan_table(plan *p, const pf_camera *camera)
+{
+    pf_camera_fixed *f = &p->fixed;
+    double focal = camera->f_u > camera->f_v ? camera->f_u : camera->f_v, steepest;
+    p->pixel_scale = focal + magnitude_of(camera->skew);
+    const sensor_tilt tilt = pf_camera_sensor_tilt(camera);
+    p->tilt[0] = tilt.along_x;
+    p->tilt[1] = tilt.along_y;
+    uint32_t intervals = 64;
+    do {
+        intervals *= 2;
+        if (intervals > INTERVALS_MAX)
+            return PF_ERR_UNSUPPORTED;
+        set_intervals(p, camera, intervals);
+    } while (!table_suffices(p, camera, p->pixel_scale, &p->bound, &steepest));
+
+    p->steepest = steepest;
+    choose_channels(p, camera);
+    double clear = clear_of(p, p->bound), extent = p->bound / clear * p->pixel_scale;
+    if (clear < TILT_CLEAR || extent > EXTENT_PX)
+        return PF_ERR_UNSUPPORTED;
+    /* The bound that camera_fixed.h states: rounding of the pixel and the table, then of the plane, then of the angle.
+     */
+    p->error = 2.2e-5 + 1e-9 * extent + 3.5e-10 * steepest * p->per_theta * p->pixel_scale / (clear * clear);
+    if (p->fixed.channels > 1 || clear < 1)
+        p->error += 3e-9 * extent / clear;
+    if (p->error > ERROR_PX)
+        return PF_ERR_UNSUPPORTED;
+    double limit = 2147483000.0; /* a little below 2^31 */
+    f->plane_q = 0;
+    while (2 * p->bound / clear < limit && 2 * steepest < SLOPE_MAX && f->plane_q < 60) {
+        limit /= 2;
+        steepest *= 2;
+        f->plane_q++;
+    }
+    if (p->pixel_scale / (clear * clear) * EXTENT_PX >
+        (double)((uint64_t)1 << f->plane_q)) /* a unit of the plane above 2^-15 px */
+        return PF_ERR_UNSUPPORTED;
+    const double scale[2] = {camera->f_u + magnitude_of(camera->skew), camera->f_v};
+    for (int i = 0; i < 2; i++) {
+        f->pixel_q[i] = 16;
+        while (f->pixel_q[i] < 30 &&
+               p->bound / clear * scale[i] * (double)((uint64_t)1 << (f->pixel_q[i] + 1)) < 2147483000.0)
+            f->pixel_q[i]++;
+    }
+    return PF_OK;
+}
+
+static affine_row make_row(double a, double b)
+{
+    affine_row row = {0, 0, 0};
+    double largest = magnitude_of(a) > magnitude_of(b) ? magnitude_of(a) : magnitude_of(b);
+    (void)to_mantissa(largest, 30, &row.shift);
+    double scale = (double)((uint64_t)1 << row.shift);
+    row.a = (int32_t)rounded(a * scale);
+    row.b = (int32_t)rounded(b * scale);
+    return row;
+}
+
+static void set_sensor(plan *p, const pf_camera *camera)
+{
+    pf_camera_fixed *f = &p->fixed;
+    const double plane = (double)((uint64_t)1 << f->plane_q), u = (double)((uint64_t)1 << f->pixel_q[0]),
+                 v = (double)((uint64_t)1 << f->pixel_q[1]);
+    f->to_pixel[0] = make_row(camera->f_u * u / plane, camera->skew * u / plane);
+    f->to_pixel[1] = make_row(0, camera->f_v * v / plane);
+    f->from_pixel[0] = make_row(plane / u / camera->f_u, -(plane / v) * (camera->skew / camera->f_u) / camera->f_v);
+    f->from_pixel[1] = make_row(0, plane / v / camera->f_v);
+    f->center[0] = rounded(camera->c_u * u);
+    f->center[1] = rounded(camera->c_v * v);
+    /* A pixel of the rim is off by the projection's error and its own rounding; on the plane that is at most so much
+     * by 1 / f, the skew's shear and the tilt, whose d is at most 2 - clear. */
+    double focal = camera->f_u < camera->f_v ? camera->f_u : camera->f_v, d = 2 - clear_of(p, p->bound);
+    f->rim_slack =
+        rounded(plane * (p->error + 1.1e-5) / focal * (1 + magnitude_of(camera->skew) / camera->f_u) * d * d) + 2;
+    /* Z in Q30 is half a unit off in both directions, and a unit is a slope of (steepest) plane units to the interval
+     * in the largest channel, up to three times that in the harmonics' turning; and each channel rounds. */
+    f->rounding = (int64_t)f->channels * 4 + rounded(p->per_theta * p->steepest * plane / (double)ONE_Q30) * 8;
+    f->tilt[0] = (int32_t)rounded(p->tilt[0] * (double)ONE_Q30);
+    f->tilt[1] = (int32_t)rounded(p->tilt[1] * (double)ONE_Q30);
+    f->plane_max = rounded(p->bound * plane);
+    f->width = camera->width;
+    f->height = camera->height;
+    f->circle[0] = rounded(camera->circle_u * 65536);
+    f->circle[1] = rounded(camera->circle_v * 65536);
+    int64_t radius = rounded(camera->circle_radius * 65536);
+    f->circle_radius2 = camera->circle_radius > 0 ? radius * radius : -1;
+}
+
 static pf_status make_plan(plan *p, const pf_camera *camera)
 {
     pf_camera_fixed *f = &p->fixed;
@@ -245,7 +267,6 @@ static pf_status make_plan(plan *p, const pf_camera *camera)
     pf_status status = plan_table(p, camera);
     if (status != PF_OK)
         return status;
-    choose_channels(p, camera);
     set_sensor(p, camera);
     f->theta_max = (uint64_t)rounded(camera->theta_max * 4294967296.0);
     f->pupil_e1 = (int32_t)rounded(camera->pupil_e1 * (double)ONE_Q30);

@@ -45,16 +45,16 @@ struct pf_camera_fixed {
     uint32_t scale, scale_shift, step, step_shift;
     uint32_t intervals, channels; /* channel 0 is r */
     channel channel[CHANNELS_MAX];
-    uint32_t plane_q, pixel_q;
-    int64_t plane_max; /* largest |W| */
-    int32_t tilt[2];   /* Q30: d = 1 + tilt[0] X + tilt[1] Y */
+    uint32_t plane_q, pixel_q[2]; /* of u and v: focal lengths may differ by any factor */
+    int64_t plane_max;            /* largest |W| */
+    int32_t tilt[2];              /* Q30: d = 1 + tilt[0] X + tilt[1] Y */
     affine_row to_pixel[2], from_pixel[2];
     int64_t center[2];                 /* pixel_q */
-    int64_t rim_slack;                 /* plane: 2^-14 px */
+    int64_t rim_slack;                 /* plane: what projection's errors leave of a pixel of the rim */
     int64_t rounding;                  /* plane: most that rounding leaves of |W - target|, as a sum */
     int32_t pupil_e1;                  /* Q30 metres */
     int64_t pupil_near;                /* Q30 metres: points must not be nearer */
-    int64_t circle[2], circle_radius2; /* Q16.16; Q32 */
+    int64_t circle[2], circle_radius2; /* Q16.16; Q32, -1 = no circle */
     const knot *knots;                 /* (intervals + 1) x channels */
 };
 

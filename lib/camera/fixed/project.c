@@ -38,7 +38,7 @@ static pf_status to_pixel(const pf_camera_fixed *fixed, uint64_t theta, polar ac
     for (int i = 0; i < 2; i++) {
         const affine_row *row = &fixed->to_pixel[i];
         int64_t at = round_shift(row->a * plane[0] + row->b * plane[1], row->shift) + fixed->center[i];
-        out[i] = round_shift(at, fixed->pixel_q - 16);
+        out[i] = round_shift(at, fixed->pixel_q[i] - 16);
         if (out[i] < INT32_MIN || out[i] > INT32_MAX)
             return PF_ERR_DOMAIN;
     }
@@ -129,7 +129,7 @@ bool pf_camera_fixed_in_image(const pf_camera_fixed *fixed, pf_point_q16 pixel)
     if (pixel.x < -32768 || pixel.y < -32768 || pixel.x > (int64_t)fixed->width * 65536 - 32768 ||
         pixel.y > (int64_t)fixed->height * 65536 - 32768)
         return false;
-    if (fixed->circle_radius2 == 0)
+    if (fixed->circle_radius2 < 0)
         return true;
     uint64_t du = magnitude(pixel.x - fixed->circle[0]), dv = magnitude(pixel.y - fixed->circle[1]);
     return du <= UINT32_MAX / 2 + 1u && dv <= UINT32_MAX / 2 + 1u &&

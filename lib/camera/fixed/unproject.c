@@ -152,8 +152,8 @@ static bool solve_plane(const pf_camera_fixed *fixed, int64_t x, int64_t y, gues
 /* The plane point of a pixel; false where it is out of all bounds. */
 static bool to_plane(const pf_camera_fixed *fixed, pf_point_q16 pixel, int64_t plane[2])
 {
-    const int64_t scale = (int64_t)1 << (fixed->pixel_q - 16);
-    int64_t at[2] = {pixel.x * scale - fixed->center[0], pixel.y * scale - fixed->center[1]};
+    int64_t at[2] = {pixel.x * ((int64_t)1 << (fixed->pixel_q[0] - 16)) - fixed->center[0],
+                     pixel.y * ((int64_t)1 << (fixed->pixel_q[1] - 16)) - fixed->center[1]};
     if (magnitude(at[0]) > (uint64_t)ONE_Q31 || magnitude(at[1]) > (uint64_t)ONE_Q31)
         return false;
     for (int i = 0; i < 2; i++)
@@ -173,6 +173,19 @@ static bool to_plane(const pf_camera_fixed *fixed, pf_point_q16 pixel, int64_t p
     return magnitude(plane[0]) <= bound && magnitude(plane[1]) <= bound;
 }
 
+/* Whether a plane point beyond the rim is within rim_slack of the rim's tangent where the straight continuation of the
+ * lens leaves it: however the lens shears there, the distance across the rim counts. A point so far out that Newton may
+ * not follow it (narrow fields, whose pixels are coarser than the table) must be near the place itself. */
+static bool is_near_rim(const pf_camera_fixed *fixed, const int64_t plane[2], polar across, bool is_solved)
+{
+    plane_point rim = pf_fixed_lens(fixed, fixed->theta_max, across.c, across.s, true);
+    residual e = miss(&rim, plane[0], plane[1]);
+    polar along = pf_fixed_polar(rim.phi_x, rim.phi_y);
+    if (e.size > (is_solved ? (uint64_t)ONE_Q30 : 4 * (uint64_t)fixed->rim_slack))
+        return false;
+    return magnitude(round_shift(e.x * along.s - e.y * along.c, 30)) <= (uint64_t)fixed->rim_slack;
+}
+
 /* theta and phi of a plane point. */
 static bool from_plane(const pf_camera_fixed *fixed, const int64_t plane[2], uint64_t *theta, polar *across)
 {
@@ -186,14 +199,14 @@ static bool from_plane(const pf_camera_fixed *fixed, const int64_t plane[2], uin
         return true;
     }
     guess g = at_polar(r >= r_max * 256 ? fixed->theta_max : solve_radius(fixed, r), *across);
-    if (!solve_plane(fixed, plane[0], plane[1], &g))
+    const bool is_solved = solve_plane(fixed, plane[0], plane[1], &g);
+    if (!is_solved && g.theta <= fixed->theta_max)
         return false;
     *theta = g.theta;
     *across = g.across;
     if (*theta > fixed->theta_max) {
         *theta = fixed->theta_max;
-        plane_point rim = pf_fixed_lens(fixed, *theta, across->c, across->s, false);
-        return miss(&rim, plane[0], plane[1]).size <= (uint64_t)fixed->rim_slack;
+        return is_near_rim(fixed, plane, *across, is_solved);
     }
     return true;
 }

@@ -48,7 +48,7 @@ typedef struct range {
         offsetof(pf_camera, field), min, max, why                                                                      \
     }
 /* The limits keep every product finite and the affine part invertible (skew <= f_u: a shear of up to 45 degrees);
- * 3.1415926535897927 is the last number before pi, and theta_max >= 1e-6 keeps the rim away from the axis. */
+ * theta_max >= 1e-6 keeps the rim away from the axis. */
 static const range RANGES[] = {
     FIELD(f_u, 0.1, 1e5, "f_u: not within 0.1..1e5 pixels per radian"),
     FIELD(f_v, 0.1, 1e5, "f_v: not within 0.1..1e5 pixels per radian"),
@@ -63,7 +63,7 @@ static const range RANGES[] = {
     FIELD(k5, -1e6, 1e6, "k5: not within -1e6..1e6"),
     FIELD(mirror, 0, 1e3, "mirror: not within 0..1000"),
     FIELD(pupil_e1, -1, 1, "pupil_e1: not within -1..1 metres"),
-    FIELD(theta_max, 1e-6, 3.1415926535897927, "theta_max: not within 1e-6..pi, pi excluded"),
+    FIELD(theta_max, 1e-6, PF_CAMERA_THETA_MAX, "theta_max: not within 1e-6..pi, pi excluded"),
     FIELD(circle_u, -1e5, 1e5, "circle_u: not within -1e5..1e5 pixels"),
     FIELD(circle_v, -1e5, 1e5, "circle_v: not within -1e5..1e5 pixels"),
     FIELD(circle_radius, 0.0, 1e5, "circle_radius: not within 0..1e5 pixels"),

@@ -37,7 +37,8 @@ typedef enum pf_radial {
     PF_RADIAL_UNIFIED = 6,       /* catadioptric, r = (mirror + 1) sin theta / (mirror + cos theta) */
 } pf_radial;
 
-#define PF_CPOLY_MAX 14
+#define PF_CPOLY_MAX        14
+#define PF_CAMERA_THETA_MAX 3.1415926535897927 /* the last number before pi */
 
 typedef struct pf_camera {
     uint32_t width, height; /* pixels, 1..16384 */
