@@ -166,6 +166,7 @@ typedef struct pf_motion_hints { /* with a frame; a reading counts only if its h
     bool has_encoder, has_roll;
     int64_t encoder;
     int32_t roll_urad; /* about the optical axis, 0 = image y axis down; rises as the picture turns from y to x */
+    uint32_t frames;   /* since the frame before it: dropped ones + 1; 0 counts as 1 */
 } pf_motion_hints;
 
 /* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
@@ -173,20 +174,27 @@ typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_poi
 
 #define PF_FALL_UNKNOWN INT32_MIN
 
-typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker_reset */
-    uint32_t n;
-    uint64_t id[PF_TRACKS_MAX];
-    pf_ray_q30 ray[PF_TRACKS_MAX];
+typedef struct pf_predictor { /* private */
+    uint32_t max_tracks, n;
     pf_motion_hints last;
     bool is_known, has_per_count;
-    int32_t turn[9];                  /* rotation of the last frame, Q30 */
-    int32_t forward;                  /* median fall of the cotangents in the last frame, Q16 */
-    int64_t per_count_q30;            /* the same for each encoder count */
-    int32_t fall[2u * PF_TRACKS_MAX]; /* of each row of the table */
-    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX], driven[PF_TRACKS_MAX]; /* scratch */
-    uint16_t pair[PF_TRACKS_MAX];
-    uint32_t value[PF_TRACKS_MAX];
+    int32_t turn[9];       /* rotation in one frame, Q30 */
+    int32_t forward;       /* median fall of the cotangents in one frame, Q16 */
+    int64_t per_count_q30; /* the same for each encoder count */
+    uint64_t *id;
+    pf_ray_q30 *ray;
+    int32_t *fall;                  /* of each row of the table, in one frame */
+    pf_ray_q30 *from, *to, *driven; /* scratch */
+    uint32_t *value;
+    uint16_t *pair;
 } pf_predictor;
+
+/* Bytes of workspace for a tracker of so many tracks. */
+#define PF_PREDICTOR_BYTES(max_tracks) (70u * (size_t)(max_tracks))
+
+/* The workspace is aligned to 8 and stays the caller's. PF_ERR_ARGUMENT: max_tracks is not 1..2048; PF_ERR_SPACE. Call
+ * it again after pf_tracker_reset. */
+pf_status pf_predictor_init(pf_predictor *predictor, uint32_t max_tracks, void *workspace, size_t size);
 
 /* Before the first frame: one encoder count moves the camera on by so much of the pipe's radius, Q5.27. */
 void pf_predictor_assume(pf_predictor *predictor, int32_t radii_per_count_q27);
