@@ -30,7 +30,7 @@ struct pf_pipeline {
     pf_jpeg *jpeg;
     uint8_t preview[PF_PREVIEW_MAX];
     uint64_t preview_due;
-    uint8_t stretched[256]; /* grey levels of the camera -> 0..255 */
+    uint8_t stretched[256];                   /* grey levels of the camera -> 0..255 */
     uint32_t preview_quality, preview_shrink; /* of the last preview */
     uint32_t next_index;
     uint32_t boots;

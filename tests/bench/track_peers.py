@@ -2,9 +2,9 @@
 
 Prints one JSON object a figure. 1280x800 pictures of the benchmark's texture, noise of 2 grey levels; processor time of
 the thread, least of many alternating repetitions. Window 21, 4 levels, on both sides. What is not equal is said at each
-figure. OpenCV's Python door to the KLT takes pictures, not pyramids, so it builds two pyramids a call, with derivatives of
-the first: the time of a call with a single point is taken off, so that its figure is that of one who keeps his pyramids.
-(buildOpticalFlowPyramid(withDerivatives=True) takes longer than that whole call: it hands the derivatives to Python.)
+figure. OpenCV's Python door to the KLT takes pictures, not pyramids; it builds two pyramids a call, derivatives of
+the first: the time of a call with one point is taken off, so that its figure is that of one who keeps his pyramids.
+(buildOpticalFlowPyramid with derivatives takes longer than that whole call: it hands them to Python.)
 Not equal: OpenCV makes up to 30 steps a level and stops at 0.01 px (its defaults), ours up to 10 and stops at 0.02 px
 (0.04 px for the template); the mask of OpenCV's refill is drawn outside the time measured.
 """
