@@ -46,6 +46,10 @@ static const setting settings[] = {
     {"camera", "trial_starts", INTEGER, AT(camera.trial_starts), "", "1", 1, 4, NULL,
      "starts with a new profile that nobody confirmed before the one before comes back; fewer than the service's "
      "tries"},
+    {"camera", "black_level", INTEGER, AT(camera.black_level), "grey levels", "0", 0, 254, NULL,
+     "what the camera calls black; 16 for video range. Frames are stretched from here to white_level as they come"},
+    {"camera", "white_level", INTEGER, AT(camera.white_level), "grey levels", "255", 1, 255, NULL,
+     "what it calls white; 235 for video range"},
 
     {"tracker", "max_tracks", INTEGER, AT(tracker.max_tracks), "", "400", 8, 2048, NULL, "tracks alive at once"},
     {"tracker", "levels", INTEGER, AT(tracker.levels), "", "4", 1, 6, NULL, "pyramid levels; more = faster motion"},
@@ -343,6 +347,8 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
         why = "camera.path: must be set: the recording to play";
     else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')
         why = "camera.profile_store: not together with camera.profile";
+    else if (c->camera.black_level >= c->camera.white_level)
+        why = "camera.black_level: must be below camera.white_level";
     else if (c->link.transport == PF_TRANSPORT_SERIAL && c->link.device[0] == '\0')
         why = "link.device: must be set for link.transport = serial";
     else if (c->link.transport == PF_TRANSPORT_TCP && c->link.address[0] == '\0')

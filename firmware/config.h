@@ -29,7 +29,7 @@ typedef struct pf_config {
     struct {
         uint32_t driver, speed;
         pf_config_text path, csv, profile, profile_store;
-        uint32_t loops, trial_starts;
+        uint32_t loops, trial_starts, black_level, white_level;
         double frame_rate;
     } camera;
     struct {

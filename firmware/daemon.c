@@ -96,8 +96,8 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
 
 static void print_tracking(FILE *out, const pf_msg_tracking *t)
 {
-    static const char *const states[PF_SCENE_FLAGS] = {"standing", "reversing",    "dark",
-                                                       "covered",  "over_exposed", "weak_texture"};
+    static const char *const states[PF_SCENE_FLAGS] = {
+        "standing", "reversing", "dark", "covered", "over_exposed", "weak_texture", "encoder_contrary"};
     static const char *const reasons[PF_TRACK_REASONS] = {
         "", "left", "flat", "diverged", "residual", "backward", "crowded", "drift", "masked", "static", "saturated"};
     (void)fputs("  \"tracking\": {", out);
@@ -105,6 +105,8 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
         (void)fprintf(out, "\"%s\": %s, ", states[i], t->scene >> i & 1u ? "true" : "false");
     (void)fprintf(out, "\"frames\": %" PRIu64 ", \"tracked\": %" PRIu64 ", \"detected\": %" PRIu64, t->frames,
                   t->tracked, t->detected);
+    for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
+        (void)fprintf(out, ", \"frames_%s\": %" PRIu64, states[i], t->state_frames[i]);
     for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
         (void)fprintf(out, ", \"lost_%s\": %" PRIu64, reasons[i], t->lost_by[i]);
     (void)fprintf(out, ", \"age_median\": %u, \"quality_median\": %u, \"static_blocks\": %u},\n", t->age_median,

@@ -30,6 +30,7 @@ struct pf_pipeline {
     pf_jpeg *jpeg;
     uint8_t preview[PF_PREVIEW_MAX];
     uint64_t preview_due;
+    uint8_t stretched[256];                   /* grey levels of the camera -> 0..255 */
     uint32_t preview_quality, preview_shrink; /* of the last preview */
     uint32_t next_index;
     uint32_t boots;
@@ -63,6 +64,16 @@ static bool open_shots(pf_pipeline *p, char *error, size_t n)
         }
     }
     return true;
+}
+
+/* A camera of limited range would never be dark, nor saturated, to any of the tracker's limits. */
+static void open_levels(pf_pipeline *p)
+{
+    const uint32_t black = p->daemon->config.camera.black_level, range = p->daemon->config.camera.white_level - black;
+    for (uint32_t v = 0; v < 256; v++) {
+        const uint32_t above = v > black ? v - black : 0;
+        p->stretched[v] = (uint8_t)(above >= range ? 255u : (255u * above + range / 2) / range);
+    }
 }
 
 static bool open_jpeg(pf_pipeline *p, char *error, size_t n)
@@ -199,6 +210,7 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     p->boots = survey->boots;
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
+    open_levels(p);
     if (!open_parts(p, error, n) || (before->boots > 0 && !store_end_of(p, before, error, n)) ||
         !store_start(p, error, n)) {
         release(p);
@@ -327,8 +339,16 @@ static void take_shot(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
 {
     const pf_image *image = &frame->image;
     shot->telemetry = read_telemetry(p, frame);
-    for (uint32_t y = 0; y < image->height; y++)
-        memcpy(shot->pixels + (size_t)y * image->width, image->data + (size_t)y * image->stride, image->width);
+    const bool is_full = p->stretched[1] == 1 && p->stretched[254] == 254;
+    for (uint32_t y = 0; y < image->height; y++) {
+        const uint8_t *from = image->data + (size_t)y * image->stride;
+        uint8_t *to = shot->pixels + (size_t)y * image->width;
+        if (is_full)
+            memcpy(to, from, image->width);
+        else
+            for (uint32_t x = 0; x < image->width; x++)
+                to[x] = p->stretched[from[x]];
+    }
     shot->frame = *frame;
     shot->frame.image = (pf_image){shot->pixels, image->width, image->height, image->width};
     p->daemon->camera.ops->release(p->daemon->camera.self, frame);

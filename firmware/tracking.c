@@ -16,10 +16,12 @@ struct pf_tracking {
     const pf_camera_fixed *camera; /* NULL = no profile: no prediction, no parallax */
     const pf_camera_rays *bearings;
     pf_predictor predictor;
-    pf_ray_q30 *rays; /* of the whole table: live and just lost tracks */
+    void *motion_workspace; /* of the predictor */
+    pf_ray_q30 *rays;       /* of the whole table: live and just lost tracks */
     pf_expected *expected;
     pf_keyframe_config choice;
     pf_keyframe_state choice_state;
+    void *choice_workspace;
     pf_scene scene;
     pf_msg_tracking since; /* the last keyframe */
     uint64_t sequence;     /* of the last frame */
@@ -46,7 +48,8 @@ static void forget_motion(pf_tracking *p)
 {
     const pf_config *c = &p->daemon->config;
     const double radius = c->survey.nominal_diameter_mm / 2e3;
-    memset(&p->predictor, 0, sizeof p->predictor);
+    const uint32_t tracks = c->tracker.max_tracks;
+    (void)pf_predictor_init(&p->predictor, tracks, p->motion_workspace, PF_PREDICTOR_BYTES(tracks));
     if (radius > 0 && c->encoder.metres_per_count != 0)
         pf_predictor_assume(&p->predictor, (int32_t)lround(c->encoder.metres_per_count / radius * 1073741824.0 / 8));
 }
@@ -90,10 +93,14 @@ static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size
         return false;
     }
     p->workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+    p->choice_workspace = aligned_alloc(16, (PF_KEYFRAME_BYTES(t.max_tracks) + 15) / 16 * 16);
+    p->motion_workspace = aligned_alloc(16, (PF_PREDICTOR_BYTES(t.max_tracks) + 15) / 16 * 16);
     p->rays = calloc(2 * (size_t)t.max_tracks, sizeof *p->rays);
     p->expected = calloc(2 * (size_t)t.max_tracks, sizeof *p->expected);
-    if (p->workspace == NULL || p->rays == NULL || p->expected == NULL ||
-        pf_tracker_init(&p->tracker, &t, p->workspace, size) != PF_OK) {
+    if (p->workspace == NULL || p->choice_workspace == NULL || p->motion_workspace == NULL || p->rays == NULL ||
+        p->expected == NULL || pf_tracker_init(&p->tracker, &t, p->workspace, size) != PF_OK ||
+        pf_keyframe_init(&p->choice_state, t.max_tracks, p->choice_workspace, PF_KEYFRAME_BYTES(t.max_tracks)) !=
+            PF_OK) {
         (void)snprintf(error, n, "no memory for the tracker");
         return false;
     }
@@ -195,6 +202,8 @@ void pf_tracking_close(pf_tracking *p)
         return;
     free(p->expected);
     free(p->rays);
+    free(p->motion_workspace);
+    free(p->choice_workspace);
     free(p->workspace);
     free(p->bearing_workspace);
     free(p->camera_workspace);
@@ -212,7 +221,7 @@ static void check_gap(pf_tracking *p, pf_shot *shot)
     shot->missing = p->has_sequence && is_later ? sequence - before - 1 : 0;
     if (p->has_sequence && (!is_later || shot->missing > p->daemon->config.tracker.reset_gap)) {
         pf_tracker_reset(p->tracker);
-        memset(&p->choice_state, 0, sizeof p->choice_state);
+        pf_keyframe_reset(&p->choice_state);
         forget_motion(p);
         (void)snprintf(shot->break_reason, sizeof shot->break_reason, "gap of %llu frames",
                        (unsigned long long)shot->missing);
@@ -222,12 +231,15 @@ static void check_gap(pf_tracking *p, pf_shot *shot)
     p->has_sequence = true;
 }
 
-static pf_motion_hints motion_hints(const pf_msg_telemetry *t)
+static pf_motion_hints motion_hints(const pf_shot *shot)
 {
+    const pf_msg_telemetry *t = &shot->telemetry;
+    const bool has_roll = t->has_attitude && fabs((double)t->roll_rad) < 1000.0; /* not NaN */
     return (pf_motion_hints){.has_encoder = t->has_encoder,
-                             .has_roll = t->has_attitude,
+                             .has_roll = has_roll,
                              .encoder = t->encoder_count,
-                             .roll_urad = (int32_t)lround((double)t->roll_rad * 1e6)};
+                             .roll_urad = has_roll ? (int32_t)lround((double)t->roll_rad * 1e6) : 0,
+                             .frames = shot->missing < 1000 ? (uint32_t)shot->missing + 1 : 1000};
 }
 
 /* Tells the tracker where its tracks should be in this frame. */
@@ -246,14 +258,20 @@ static uint32_t update_scene(pf_tracking *p, const pf_shot *shot)
     const pf_scene_hints hints = {.has_lamp = t->has_lamp,
                                   .lamp_on = t->lamp > 0.01f,
                                   .has_encoder = t->has_encoder && per_count != 0,
-                                  .encoder = per_count < 0 ? -t->encoder_count : t->encoder_count};
+                                  .encoder =
+                                      per_count < 0 ? (int64_t)(0u - (uint64_t)t->encoder_count) : t->encoder_count};
     const uint32_t before = p->scene.flags, now = pf_scene_update(&p->scene, &shot->stats.scene, &hints);
-    static const char *const words[PF_SCENE_FLAGS] = {"standing still", "reversing",    "dark",
-                                                      "lens covered",   "over-exposed", "weak texture"};
+    static const char *const words[PF_SCENE_FLAGS] = {"standing still",
+                                                      "reversing",
+                                                      "dark",
+                                                      "lens covered",
+                                                      "over-exposed",
+                                                      "weak texture",
+                                                      "encoder contradicts the picture"};
     for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
         if ((before ^ now) >> i & 1u)
-            pf_log(PF_LOG_INFO, "frame %llu: %s%s", (unsigned long long)shot->frame.sequence,
-                   now >> i & 1u ? "" : "no longer ", words[i]);
+            pf_log((now >> i & 1u) && 1u << i == PF_SCENE_ENCODER ? PF_LOG_WARNING : PF_LOG_INFO, "frame %llu: %s%s",
+                   (unsigned long long)shot->frame.sequence, now >> i & 1u ? "" : "no longer ", words[i]);
     return now;
 }
 
@@ -261,6 +279,8 @@ void pf_tracking_count(pf_msg_tracking *sum, const pf_tracker_stats *s, uint32_t
 {
     sum->scene = scene;
     sum->frames++;
+    for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
+        sum->state_frames[i] += scene >> i & 1u;
     sum->tracked += s->tracked;
     sum->detected += s->detected;
     for (uint32_t i = 0; i < PF_TRACK_REASONS; i++)
@@ -274,13 +294,13 @@ void pf_tracking_shot(void *tracking, void *item)
 {
     pf_tracking *p = tracking;
     pf_shot *shot = item;
-    const pf_motion_hints hints = motion_hints(&shot->telemetry);
     const bool predicts = p->camera != NULL && p->daemon->config.tracker.prediction;
     const uint64_t start = pf_now();
     uint32_t n;
 
     shot->break_reason[0] = '\0';
     check_gap(p, shot);
+    const pf_motion_hints hints = motion_hints(shot);
     if (predicts)
         expect(p, &hints);
     (void)pf_tracker_frame(p->tracker, &shot->frame.image, pf_now, shot->stage_ns);
@@ -290,10 +310,11 @@ void pf_tracking_shot(void *tracking, void *item)
         pf_track_bearings(p->bearings, tracks, n, p->rays);
     if (predicts)
         pf_predictor_learn(&p->predictor, tracks, p->rays, n, &hints);
+    const uint32_t scene = update_scene(p, shot);
     shot->cause =
         pf_keyframe_decide(&p->choice_state, &p->choice, tracks, p->rays, n,
-                           shot->telemetry.has_encoder ? &shot->telemetry.encoder_count : NULL, &shot->common);
-    pf_tracking_count(&p->since, &shot->stats, update_scene(p, shot));
+                           shot->telemetry.has_encoder ? &shot->telemetry.encoder_count : NULL, scene, &shot->common);
+    pf_tracking_count(&p->since, &shot->stats, scene);
     shot->tracking = p->since;
     if (shot->cause != PF_KEYFRAME_NO) {
         memcpy(shot->tracks, tracks, n * sizeof *tracks);

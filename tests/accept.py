@@ -64,6 +64,15 @@ def check_track() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_pipes() -> list[dict]:
+    """The whole chain in 24 simulated pipes: material, diameter, speed; the truth and OpenCV beside it."""
+    done = run(sys.executable, "tests/accept_pipes.py")
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_pipes.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -137,6 +146,7 @@ def check_demo() -> list[dict]:
 CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_goodput": check_link_goodput,
     "track": check_track,
+    "pipes": check_pipes,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,

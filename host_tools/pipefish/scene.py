@@ -12,6 +12,7 @@ STATES = [
     ("covered", "lens covered"),
     ("over_exposed", "over-exposed"),
     ("weak_texture", "weak texture"),
+    ("encoder_contrary", "encoder contradicts the picture"),
 ]
 REASONS = [
     ("lost_left", "left the picture"),
@@ -30,6 +31,15 @@ REASONS = [
 def states_of(tracking: pb.Tracking) -> list[str]:
     """The states in force, in words."""
     return [words for name, words in STATES if getattr(tracking, name)]
+
+
+def frames_in(tracking: pb.Tracking) -> dict[str, int]:
+    """Frames since the keyframe before (of a status: since the start) in each state, by its field's name; of a device
+    that does not count them, `frames` for those in force in the last frame, at least 1."""
+    if tracking.state_frames:
+        counts = list(tracking.state_frames) + [0] * len(STATES)
+        return {name: counts[i] for i, (name, _) in enumerate(STATES)}
+    return {name: max(tracking.frames, 1) if getattr(tracking, name) else 0 for name, _ in STATES}
 
 
 def losses_of(tracking: pb.Tracking) -> dict[str, int]:

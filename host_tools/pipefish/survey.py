@@ -17,7 +17,7 @@ from mcap.records import Channel, Message, Metadata
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError
 from pipefish.mcapscan import Damage, McapScan, read_chunk
-from pipefish.scene import STATES, losses_of
+from pipefish.scene import STATES, frames_in, losses_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -396,7 +396,8 @@ class Survey:
         return self.statuses[-1][1] if self.statuses else None
 
     def _count_state(self, name: str) -> int:
-        return sum(getattr(k.message.tracking, name) for k in self.keyframes)
+        """Keyframes at which, or since the one before which, the device was in a state."""
+        return sum(frames_in(k.message.tracking)[name] > 0 for k in self.keyframes)
 
     @cached_property
     def info(self) -> dict[str, Any]:

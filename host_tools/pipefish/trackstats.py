@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.scene import REASONS, STATES
+from pipefish.scene import REASONS, STATES, frames_in
 from pipefish.survey import Survey
 
 
 def statistics(survey: Survey) -> dict[str, np.ndarray]:
     """Per keyframe (N,): live tracks; mean a frame since the keyframe before of tracked, detected and each lost_*
     (NaN where the device counts nothing); age_median in camera frames, quality_median 0..1 (NaN without tracks); each
-    state as bool."""
+    state as frames in it since the keyframe before."""
     parts = [k.message.tracking for k in survey.keyframes]
     frames = np.array([p.frames or np.nan for p in parts], dtype=float)
     found = np.array([p.tracked > 0 for p in parts], dtype=bool)
@@ -22,8 +22,9 @@ def statistics(survey: Survey) -> dict[str, np.ndarray]:
         result[name] = np.array([getattr(p, name) for p in parts], dtype=float) / frames
     result["age_median"] = np.where(found, np.array([p.age_median for p in parts], dtype=float), np.nan)
     result["quality_median"] = np.where(found, np.array([p.quality_median for p in parts]) / 32768.0, np.nan)
+    counted = [frames_in(p) for p in parts]
     for name, _ in STATES:
-        result[name] = np.array([getattr(p, name) for p in parts], dtype=bool)
+        result[name] = np.array([c[name] for c in counted], dtype=int)
     return result
 
 
@@ -99,14 +100,15 @@ def charts(survey: Survey, along: np.ndarray, title: str) -> list[dict[str, Any]
             {
                 "id": "stats-states",
                 "title": "States of the scene",
-                "text": "Keyframes at which the device reported a state.",
+                "text": "States that the device reported since the keyframe before, and in how many frames.",
                 "data": [
                     {
                         "type": "scatter",
                         "mode": "markers",
                         "name": words,
                         "x": [v for v, on in zip(x, stats[name], strict=True) if on],
-                        "y": [words] * int(stats[name].sum()),
+                        "y": [words] * int((stats[name] > 0).sum()),
+                        "text": [f"{on} frames" for on in stats[name] if on],
                         "marker": {"symbol": "square", "size": 9},
                     }
                     for name, words in seen

@@ -103,7 +103,8 @@ _Static_assert((int)PF_TRACK_NEW == (int)pipefish_v1_TrackStatus_TRACK_STATUS_NE
 _Static_assert((int)PF_KEYFRAME_FIRST == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_FIRST &&
                    (int)PF_KEYFRAME_ENCODER == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_ENCODER &&
                    (int)PF_KEYFRAME_PARALLAX == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_PARALLAX &&
-                   (int)PF_KEYFRAME_FEW_COMMON == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_FEW_COMMON,
+                   (int)PF_KEYFRAME_FEW_COMMON == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_FEW_COMMON &&
+                   (int)PF_KEYFRAME_STATE == (int)pipefish_v1_KeyframeCause_KEYFRAME_CAUSE_STATE,
                "the keyframe's cause is copied as a number");
 
 static bool write_column_items(pb_ostream_t *stream, const observation_column *column)
@@ -210,7 +211,13 @@ static void set_tracking(pipefish_v1_Tracking *out, const pf_msg_tracking *in)
                                   .lost_saturated = in->lost_by[PF_TRACK_SATURATED],
                                   .age_median = in->age_median,
                                   .quality_median = in->quality_median,
-                                  .static_blocks = in->static_blocks};
+                                  .static_blocks = in->static_blocks,
+                                  .encoder_contrary = (in->scene & PF_SCENE_ENCODER) != 0};
+    _Static_assert(sizeof out->state_frames == sizeof in->state_frames, "max_count of the schema is PF_SCENE_FLAGS");
+    memcpy(out->state_frames, in->state_frames, sizeof in->state_frames);
+    for (uint32_t i = 0; i < PF_SCENE_FLAGS; i++)
+        if (in->state_frames[i])
+            out->state_frames_count = PF_SCENE_FLAGS;
 }
 
 static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)

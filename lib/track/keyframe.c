@@ -5,6 +5,12 @@
 #define OUTGROWN       2u
 #define OUTGROWN_LEAST 16u
 
+#define YOUNG        2u  /* frames: noise of the sensor gives corners by the hundred, none of which lives so long */
+#define WAIT_MOST    64u /* frames between keyframes for want of common tracks, where the reference was poor */
+#define STATE_FRAMES 30u /* another state than the last keyframe's is a keyframe when it has lasted so long */
+
+#define BLIND (PF_SCENE_DARK | PF_SCENE_COVERED | PF_SCENE_WEAK_TEXTURE)
+
 static uint32_t or_default(uint32_t value, uint32_t fallback)
 {
     return value ? value : fallback;
@@ -94,57 +100,130 @@ static uint32_t count_common(const pf_keyframe_state *state, const pf_track *tra
     return count;
 }
 
-static uint32_t count_alive(const pf_track *tracks, uint32_t n)
+/* Tracks that have lived long enough to be a reference. */
+static uint32_t count_grown(const pf_track *tracks, uint32_t n)
 {
     uint32_t count = 0;
     for (uint32_t i = 0; i < n; i++)
-        count += alive(&tracks[i]);
+        count += alive(&tracks[i]) && tracks[i].age >= YOUNG;
     return count;
 }
 
 static void take_reference(pf_keyframe_state *state, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
-                           const int64_t *encoder)
+                           const int64_t *encoder, uint32_t scene)
 {
-    state->n = 0;
-    for (uint32_t i = 0; i < n && state->n < PF_TRACKS_MAX; i++)
+    state->n = state->young = 0;
+    for (uint32_t i = 0; i < n && state->n < state->max_tracks; i++)
         if (alive(&tracks[i])) {
             state->id[state->n] = tracks[i].id;
             state->ray[state->n++] = rays[i];
+            state->young += tracks[i].age < YOUNG;
         }
     state->started = true;
-    state->frames_since = 0;
+    state->frames_since = state->differs = 0;
+    state->scene = scene;
     state->have_encoder = encoder != NULL;
     state->encoder = encoder ? *encoder : 0;
 }
 
-pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks,
-                                     const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t *common)
+/* What was young in the reference and is gone by now never was a landmark. Ids ascend, so the young are at the end. */
+static void drop_young(pf_keyframe_state *state, const pf_track *tracks, uint32_t n)
 {
-    const uint32_t wanted = or_default(config->min_common, 100), half = state->n / 2u;
-    const uint32_t shared = state->started ? count_common(state, tracks, rays, n) : 0;
+    uint32_t kept = state->n - state->young;
+    for (uint32_t i = kept, j = 0; i < state->n; i++) {
+        while (j < n && tracks[j].id < state->id[i])
+            j++;
+        if (j < n && tracks[j].id == state->id[i] && alive(&tracks[j])) {
+            state->id[kept] = state->id[i];
+            state->ray[kept++] = state->ray[i];
+        }
+    }
+    state->n = kept;
+    state->young = 0;
+}
+
+static void watch(pf_keyframe_state *state, const int64_t *encoder, uint32_t scene)
+{
+    const bool stays = encoder && state->had_encoder && *encoder == state->encoder_before;
+    state->still = stays ? state->still + (state->still < UINT32_MAX) : 0;
+    state->had_encoder = encoder != NULL;
+    state->encoder_before = encoder ? *encoder : 0;
+    state->differs = scene != state->scene ? state->differs + (state->differs < UINT32_MAX) : 0;
+    state->frames_since += state->frames_since < UINT32_MAX;
+}
+
+static bool is_far_enough(pf_keyframe_state *state, const pf_keyframe_config *config, const int64_t *encoder)
+{
+    const uint64_t now = (uint64_t)*encoder, then = (uint64_t)state->encoder;
+    return (*encoder > state->encoder ? now - then : then - now) >= config->step_counts;
+}
+
+/* A poor reference is no measure: replaced by another as poor at once, it would be a keyframe every other frame. */
+static bool lacks_common(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks, uint32_t n,
+                         uint32_t shared, uint32_t scene)
+{
+    const uint32_t wanted = or_default(config->min_common, 100), grown = state->n - state->young, half = grown / 2u;
+    const bool is_poor = grown < wanted, stands = state->still >= PF_SCENE_WINDOW;
+    if ((scene & BLIND) || (is_poor && (stands || state->frames_since < state->wait)))
+        return false;
+    if (shared >= (wanted < half ? wanted : half) && count_grown(tracks, n) <= OUTGROWN * grown + OUTGROWN_LEAST)
+        return false;
+    if (!is_poor)
+        state->wait = 0;
+    else
+        state->wait = state->wait == 0 ? 4u : state->wait < WAIT_MOST ? 2u * state->wait : WAIT_MOST;
+    return true;
+}
+
+pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks,
+                                     const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t scene,
+                                     uint32_t *common)
+{
     pf_keyframe_cause cause = PF_KEYFRAME_NO;
+    watch(state, encoder, scene);
+    if (state->frames_since == YOUNG)
+        drop_young(state, tracks, n);
+    const uint32_t shared = state->started ? count_common(state, tracks, rays, n) : 0;
     if (common)
         *common = shared;
-    state->frames_since += state->frames_since < UINT32_MAX;
     if (!state->started) {
         cause = PF_KEYFRAME_FIRST;
     } else if (state->frames_since >= or_default(config->min_interval, 2)) {
-        if (config->step_counts && encoder && state->have_encoder) {
-            const uint64_t moved = *encoder > state->encoder ? (uint64_t)*encoder - (uint64_t)state->encoder
-                                                             : (uint64_t)state->encoder - (uint64_t)*encoder;
-            if (moved >= config->step_counts)
-                cause = PF_KEYFRAME_ENCODER;
-        } else {
-            uint32_t median;
-            if (median_chord2(state, tracks, rays, n, &median) &&
-                median >= chord2_of_angle(or_default(config->parallax_urad, 174533)))
-                cause = PF_KEYFRAME_PARALLAX;
-        }
-        if (cause == PF_KEYFRAME_NO &&
-            (shared < (wanted < half ? wanted : half) || count_alive(tracks, n) > OUTGROWN * state->n + OUTGROWN_LEAST))
+        const bool counts = config->step_counts && encoder && state->have_encoder;
+        uint32_t median;
+        if (counts && is_far_enough(state, config, encoder))
+            cause = PF_KEYFRAME_ENCODER;
+        /* an encoder that stands while the picture moves is stuck */
+        else if ((!counts || state->still >= PF_SCENE_WINDOW) && median_chord2(state, tracks, rays, n, &median) &&
+                 median >= chord2_of_angle(or_default(config->parallax_urad, 174533)))
+            cause = PF_KEYFRAME_PARALLAX;
+        else if (lacks_common(state, config, tracks, n, shared, scene))
             cause = PF_KEYFRAME_FEW_COMMON;
+        else if (state->differs >= STATE_FRAMES)
+            cause = PF_KEYFRAME_STATE;
     }
     if (cause != PF_KEYFRAME_NO)
-        take_reference(state, tracks, rays, n, encoder);
+        take_reference(state, tracks, rays, n, encoder, scene);
     return cause;
+}
+
+pf_status pf_keyframe_init(pf_keyframe_state *state, uint32_t max_tracks, void *workspace, size_t size)
+{
+    if (max_tracks == 0 || max_tracks > PF_TRACKS_MAX)
+        return PF_ERR_ARGUMENT;
+    if (size < PF_KEYFRAME_BYTES(max_tracks))
+        return PF_ERR_SPACE;
+    *state = (pf_keyframe_state){.max_tracks = max_tracks, .id = workspace};
+    state->ray = (pf_ray_q30 *)(state->id + max_tracks);
+    state->from = state->ray + max_tracks;
+    state->to = state->from + max_tracks;
+    state->chord = (uint32_t *)(state->to + max_tracks);
+    return PF_OK;
+}
+
+void pf_keyframe_reset(pf_keyframe_state *state)
+{
+    state->started = false;
+    state->n = state->young = state->still = state->wait = 0;
+    state->had_encoder = false;
 }

@@ -12,6 +12,8 @@
 #define RATIO_MAX (8 << 16)
 #define FAST      (65536 / 25) /* of the radius a frame: patches then grow by 4 % and more */
 #define TILT      64           /* 1/64 rad */
+#define FRAMES    16           /* after more dropped frames nothing is found again anyway */
+#define LEAP      (4 << 16)    /* radii a frame: no crawler drives so, a reading that says so is wrong */
 #define ROLL_JUMP 20000        /* urad: below, the last frame's own rotation is better than an inclinometer */
 
 static int64_t sine_of(const pf_ray_q30 *v)
@@ -53,12 +55,31 @@ static void remember(pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *
                      const pf_motion_hints *now)
 {
     p->n = 0;
-    for (uint32_t j = 0; j < n && p->n < PF_TRACKS_MAX; j++)
+    for (uint32_t j = 0; j < n && p->n < p->max_tracks; j++)
         if (tracks[j].status != PF_TRACK_LOST) {
             p->id[p->n] = tracks[j].id;
             p->ray[p->n++] = rays[j];
         }
     p->last = *now;
+}
+
+pf_status pf_predictor_init(pf_predictor *p, uint32_t max_tracks, void *workspace, size_t size)
+{
+    if (max_tracks == 0 || max_tracks > PF_TRACKS_MAX)
+        return PF_ERR_ARGUMENT;
+    if (size < PF_PREDICTOR_BYTES(max_tracks))
+        return PF_ERR_SPACE;
+    *p = (pf_predictor){.max_tracks = max_tracks, .id = workspace};
+    p->ray = (pf_ray_q30 *)(p->id + max_tracks);
+    p->from = p->ray + max_tracks;
+    p->to = p->from + max_tracks;
+    p->driven = p->to + max_tracks;
+    p->fall = (int32_t *)(p->driven + max_tracks);
+    p->value = (uint32_t *)(p->fall + 2u * max_tracks);
+    p->pair = (uint16_t *)(p->value + max_tracks);
+    for (uint32_t i = 0; i < 2u * max_tracks; i++)
+        p->fall[i] = PF_FALL_UNKNOWN;
+    return PF_OK;
 }
 
 void pf_predictor_assume(pf_predictor *p, int32_t radii_per_count_q27)
@@ -76,12 +97,29 @@ static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
     return (pf_ray_q30){(int32_t)(sine * v->x / rho), (int32_t)(sine * v->y / rho), (int32_t)(c * ONE / norm)};
 }
 
-/* The common fall in the next frame. */
+static int32_t frames_of(const pf_motion_hints *h)
+{
+    return h->frames == 0 ? 1 : h->frames < FRAMES ? (int32_t)h->frames : FRAMES;
+}
+
+/* Counts since the last frame; false if there is no encoder, or a jump that is none of its making. A register may wrap.
+ */
+static bool counted(const pf_predictor *p, const pf_motion_hints *next, int64_t *step)
+{
+    *step = (int64_t)((uint64_t)next->encoder - (uint64_t)p->last.encoder);
+    if (!p->last.has_encoder || !next->has_encoder || *step > 1 << 24 || *step < -(1 << 24))
+        return false;
+    const int64_t fall = (pf_clamp_i64(p->per_count_q30, INT32_MAX) * *step) >> 14;
+    const int64_t most = (int64_t)LEAP * frames_of(next);
+    return !p->has_per_count || (fall <= most && fall >= -most);
+}
+
+/* The common fall until the next frame. */
 static int32_t next_forward(const pf_predictor *p, const pf_motion_hints *next)
 {
-    if (!p->has_per_count || !p->last.has_encoder || !next->has_encoder)
-        return p->forward;
-    const int64_t step = pf_clamp_i64(next->encoder - p->last.encoder, 1 << 24);
+    int64_t step;
+    if (!p->has_per_count || !counted(p, next, &step))
+        return pf_clamp_i64((int64_t)p->forward * frames_of(next), COT_MOST);
     return pf_clamp_i64((pf_clamp_i64(p->per_count_q30, INT32_MAX) * step) >> 14, COT_MOST);
 }
 
@@ -113,36 +151,80 @@ static void separate(pf_predictor *p, uint32_t count, int32_t fall, uint32_t *me
     p->forward = p->is_known ? median_signed(p->value, *measured) : 0;
 }
 
+/* What was learned over several frames, for one. The turn by its Cayley vector, 2 sin a / (1 + cos a) long. */
+static void share_out(pf_predictor *p, uint32_t n, int32_t frames)
+{
+    const int32_t *r = p->turn;
+    const int64_t d = (ONE + r[0] + r[4] + (int64_t)r[8]) / 2 + 1; /* 1 + cos a */
+    const int64_t v[3] = {(int64_t)r[7] - r[5], (int64_t)r[2] - r[6], (int64_t)r[3] - r[1]};
+    int32_t w[3];
+    if (frames == 1)
+        return;
+    p->forward /= frames;
+    for (uint32_t j = 0; j < n; j++)
+        if (p->fall[j] != PF_FALL_UNKNOWN)
+            p->fall[j] /= frames;
+    for (int32_t i = 0; i < 3; i++)
+        w[i] = d > ONE / 4 ? pf_clamp_i64(v[i] * ONE / d / frames, (int32_t)ONE / 2) : 0;
+    for (int32_t i = 0; i < 9; i++)
+        p->turn[i] = i % 4 ? 0 : (int32_t)ONE;
+    pf_rotation_turn(w, p->turn);
+}
+
 void pf_predictor_learn(pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *now)
 {
-    const uint32_t count = match(p, tracks, rays, n);
+    const uint32_t rows = n < 2u * p->max_tracks ? n : 2u * p->max_tracks;
+    const uint32_t count = match(p, tracks, rays, rows);
+    int64_t step;
     uint32_t measured;
-    for (uint32_t j = 0; j < n && j < 2u * PF_TRACKS_MAX; j++)
+    for (uint32_t j = 0; j < rows; j++)
         p->fall[j] = PF_FALL_UNKNOWN;
     separate(p, count, next_forward(p, now), &measured);
     separate(p, count, p->forward, &measured);
     /* Of a few survivors the slow ones are too many: then what a count means stays as it is. */
-    if (p->is_known && 3u * measured >= n && p->last.has_encoder && now->has_encoder &&
-        now->encoder != p->last.encoder) {
-        const int64_t step = pf_clamp_i64(now->encoder - p->last.encoder, 1 << 24);
+    if (p->is_known && 3u * measured >= n && counted(p, now, &step) && step != 0) {
         const int64_t per_count = (int64_t)p->forward * 16384 / step;
         /* an eighth each time: counts are coarse, and the median falls by a few per cent from frame to frame */
         p->per_count_q30 = p->has_per_count ? p->per_count_q30 + (per_count - p->per_count_q30) / 8 : per_count;
         p->has_per_count = true;
     }
-    remember(p, tracks, rays, n, now);
+    share_out(p, rows, frames_of(now));
+    remember(p, tracks, rays, rows, now);
 }
 
-/* The rotation in the next frame: the last one again, but a jump of the inclinometer's roll is believed. */
+/* out <- a b */
+static void multiply(const int32_t a[9], const int32_t b[9], int32_t out[9])
+{
+    for (int32_t i = 0; i < 9; i++) {
+        int64_t sum = ONE / 2;
+        for (int32_t k = 0; k < 3; k++)
+            sum += (int64_t)a[i / 3 * 3 + k] * b[3 * k + i % 3];
+        out[i] = pf_clamp_i64(sum >> 30, (int32_t)ONE);
+    }
+}
+
+/* The difference of two angles, within half a turn. */
+static int32_t angle_between(int32_t from_urad, int32_t to_urad)
+{
+    const int64_t turn = 6283185, d = ((int64_t)to_urad - from_urad) % turn;
+    return (int32_t)(d > turn / 2 ? d - turn : d < -turn / 2 ? d + turn : d);
+}
+
+/* The rotation until the next frame: the last one again, for each, but a jump of the inclinometer's roll is believed.
+ */
 static void next_turn(const pf_predictor *p, const pf_motion_hints *next, int32_t r[9])
 {
     for (int32_t i = 0; i < 9; i++)
         r[i] = p->is_known ? p->turn[i] : i % 4 ? 0 : (int32_t)ONE;
+    for (int32_t k = 1; p->is_known && k < frames_of(next); k++) {
+        const int32_t so_far[9] = {r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8]};
+        multiply(p->turn, so_far, r);
+    }
     if (!p->last.has_roll || !next->has_roll)
         return;
     /* the picture turns against the camera */
-    const int64_t rolled = -(int64_t)pf_clamp_i64((int64_t)next->roll_urad - p->last.roll_urad, 500000);
+    const int64_t rolled = -(int64_t)pf_clamp_i64(angle_between(p->last.roll_urad, next->roll_urad), 500000);
     const int64_t already = ((int64_t)r[3] - r[1]) / 2 * 1000000 / ONE;
     if (rolled - already < ROLL_JUMP && already - rolled < ROLL_JUMP)
         return;
@@ -215,7 +297,7 @@ void pf_predictor_guess(const pf_predictor *p, const pf_track *tracks, const pf_
         *e = (pf_expected){{PF_NO_GUESS, 0}, {65536, 0, 0, 65536}};
         if (tracks[i].status == PF_TRACK_LOST || !pf_ray_valid(&rays[i]))
             continue;
-        const bool has_own = i < 2u * PF_TRACKS_MAX && p->fall[i] != PF_FALL_UNKNOWN && is_moving;
+        const bool has_own = i < 2u * p->max_tracks && p->fall[i] != PF_FALL_UNKNOWN && is_moving;
         d.fall = has_own ? (p->fall[i] * ratio) >> 16 : forward;
         const pf_ray_q30 driven = drive(&d, &rays[i]);
         if (!project(camera, &driven, &e->at))

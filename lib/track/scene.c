@@ -14,7 +14,7 @@
 typedef enum pf_vote { KEEP, RISE, FALL } pf_vote;
 
 /* Frames that must agree, by flag: to rise, to fall. */
-static const uint8_t patience[PF_SCENE_FLAGS][2] = {{5, 2}, {3, 3}, {2, 2}, {5, 3}, {3, 5}, {5, 5}};
+static const uint8_t patience[PF_SCENE_FLAGS][2] = {{5, 2}, {3, 3}, {2, 2}, {5, 3}, {3, 5}, {5, 5}, {10, 10}};
 
 static pf_vote vote_on(bool rise, bool fall)
 {
@@ -24,6 +24,24 @@ static pf_vote vote_on(bool rise, bool fall)
 static uint32_t range(const pf_scene_measures *m)
 {
     return m->high - m->low;
+}
+
+/* Since the last frame; a wheel's register may wrap. */
+static int64_t counted(const pf_scene *s, const pf_scene_hints *h)
+{
+    return (int64_t)((uint64_t)h->encoder - (uint64_t)s->encoder);
+}
+
+/* Only where the flow has a direction along the radius: a roll has none. */
+static pf_vote vote_encoder(const pf_scene *s, const pf_scene_measures *m, const pf_scene_hints *h)
+{
+    if (!h->has_encoder)
+        return FALL;
+    const bool ahead = 10u * m->outward >= 6u * m->moved, back = 10u * m->inward >= 6u * m->moved;
+    const int64_t step = counted(s, h);
+    if (!s->have_encoder || m->moved < FEW || ahead == back || m->motion_q16 < HALF_PIXEL)
+        return KEEP;
+    return vote_on(step == 0 ? s->still >= PF_SCENE_WINDOW : (step > 0) == back, step != 0 && (step > 0) == ahead);
 }
 
 static pf_vote vote_standing(const pf_scene *s, const pf_scene_measures *m, const pf_scene_hints *h)
@@ -40,7 +58,7 @@ static pf_vote vote_reversing(const pf_scene *s, const pf_scene_measures *m, con
     if (m->tracked < FEW) {
         if (!h->has_encoder || !s->have_encoder)
             return FALL;
-        return vote_on(h->encoder<s->encoder, h->encoder> s->encoder || s->still >= PF_SCENE_WINDOW);
+        return vote_on(counted(s, h) < 0, counted(s, h) > 0 || s->still >= PF_SCENE_WINDOW);
     }
     if (m->moved < FEW)
         return s->flags & PF_SCENE_STANDING ? FALL : KEEP;
@@ -72,17 +90,22 @@ uint32_t pf_scene_update(pf_scene *s, const pf_scene_measures *m, const pf_scene
 {
     const bool lamp_on = h->has_lamp && h->lamp_on;
     const bool is_dark = m->high < DARK, is_lit = m->high >= LIT;
-    const bool is_flat = range(m) < FLAT_RANGE && m->texture_q8 < FLAT_Q8 && m->saturated_q15 < TENTH;
+    /* the noise of a high gain is texture too, but none that a track could follow */
+    const bool is_flat =
+        range(m) < FLAT_RANGE && m->saturated_q15 < TENTH && (m->texture_q8 < FLAT_Q8 || m->tracked < FEW);
     if (h->has_encoder && s->have_encoder)
         s->still = h->encoder == s->encoder ? s->still + (s->still < UINT32_MAX) : 0;
     settle(s, 2, vote_on(is_dark && !lamp_on, is_lit || lamp_on));
     settle(s, 3,
            vote_on(is_dark ? lamp_on : is_flat && is_lit,
-                   is_dark ? !lamp_on : range(m) > FLAT_RANGE * 3u / 2u || m->texture_q8 > FLAT_Q8 * 3u / 2u));
+                   is_dark
+                       ? !lamp_on
+                       : range(m) > FLAT_RANGE * 3u / 2u || (m->texture_q8 > FLAT_Q8 * 3u / 2u && m->tracked >= FEW)));
     settle(s, 4, vote_on(m->saturated_q15 >= QUARTER, m->saturated_q15 < QUARTER / 2u));
     settle(s, 0, vote_standing(s, m, h));
     settle(s, 1, vote_reversing(s, m, h));
     settle(s, 5, vote_weak(s, m));
+    settle(s, 6, vote_encoder(s, m, h));
     s->have_encoder = h->has_encoder;
     s->encoder = h->encoder;
     return s->flags;

@@ -27,7 +27,7 @@ uint32_t entry_klt(entry *e, const float *from, const float *guess, uint32_t n, 
 uint32_t entry_frame(entry *e, const uint8_t *data);
 uint32_t entry_tracks(const entry *e, uint64_t *id, float *xy, float *cov, uint8_t *status, uint32_t room);
 void entry_reset(entry *e);
-size_t entry_workspace(uint32_t width, uint32_t height);
+size_t entry_memory(uint32_t width, uint32_t height, uint32_t tracks, uint32_t step);
 
 void entry_free(entry *e)
 {
@@ -122,8 +122,29 @@ uint32_t entry_tracks(const entry *e, uint64_t *id, float *xy, float *cov, uint8
     return n;
 }
 
-/* Bytes of workspace with the defaults. */
-size_t entry_workspace(uint32_t width, uint32_t height)
+/* Bytes of all that tracking keeps between frames, the frames themselves apart: tracker, prediction, keyframe choice,
+ * scene, bearings and guesses of the table, and an equidistant lens of 180 degrees with its table of rays. */
+size_t entry_memory(uint32_t width, uint32_t height, uint32_t tracks, uint32_t step)
 {
-    return pf_tracker_workspace_size(&(pf_tracker_config){.width = width, .height = height});
+    const pf_tracker_config config = {.width = width, .height = height, .max_tracks = tracks};
+    const double f = (double)height / 3.1416;
+    const pf_camera lens = {.width = width,
+                            .height = height,
+                            .radial = PF_RADIAL_EQUIDISTANT,
+                            .f_u = f,
+                            .f_v = f,
+                            .c_u = width / 2.0,
+                            .c_v = height / 2.0,
+                            .theta_max = 1.57};
+    const size_t fixed = pf_camera_fixed_workspace_size(&lens);
+    const pf_camera_fixed *camera;
+    void *block = aligned_alloc(16, (fixed + 15) / 16 * 16);
+    size_t sum = 0;
+    if (block && pf_camera_fixed_init(&camera, &lens, block, fixed) == PF_OK)
+        sum = fixed + pf_camera_rays_workspace_size(camera, step) + pf_tracker_workspace_size(&config) +
+              PF_PREDICTOR_BYTES(tracks) + sizeof(pf_predictor) + PF_KEYFRAME_BYTES(tracks) +
+              sizeof(pf_keyframe_state) + sizeof(pf_scene) +
+              2 * (size_t)tracks * (sizeof(pf_ray_q30) + sizeof(pf_expected));
+    free(block);
+    return sum;
 }

@@ -17,7 +17,7 @@ class Entry:
             raise SystemExit(f"{LIBRARY} is missing: `make build` makes it")
         lib = ctypes.CDLL(str(LIBRARY))
         lib.entry_new.restype = ctypes.c_void_p
-        lib.entry_workspace.restype = ctypes.c_size_t
+        lib.entry_memory.restype = ctypes.c_size_t
         handle = lib.entry_new(width, height, max_tracks, cell, 0, round(noise * 256))
         if not handle:
             raise SystemExit("the tracker refuses this configuration")
@@ -73,6 +73,6 @@ class Entry:
         full = cov[:n][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         return identity[:n].astype(np.int64), xy[:n].astype(float), full.astype(float), status[:n]
 
-    def workspace(self, width: int, height: int) -> int:
-        """Bytes a tracker with the defaults wants."""
-        return self.lib.entry_workspace(width, height)
+    def memory(self, width: int, height: int, tracks: int, step: int) -> int:
+        """Bytes that tracking keeps: tracker, prediction, keyframes, camera with rays at this step; no frames."""
+        return self.lib.entry_memory(width, height, tracks, step)

@@ -9,6 +9,7 @@ enum { WIDTH = 160, HEIGHT = 120, TEXTURE = 128, FRAMES = 12, TRACKS = 40 };
 static uint8_t texture[TEXTURE * TEXTURE], frame[2][WIDTH * HEIGHT];
 static _Alignas(16) uint8_t workspace[160000], camera_block[2000], rays_block[20000];
 static pf_keyframe_state keyframes;
+static _Alignas(16) uint8_t keyframes_block[PF_KEYFRAME_BYTES(TRACKS)];
 static pf_ray_q30 rays[2 * TRACKS];
 
 static void make_frame(uint32_t k, uint8_t *out)
@@ -43,7 +44,8 @@ uint32_t hash_track(size_t *ram)
     *ram = pf_tracker_workspace_size(&config);
     if (pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK ||
         pf_camera_fixed_init(&fixed, &CAMERAS[0], camera_block, sizeof camera_block) != PF_OK ||
-        pf_camera_rays_init(&bearings, fixed, 16, rays_block, sizeof rays_block) != PF_OK)
+        pf_camera_rays_init(&bearings, fixed, 16, rays_block, sizeof rays_block) != PF_OK ||
+        pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK)
         return 0;
     for (uint32_t k = 0; k < FRAMES; k++) {
         const pf_image image = {frame[k % 2u], WIDTH, HEIGHT, WIDTH};
@@ -57,7 +59,7 @@ uint32_t hash_track(size_t *ram)
             crc = hash_u32(hash_u32(crc, (uint32_t)tracks[i].pos.x), (uint32_t)tracks[i].pos.y);
             crc = hash_u32(hash_u32(hash_u32(crc, (uint32_t)rays[i].x), (uint32_t)rays[i].y), (uint32_t)rays[i].z);
         }
-        crc = hash_u32(crc, (uint32_t)pf_keyframe_decide(&keyframes, &choice, tracks, rays, n, NULL, &common));
+        crc = hash_u32(crc, (uint32_t)pf_keyframe_decide(&keyframes, &choice, tracks, rays, n, NULL, 0, &common));
         tracked += pf_tracker_last_stats(tracker)->tracked;
     }
     return tracked > FRAMES * TRACKS / 4 ? crc : 0;

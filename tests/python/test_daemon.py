@@ -499,8 +499,8 @@ def test_polar_cells_without_a_circle_are_a_clear_error(crawler: Crawler):
     assert "tracker.cells = polar: needs an image circle" in crawler.text()
 
 
-def write_states(path: Path) -> None:
-    """Moving, standing, dark, moving: 30 frames each."""
+def write_states(path: Path, black: int = 0, white: int = 255) -> None:
+    """Moving, standing, dark, moving: 30 frames each, by a camera with these levels."""
     pattern = texture(3)
     with path.open("wb") as out:
         out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F25:1 Ip A1:1 Cmono\n".encode())
@@ -509,13 +509,21 @@ def write_states(path: Path) -> None:
             part = i // 30
             shift += 2 if part in (0, 3) else 0
             frame = np.roll(pattern, -shift, axis=1)[:, :WIDTH]
-            out.write(b"FRAME\n" + np.ascontiguousarray(frame // (60 if part == 2 else 1)).tobytes())
+            grey = black + (frame // (60 if part == 2 else 1)).astype(int) * (white - black) // 255
+            out.write(b"FRAME\n" + np.ascontiguousarray(grey.astype(np.uint8)).tobytes())
     path.with_suffix(".csv").unlink(missing_ok=True)
 
 
-def test_states_of_the_scene_reach_the_host_and_the_log(tmp_path: Path):
-    write_states(tmp_path / "survey.y4m")
-    crawler = Crawler(tmp_path, encoder__metres_per_count=0, keyframe__min_common=2000)
+@pytest.mark.parametrize(("black", "white"), [(0, 255), (16, 235)])
+def test_states_of_the_scene_reach_the_host_and_the_log(tmp_path: Path, black: int, white: int):
+    write_states(tmp_path / "survey.y4m", black, white)
+    crawler = Crawler(
+        tmp_path,
+        encoder__metres_per_count=0,
+        keyframe__min_common=2000,
+        camera__black_level=black,
+        camera__white_level=white,
+    )
     store = Store(crawler.port)
     crawler.start()
     assert receive_all(crawler, store) == 0
@@ -529,7 +537,8 @@ def test_states_of_the_scene_reach_the_host_and_the_log(tmp_path: Path):
     assert lost > 0  # in the dark
     assert crawler.status()["tracking"]["frames"] == 120
     assert sum(k.tracking.frames for k in store.keyframes) <= 120
-    assert any(k.tracking.standing for k in store.keyframes) or len(store.keyframes) < 5
+    assert last.state_frames[0] >= 15 and last.state_frames[2] >= 20  # standing; dark
+    assert sum(k.tracking.state_frames[0] for k in store.keyframes if k.tracking.state_frames) >= 15
 
 
 def test_dropped_frames_are_counted_and_a_long_gap_is_a_marked_break(tmp_path: Path, crawler: Crawler):

@@ -91,6 +91,7 @@ def tracking_survey(tmp_path) -> Survey:
             counts = message.tracking
             counts.frames, counts.tracked, counts.lost_drift, counts.age_median = 5, 150, k, 7
             counts.quality_median, counts.reversing = 31130, message.index == 3
+            counts.state_frames.extend([2 if message.index == 4 else 0, 5 if message.index == 3 else 0])
             name, kind, data = as_object(kind, message)
         objects.append((name, kind, data))
     write_survey(tmp_path / "t.mcap", objects=objects)
@@ -103,8 +104,9 @@ def test_statistics_are_means_a_frame_and_states_are_drawn(tmp_path):
     np.testing.assert_allclose(stats["tracked"], 30)
     np.testing.assert_allclose(stats["lost_drift"], np.arange(1, 7) / 5)
     np.testing.assert_allclose(stats["quality_median"], 0.95, atol=1e-4)
-    assert stats["reversing"].tolist() == [False, False, False, True, False, False]
-    assert survey.info["states"] == {"reversing": 1}
+    assert stats["reversing"].tolist() == [0, 0, 0, 5, 0, 0]
+    assert stats["standing"].tolist() == [0, 0, 0, 0, 2, 0]  # over by the keyframe, and still told
+    assert survey.info["states"] == {"standing still": 1, "reversing": 1}
     plain, stated = (np.asarray(Painter(survey).draw(i, Style(640, legend=False)))[:30, :120] for i in (2, 3))
     assert (stated == (255, 190, 90)).all(axis=-1).any() and not (plain == (255, 190, 90)).all(axis=-1).any()
 

@@ -8,14 +8,17 @@
 #define WIDTH   320
 #define HEIGHT  240
 #define TEXTURE 512
+#define TRACKS  60
 #define TURN    60 /* frames after which the sequence runs back, and so on */
 
 static uint8_t texture[TEXTURE * TEXTURE], frame[2][WIDTH * HEIGHT];
 static _Alignas(16) uint8_t workspace[400000];
 static pf_keyframe_state keyframes;
+static _Alignas(16) uint8_t keyframes_block[PF_KEYFRAME_BYTES(TRACKS)];
 static pf_ray_q30 rays[PF_TRACKS_MAX];
 static pf_expected expected[PF_TRACKS_MAX];
 static pf_predictor predictor;
+static _Alignas(16) uint8_t predictor_block[PF_PREDICTOR_BYTES(TRACKS)];
 static pf_scene scene;
 static _Alignas(16) uint8_t camera_block[4000], rays_block[30000];
 static const pf_camera_fixed *camera;
@@ -134,7 +137,7 @@ static bool golden_replay(uint32_t frames, golden *out)
 {
     const pf_tracker_config config = {.width = WIDTH,
                                       .height = HEIGHT,
-                                      .max_tracks = 60,
+                                      .max_tracks = TRACKS,
                                       .window = 15,
                                       .circle = {(WIDTH / 2) << 16, (HEIGHT / 2) << 16},
                                       .circle_radius_q16 = 150u << 16};
@@ -142,18 +145,20 @@ static bool golden_replay(uint32_t frames, golden *out)
     pf_tracker *tracker;
     *out = (golden){0, 0, 0, 0};
     make_texture();
-    if (!make_lens() || pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK)
+    if (!make_lens() || pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK ||
+        pf_predictor_init(&predictor, TRACKS, predictor_block, sizeof predictor_block) != PF_OK ||
+        pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK)
         return false;
     for (uint32_t k = 0; k < frames; k++) {
         const pf_image image = {frame[k % 2u], WIDTH, HEIGHT, WIDTH};
         /* for 20 frames in each 40 there is no encoder */
-        const pf_motion_hints hints = {k % 40u >= 20u, true, 7 * (int64_t)k, (int32_t)(k % 50u) * 2000};
+        const pf_motion_hints hints = {k % 40u >= 20u, true, 7 * (int64_t)k, (int32_t)(k % 50u) * 2000, 1};
         const pf_scene_hints light = {false, false, hints.has_encoder, hints.encoder};
         uint32_t n, common;
         const pf_track *tracks = pf_tracker_tracks(tracker, &n);
         make_frame(k, frame[k % 2u]);
-        if (k % 3u) {                                                           /* now and then without a prediction */
-            const pf_motion_hints leap = {true, false, hints.encoder + 300, 0}; /* so fast that patches grow */
+        if (k % 3u) { /* now and then without a prediction */
+            const pf_motion_hints leap = {true, false, hints.encoder + 300, 0, 1}; /* so fast that patches grow */
             out->crc = hash_guesses(out->crc, tracks, n, &leap);
             out->crc = hash_guesses(out->crc, tracks, n, &hints);
             if (pf_tracker_expect(tracker, expected, n) != PF_OK)
@@ -166,7 +171,7 @@ static bool golden_replay(uint32_t frames, golden *out)
         pf_predictor_learn(&predictor, tracks, rays, n, &hints);
         const uint32_t flags = pf_scene_update(&scene, &pf_tracker_last_stats(tracker)->scene, &light);
         const pf_keyframe_cause cause = pf_keyframe_decide(&keyframes, &choice, tracks, rays, n,
-                                                           hints.has_encoder ? &hints.encoder : NULL, &common);
+                                                           hints.has_encoder ? &hints.encoder : NULL, flags, &common);
         out->crc = hash_u32(hash_frame(out->crc, tracker, flags), (uint32_t)cause << 16 | common);
         out->keyframes += cause != PF_KEYFRAME_NO;
         out->tracked += pf_tracker_last_stats(tracker)->tracked;

@@ -7,13 +7,14 @@
 #define N 200
 
 static pf_keyframe_state state;
+static _Alignas(16) uint8_t workspace[PF_KEYFRAME_BYTES(N)];
 static pf_track tracks[N];
 static pf_ray_q30 rays[N];
 static const pf_keyframe_config config = {.min_interval = 1};
 
 void setUp(void)
 {
-    memset(&state, 0, sizeof state);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_keyframe_init(&state, N, workspace, sizeof workspace));
 }
 void tearDown(void) {}
 
@@ -29,7 +30,7 @@ static void look(double travel, double angle, int axis)
         q[b] = s * p[a] + c * p[b];
         const double n = 1073741824.0 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]);
         rays[i] = (pf_ray_q30){(int32_t)lrint(q[0] * n), (int32_t)lrint(q[1] * n), (int32_t)lrint(q[2] * n)};
-        tracks[i] = (pf_track){.id = (uint64_t)i + 1u, .status = PF_TRACK_TRACKED};
+        tracks[i] = (pf_track){.id = (uint64_t)i + 1u, .status = PF_TRACK_TRACKED, .age = 10};
     }
 }
 
@@ -47,7 +48,7 @@ static void look_again(double angle, int axis)
 
 static pf_keyframe_cause decide(const pf_keyframe_config *c, const int64_t *encoder, uint32_t *common)
 {
-    return pf_keyframe_decide(&state, c, tracks, rays, N, encoder, common);
+    return pf_keyframe_decide(&state, c, tracks, rays, N, encoder, 0, common);
 }
 
 /* Proves: the encoder rules where there is one, in either direction, and parallax then does not. */
@@ -70,7 +71,7 @@ static void test_pure_rotation_makes_no_keyframe(void)
 {
     for (int axis = 0; axis < 3; axis++) {
         uint32_t common = 0;
-        memset(&state, 0, sizeof state);
+        pf_keyframe_reset(&state);
         look(0, 0, 0);
         TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, &common));
         TEST_ASSERT_EQUAL_UINT32(0, common);
@@ -89,7 +90,7 @@ static void test_rotation_is_found_to_a_ten_thousandth(void)
         for (int axis = 0; axis < 3; axis++)
             for (int wild = 0; wild <= N / 4; wild += N / 4) {
                 const pf_keyframe_config c = {.min_interval = 1, .parallax_urad = wild ? 1000 : 100};
-                memset(&state, 0, sizeof state);
+                pf_keyframe_reset(&state);
                 look(0, 0.3, (axis + 1) % 3);
                 TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&c, NULL, NULL));
                 look(0, 0.3, (axis + 1) % 3);
@@ -106,7 +107,7 @@ static void test_forward_motion_makes_a_keyframe_at_the_parallax(void)
     for (int k = 0; k < 2; k++) {
         int steps = 0;
         double median[N];
-        memset(&state, 0, sizeof state);
+        pf_keyframe_reset(&state);
         look(0, 0, 2);
         TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, NULL));
         do {
@@ -154,9 +155,9 @@ static void test_a_reference_without_tracks_is_not_kept(void)
         tracks[i].status = PF_TRACK_LOST;
     TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FIRST, decide(&config, NULL, NULL));
     for (int i = 0; i < 16; i++)
-        tracks[i].status = PF_TRACK_NEW;
+        tracks[i].status = PF_TRACK_TRACKED;
     TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, NULL));
-    tracks[16].status = PF_TRACK_NEW;
+    tracks[16].status = PF_TRACK_TRACKED;
     TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_FEW_COMMON, decide(&config, NULL, NULL));
     TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_NO, decide(&config, NULL, NULL));
 }
@@ -190,6 +191,76 @@ static void test_invalid_bearings_are_left_out(void)
     TEST_ASSERT_EQUAL_UINT32(N, common);
 }
 
+/* Frames of 200 corners of noise: nearly all are gone in the next. Returns the keyframes. */
+static uint32_t storm(uint32_t frames, uint32_t lasting, const int64_t *encoder, uint32_t scene)
+{
+    uint32_t keyframes = 0;
+    uint64_t id = 1000;
+    look(0, 0, 0);
+    for (uint32_t k = 0; k < frames; k++) {
+        for (uint32_t i = 0; i < N; i++)
+            tracks[i] = (pf_track){.id = id++, .status = PF_TRACK_NEW};
+        for (uint32_t i = 0; i < lasting; i++)
+            tracks[i] = (pf_track){.id = 1 + i + k / 3 * lasting, .status = PF_TRACK_TRACKED, .age = k % 3};
+        keyframes += pf_keyframe_decide(&state, &config, tracks, rays, N, encoder, scene, NULL) != PF_KEYFRAME_NO;
+    }
+    return keyframes;
+}
+
+/* Proves: corners of the sensor's noise, which come and go, are no common tracks that were lost; those of them that do
+ * live three frames force a keyframe less and less often, none with a standing encoder or in the dark. */
+static void test_noise_makes_no_storm_of_keyframes(void)
+{
+    static const int64_t at = 5;
+    TEST_ASSERT_EQUAL_UINT32(1, storm(200, 0, NULL, 0));
+    setUp();
+    TEST_ASSERT_LESS_OR_EQUAL_UINT32(8, storm(200, 40, NULL, 0));
+    setUp();
+    TEST_ASSERT_EQUAL_UINT32(1, storm(30, 40, NULL, PF_SCENE_WEAK_TEXTURE));
+    setUp();
+    TEST_ASSERT_LESS_OR_EQUAL_UINT32(3, storm(200, 40, &at, 0));
+}
+
+/* Proves: an encoder that is stuck does not stop keyframes by parallax; one that counts does. */
+static void test_parallax_chooses_while_the_encoder_is_stuck(void)
+{
+    static const int64_t stuck = 7;
+    const pf_keyframe_config c = {.step_counts = 100, .min_interval = 1};
+    uint32_t keyframes[2] = {0, 0};
+    for (int counts = 0; counts < 2; counts++) {
+        setUp();
+        for (int64_t k = 0; k < 60; k++) {
+            look(0.005 * (double)k, 0, 2);
+            keyframes[counts] += decide(&c, counts ? &k : &stuck, NULL) == PF_KEYFRAME_PARALLAX;
+        }
+    }
+    TEST_ASSERT_GREATER_THAN_UINT32(2, keyframes[0]);
+    TEST_ASSERT_EQUAL_UINT32(0, keyframes[1]);
+}
+
+/* Proves: a state that lasts is a keyframe, once, and so is its end; one that passes is not. */
+static void test_a_lasting_state_is_a_keyframe(void)
+{
+    uint32_t made[200] = {0}, total = 0;
+    look(0, 0, 0);
+    for (uint32_t k = 0; k < 200; k++) {
+        const uint32_t scene = k >= 20 && k < 100 ? PF_SCENE_DARK : k >= 150 && k < 170 ? PF_SCENE_COVERED : 0u;
+        made[k] = pf_keyframe_decide(&state, &config, tracks, rays, N, NULL, scene, NULL);
+        total += made[k] != PF_KEYFRAME_NO;
+    }
+    TEST_ASSERT_EQUAL_UINT32(3, total);
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_STATE, made[49]);
+    TEST_ASSERT_EQUAL_INT(PF_KEYFRAME_STATE, made[129]);
+}
+
+/* Proves: the workspace is checked. */
+static void test_too_small_a_workspace_is_refused(void)
+{
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_keyframe_init(&state, N + 1, workspace, sizeof workspace));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_keyframe_init(&state, 0, workspace, sizeof workspace));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_keyframe_init(&state, PF_TRACKS_MAX + 1, workspace, SIZE_MAX));
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -201,5 +272,9 @@ int main(void)
     RUN_TEST(test_a_reference_without_tracks_is_not_kept);
     RUN_TEST(test_interval_between_keyframes_is_kept);
     RUN_TEST(test_invalid_bearings_are_left_out);
+    RUN_TEST(test_noise_makes_no_storm_of_keyframes);
+    RUN_TEST(test_parallax_chooses_while_the_encoder_is_stuck);
+    RUN_TEST(test_a_lasting_state_is_a_keyframe);
+    RUN_TEST(test_too_small_a_workspace_is_refused);
     return UNITY_END();
 }

@@ -161,6 +161,8 @@ static pf_msg_tracking sample_tracking(void)
                          .static_blocks = 22};
     for (uint32_t i = 1; i < PF_TRACK_REASONS; i++)
         t.lost_by[i] = 9 + i;
+    t.state_frames[1] = 3;
+    t.state_frames[6] = 5;
     return t;
 }
 
@@ -305,6 +307,9 @@ static void check_tracking(view t)
         TEST_ASSERT_EQUAL_UINT64(i == 2 || i == 5, number(t, i));
     for (uint32_t i = 7; i <= 22; i++)
         TEST_ASSERT_EQUAL_UINT64(i, number(t, i));
+    static const uint8_t frames[PF_SCENE_FLAGS] = {0, 3, 0, 0, 0, 0, 5}; /* packed varints */
+    TEST_ASSERT_EQUAL_size_t(sizeof frames, bytes(t, 24).n);
+    TEST_ASSERT_EQUAL_MEMORY(frames, bytes(t, 24).data, sizeof frames);
 }
 
 static void check_status(view s)

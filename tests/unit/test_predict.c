@@ -6,6 +6,10 @@ static uint8_t frame[2][TUBE_W * TUBE_H];
 static _Alignas(16) uint8_t workspace[600000];
 static pf_tracker *tracker;
 static pf_predictor predictor;
+static _Alignas(16) uint8_t predictor_block[PF_PREDICTOR_BYTES(400)];
+static uint32_t elapsed; /* frames, of the hints */
+static int64_t counts_from;
+static double roll_from;
 static _Alignas(16) uint8_t camera_block[4000], rays_block[60000];
 static const pf_camera_fixed *camera;
 static const pf_camera_rays *table;
@@ -19,7 +23,10 @@ void setUp(void)
 {
     tube_seed = 5;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_init(&tracker, &tube_config, workspace, sizeof workspace));
-    memset(&predictor, 0, sizeof predictor);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_predictor_init(&predictor, 400, predictor_block, sizeof predictor_block));
+    elapsed = 1;
+    counts_from = 0;
+    roll_from = 0;
     view = last = tube_usual;
     fed = 0;
     const pf_camera lens = {.width = TUBE_W, /* of tube_scene.h */
@@ -37,7 +44,9 @@ void tearDown(void) {}
 
 static pf_motion_hints hints_of(const tube_view *v, bool with_sensors)
 {
-    return (pf_motion_hints){with_sensors, with_sensors, (int64_t)floor(v->z * 20), (int32_t)lrint(-v->roll * 1e6)};
+    const uint64_t count = (uint64_t)counts_from + (uint64_t)(int64_t)floor(v->z * 20);
+    return (pf_motion_hints){with_sensors, with_sensors, (int64_t)count,
+                             (int32_t)lrint(remainder(roll_from - v->roll, 2 * TUBE_PI) * 1e6), elapsed};
 }
 
 /* Guesses for the table as it is and the view to come. */
@@ -134,6 +143,54 @@ static void test_roll_is_predicted(void)
     TEST_ASSERT_TRUE(guess_error(&next, true, &share) < 0.6);
 }
 
+/* Proves: over two dropped frames driving and roll are predicted three frames on, from the pictures alone and with an
+ * encoder, to 0.5 px; and what was learned over the gap is one frame's motion again. */
+static void test_dropped_frames_are_counted(void)
+{
+    for (int sensors = 0; sensors < 2; sensors++) {
+        double share;
+        setUp();
+        for (int i = 0; i < 8; i++) {
+            view.z += 4;
+            view.roll += 0.02;
+            feed(true, sensors);
+        }
+        for (int i = 0; i < 2; i++) {
+            tube_view next = view;
+            elapsed = i ? 1 : 3;
+            next.z += 4 * elapsed;
+            next.roll += 0.02 * elapsed;
+            TEST_ASSERT_TRUE(guess_error(&next, sensors, &share) < 0.5);
+            view = next;
+            TEST_ASSERT_TRUE(guess(&view, sensors) > 0);
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_expect(tracker, at, before_n = guess(&view, sensors)));
+            feed(true, sensors);
+        }
+    }
+}
+
+/* Proves: readings at the ends of their ranges predict like others: a roll of half a turn, an encoder's register that
+ * wraps; a leap that no drive makes is no reading. */
+static void test_readings_wrap_and_leaps_are_ignored(void)
+{
+    double share;
+    roll_from = TUBE_PI - 0.01;
+    counts_from = INT64_MAX - 80 * 9;
+    for (int i = 0; i < 8; i++) {
+        view.z += 4;
+        view.roll += i % 2 ? 0.05 : -0.05; /* across the end and back */
+        feed(true, true);
+    }
+    tube_view next = view;
+    next.z += 12;
+    TEST_ASSERT_TRUE(guess_error(&next, true, &share) < 1.0);
+    next.z = view.z + 4;
+    counts_from = 0;
+    TEST_ASSERT_TRUE(guess_error(&next, true, &share) < 1.0);
+    counts_from = INT64_MAX - 80 * 9 - 1000000; /* 600 radii */
+    TEST_ASSERT_TRUE(guess_error(&next, true, &share) < 1.0);
+}
+
 /* Tracked tracks and those off by over 1 px, in the last frame, of tracks that should still be seen. */
 static uint32_t count_found(const tube_view *from, uint32_t *possible, uint32_t *wrong)
 {
@@ -194,6 +251,8 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_driving_is_predicted_through_rays);
     RUN_TEST(test_roll_is_predicted);
+    RUN_TEST(test_dropped_frames_are_counted);
+    RUN_TEST(test_readings_wrap_and_leaps_are_ignored);
     RUN_TEST(test_wrong_predictions_harm_nothing);
     return UNITY_END();
 }

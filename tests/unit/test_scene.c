@@ -123,6 +123,52 @@ static void test_covered_lens_is_recognised(void)
     drive(15, 3, 8, 0);
 }
 
+/* Proves: the noise of a high gain does not hide it, though its grain passes for texture. */
+static void test_covered_lens_is_recognised_under_noise(void)
+{
+    for (int noise = 8; noise <= 20; noise += 6) {
+        setUp();
+        drive(15, 3, 15, 0);
+        view.gain = 0.03;
+        view.bias = 90;
+        view.noise = noise;
+        drive(20, 3, 8, PF_SCENE_COVERED);
+    }
+}
+
+/* Proves: an encoder that counts against the picture is told after 10 frames, and one that stands while it moves; one
+ * that agrees, in either direction and across the end of its range, and one beside a roll are not. */
+static void test_an_encoder_against_the_picture_is_told(void)
+{
+    static const struct {
+        double speed;
+        int64_t counts;
+        uint32_t flags;
+    } way[] = {{3, 5, 0},
+               {3, -5, PF_SCENE_ENCODER},
+               {3, 0, PF_SCENE_ENCODER},
+               {-3, -5, PF_SCENE_REVERSING},
+               {-3, 5, PF_SCENE_REVERSING | PF_SCENE_ENCODER}};
+    for (size_t i = 0; i < sizeof way / sizeof way[0]; i++) {
+        setUp();
+        hints = (pf_scene_hints){.has_encoder = true, .encoder = INT64_MAX - 50};
+        uint64_t at = INT64_MAX - 50;
+        for (int k = 0; k < 40; k++) {
+            view.z += way[i].speed;
+            at += (uint64_t)way[i].counts;
+            hints.encoder = (int64_t)at;
+            (void)feed();
+        }
+        TEST_ASSERT_EQUAL_HEX32(way[i].flags, scene.flags);
+    }
+    setUp();
+    hints.has_encoder = true;
+    for (int k = 0; k < 40; k++) {
+        view.roll += 0.03;
+        TEST_ASSERT_EQUAL_HEX32(0, feed() & PF_SCENE_ENCODER);
+    }
+}
+
 /* Proves: glare over a quarter of the picture is over-exposure; a bright picture that is not saturated is none. */
 static void test_over_exposure_is_recognised(void)
 {
@@ -169,6 +215,8 @@ int main(void)
     RUN_TEST(test_roll_is_not_reversing);
     RUN_TEST(test_lamp_off_is_dark_and_dark_with_the_lamp_on_is_covered);
     RUN_TEST(test_covered_lens_is_recognised);
+    RUN_TEST(test_covered_lens_is_recognised_under_noise);
+    RUN_TEST(test_an_encoder_against_the_picture_is_told);
     RUN_TEST(test_over_exposure_is_recognised);
     RUN_TEST(test_weak_texture_is_recognised);
     RUN_TEST(test_one_odd_frame_changes_nothing);

@@ -36,6 +36,7 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
 typedef struct pf_msg_tracking {
     uint32_t scene; /* pf_scene_flag */
     uint64_t frames, tracked, detected;
+    uint64_t state_frames[PF_SCENE_FLAGS]; /* of `frames`, those in each state, in the order of the bits */
     uint64_t lost_by[PF_TRACK_REASONS];
     uint32_t age_median, quality_median, static_blocks;
 } pf_msg_tracking;

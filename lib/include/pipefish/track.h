@@ -166,6 +166,7 @@ typedef struct pf_motion_hints { /* with a frame; a reading counts only if its h
     bool has_encoder, has_roll;
     int64_t encoder;
     int32_t roll_urad; /* about the optical axis, 0 = image y axis down; rises as the picture turns from y to x */
+    uint32_t frames;   /* since the frame before it: dropped ones + 1; 0 counts as 1 */
 } pf_motion_hints;
 
 /* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
@@ -173,20 +174,27 @@ typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_poi
 
 #define PF_FALL_UNKNOWN INT32_MIN
 
-typedef struct pf_predictor { /* private; zero-initialise, also after pf_tracker_reset */
-    uint32_t n;
-    uint64_t id[PF_TRACKS_MAX];
-    pf_ray_q30 ray[PF_TRACKS_MAX];
+typedef struct pf_predictor { /* private */
+    uint32_t max_tracks, n;
     pf_motion_hints last;
     bool is_known, has_per_count;
-    int32_t turn[9];                  /* rotation of the last frame, Q30 */
-    int32_t forward;                  /* median fall of the cotangents in the last frame, Q16 */
-    int64_t per_count_q30;            /* the same for each encoder count */
-    int32_t fall[2u * PF_TRACKS_MAX]; /* of each row of the table */
-    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX], driven[PF_TRACKS_MAX]; /* scratch */
-    uint16_t pair[PF_TRACKS_MAX];
-    uint32_t value[PF_TRACKS_MAX];
+    int32_t turn[9];       /* rotation in one frame, Q30 */
+    int32_t forward;       /* median fall of the cotangents in one frame, Q16 */
+    int64_t per_count_q30; /* the same for each encoder count */
+    uint64_t *id;
+    pf_ray_q30 *ray;
+    int32_t *fall;                  /* of each row of the table, in one frame */
+    pf_ray_q30 *from, *to, *driven; /* scratch */
+    uint32_t *value;
+    uint16_t *pair;
 } pf_predictor;
+
+/* Bytes of workspace for a tracker of so many tracks. */
+#define PF_PREDICTOR_BYTES(max_tracks) (70u * (size_t)(max_tracks))
+
+/* The workspace is aligned to 8 and stays the caller's. PF_ERR_ARGUMENT: max_tracks is not 1..2048; PF_ERR_SPACE. Call
+ * it again after pf_tracker_reset. */
+pf_status pf_predictor_init(pf_predictor *predictor, uint32_t max_tracks, void *workspace, size_t size);
 
 /* Before the first frame: one encoder count moves the camera on by so much of the pipe's radius, Q5.27. */
 void pf_predictor_assume(pf_predictor *predictor, int32_t radii_per_count_q27);
@@ -208,8 +216,10 @@ typedef enum pf_scene_flag {
     PF_SCENE_COVERED = 8,       /* nothing to see though there is light: no contrast; or dark with the lamp on */
     PF_SCENE_OVEREXPOSED = 16,  /* over a quarter of the picture is saturated */
     PF_SCENE_WEAK_TEXTURE = 32, /* too few tracks, or in fewer than 4 of 6 sextants, and none of the three above */
+    PF_SCENE_ENCODER = 64,      /* the encoder contradicts the picture, seen ahead: it counts the other way, or stands
+                                 * while the picture moves along the radius. Wheels that slip are not told */
 } pf_scene_flag;
-#define PF_SCENE_FLAGS 6u
+#define PF_SCENE_FLAGS 7u
 
 typedef struct pf_scene_hints { /* what else is known of the frame */
     bool has_lamp, lamp_on;
@@ -230,14 +240,17 @@ uint32_t pf_scene_update(pf_scene *scene, const pf_scene_measures *measures, con
 
 /* --- Keyframe choice (RECONSTRUCTION section 6) --------------------------------------------------------------------
  * A frame becomes a keyframe when the encoder has moved `step_counts` since the last one; without an encoder, when the
- * rotation-compensated median angle between bearings of common tracks reaches `parallax`; and in any case when fewer
- * than `min_common` tracks are shared with the last keyframe. */
+ * rotation-compensated median angle between bearings of common tracks reaches `parallax` (so too while an encoder
+ * stands for PF_SCENE_WINDOW frames: it may be stuck); when fewer than `min_common` tracks are shared with the last
+ * keyframe, unless the scene is dark, covered or without texture; and when the states of the scene have for 30 frames
+ * not been those of the last keyframe. */
 typedef enum pf_keyframe_cause {
     PF_KEYFRAME_NO = 0,
     PF_KEYFRAME_FIRST = 1,
     PF_KEYFRAME_ENCODER = 2,
     PF_KEYFRAME_PARALLAX = 3,
     PF_KEYFRAME_FEW_COMMON = 4,
+    PF_KEYFRAME_STATE = 5,
 } pf_keyframe_cause;
 
 typedef struct pf_keyframe_config { /* zero = default in brackets */
@@ -245,26 +258,42 @@ typedef struct pf_keyframe_config { /* zero = default in brackets */
     uint32_t parallax_urad;         /* micro-radians [174533 = 10 degrees] */
     uint32_t min_common;   /* forced below so many common tracks [100], or below half of what the last keyframe had
                             * where that is less: weak texture alone must not force one at every frame. Forced as well
-                            * when there are over twice as many tracks as the last keyframe had, and 16 */
+                            * when there are over twice as many tracks as the last keyframe had, and 16. Tracks that
+                            * have not lived 2 frames count in neither. After a keyframe with fewer tracks than this
+                            * the next one so forced waits, each time twice as long, up to 64 frames, and until the
+                            * encoder moves */
     uint32_t min_interval; /* frames, at least so many between keyframes [2] */
 } pf_keyframe_config;
 
-typedef struct pf_keyframe_state { /* private; zero-initialise */
-    uint32_t n;                    /* live tracks of the last keyframe; ids ascending */
-    uint32_t frames_since;
-    bool have_encoder, started;
-    int64_t encoder;
-    uint64_t id[PF_TRACKS_MAX];
-    pf_ray_q30 ray[PF_TRACKS_MAX];
-    pf_ray_q30 from[PF_TRACKS_MAX], to[PF_TRACKS_MAX]; /* scratch: common bearings */
-    uint32_t chord[PF_TRACKS_MAX];                     /* scratch: squared chords for the median */
+typedef struct pf_keyframe_state { /* private */
+    uint32_t max_tracks;
+    uint32_t n, young; /* live tracks of the last keyframe, ids ascending; the last `young` of them may be noise */
+    uint32_t frames_since, wait, still, differs;
+    uint32_t scene; /* of the last keyframe */
+    bool have_encoder, had_encoder, started;
+    int64_t encoder, encoder_before; /* of the last keyframe, of the last frame */
+    uint64_t *id;
+    pf_ray_q30 *ray;
+    pf_ray_q30 *from, *to; /* scratch: common bearings */
+    uint32_t *chord;       /* scratch: squared chords for the median */
 } pf_keyframe_state;
 
+/* Bytes of workspace for a tracker of so many tracks. */
+#define PF_KEYFRAME_BYTES(max_tracks) (48u * (size_t)(max_tracks))
+
+/* The workspace is aligned to 8 and stays the caller's. PF_ERR_ARGUMENT: max_tracks is not 1..2048; PF_ERR_SPACE. */
+pf_status pf_keyframe_init(pf_keyframe_state *state, uint32_t max_tracks, void *workspace, size_t size);
+
+/* After pf_tracker_reset: the next frame is the first. */
+void pf_keyframe_reset(pf_keyframe_state *state);
+
 /* Decides for the current frame and, when it becomes a keyframe, makes it the new reference.
- * tracks[n], rays[n]: the table and its bearings, ids ascending. encoder: NULL when there is none.
+ * tracks[n], rays[n]: the table and its bearings, ids ascending. encoder: NULL when there is none. scene: the states in
+ * force, pf_scene_flag.
  * *common (may be NULL) gets the number of tracks shared with the last keyframe. */
 pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks,
-                                     const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t *common);
+                                     const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t scene,
+                                     uint32_t *common);
 
 #ifdef __cplusplus
 }
