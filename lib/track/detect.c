@@ -71,11 +71,12 @@ static int32_t bin_of(const pf_tracker *t, pf_point_q16 at)
     return (int32_t)(ring * SECTORS + quadrant * 3u + third);
 }
 
-/* Whether a candidate may become a track: not in the glare, and with room in its polar cell, where it takes a place. */
+/* Whether a candidate may become a track: neither in the glare nor in the dark, and with room in its polar cell, where
+ * it takes a place. */
 static bool take_place(pf_tracker *t, pf_point_q16 at)
 {
     const uint32_t most = (3u * t->config.max_tracks + 2u * SECTORS * RINGS - 1u) / (2u * SECTORS * RINGS);
-    if (pf_mask_saturated(t, &t->pyramid[t->now].level[0], at, t->config.window * t->config.window / SATURATED))
+    if (CLIPPED * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
         return false;
     if (!t->config.polar)
         return true;
@@ -97,6 +98,7 @@ static void add_track(pf_tracker *t, pf_point_q16 at)
     s->expected.at.x = PF_NO_GUESS;
     s->sure = false;
     s->from = at;
+    s->clipped = pf_mask_clipped(t, image, at);
     t->slot_of[row] = slot;
     t->table[row] = (pf_track){.id = ++t->last_id, .pos = at, .status = PF_TRACK_NEW, .reason = PF_TRACK_OK};
     pf_anchor_take(&t->klt, image, t->table[row].pos, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);

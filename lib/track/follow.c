@@ -19,6 +19,7 @@
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
+#define CLIP_CHANGE  20u /* a twentieth of the window: with it the worst is at 5 sigma */
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
 {
@@ -136,8 +137,18 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
     return n;
 }
 
-/* What a track must pass wherever it was found: `fit` of its template in the new frame at `fine`. */
-static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_q16 fine, int32_t least_q15)
+/* Whether too much of a window is clipped, or much more or less than of its template: what is clipped in one of them
+ * only has a shape of its own, and pulls by up to half a pixel. */
+static bool is_clipped(const pf_tracker *t, uint32_t now, uint32_t before)
+{
+    const uint32_t area = t->config.window * t->config.window, change = now > before ? now - before : before - now;
+    return CLIPPED * now > area || CLIP_CHANGE * change > area;
+}
+
+/* What a track must pass wherever it was found: `fit` of its template, `clipped` pixels of it clipped, in the new frame
+ * at `fine`. */
+static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_q16 fine, int32_t least_q15,
+                               uint32_t clipped)
 {
     const pf_image *image = &t->pyramid[t->now].level[0];
     if (fit->reason != PF_TRACK_OK)
@@ -148,7 +159,7 @@ static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_
         return PF_TRACK_LEFT;
     if (!pf_mask_allows(t, fine))
         return PF_TRACK_MASKED;
-    if (pf_mask_saturated(t, image, fine, t->config.window * t->config.window / SATURATED))
+    if (is_clipped(t, pf_mask_clipped(t, image, fine), clipped))
         return PF_TRACK_SATURATED;
     if (pf_grid_near(t, fine, (int64_t)t->config.cell << 14))
         return PF_TRACK_CROWDED;
@@ -169,6 +180,7 @@ static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 f
         if (d > RENEW || d < -RENEW) {
             pf_anchor_take(&t->klt, &t->pyramid[t->now].level[0], fine, &s->anchor,
                            t->pixels + (size_t)slot * t->patch_bytes);
+            s->clipped = pf_mask_clipped(t, &t->pyramid[t->now].level[0], fine);
             break;
         }
     }
@@ -207,7 +219,7 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
     if (reason == PF_TRACK_OK && farther(fine, at, PULL_MAX))
         reason = PF_TRACK_DRIFT;
     if (reason == PF_TRACK_OK)
-        reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK);
+        reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK, s->clipped);
     if (reason == PF_TRACK_OK) {
         s->sure = !farther(fine, guess, CERTAIN);
         accept(t, track, slot, fine, &anchored, fit.zncc_q15);
@@ -243,7 +255,7 @@ static pf_track_reason attempt_warped(pf_tracker *t, pf_track *track, uint16_t s
     pf_track_reason reason = first.reason;
     if (reason == PF_TRACK_OK) {
         const pf_fit second = fit_warped(t, slot, &saved, warp, &two);
-        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15);
+        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15, t->slots[slot].clipped);
         if (reason == PF_TRACK_OK && farther(one, two, t->config.fb_q16))
             reason = PF_TRACK_DIVERGED;
         if (reason == PF_TRACK_OK) {

@@ -13,7 +13,8 @@
 #define MOVES_Q6     192
 #define CONTRAST     10 /* grey levels within the block: less than this is no corner */
 #define SENTENCE     40 /* lessons for which a block where a track got stuck stays closed, whatever its own pixel does */
-#define BRIGHT       250
+#define BRIGHT       250 /* from here on, and */
+#define BLACK        2   /* down from here, a pixel is clipped, or its noise is */
 
 /* New tracks keep a block's distance from static ones: a window reaches further than the pixel it is centred on. */
 static void close_blocks(pf_tracker *t)
@@ -134,16 +135,16 @@ void pf_mask_learn(pf_tracker *t)
     t->stats.scene.static_blocks = t->static_blocks;
 }
 
-bool pf_mask_saturated(const pf_tracker *t, const pf_image *image, pf_point_q16 at, uint32_t most)
+uint32_t pf_mask_clipped(const pf_tracker *t, const pf_image *image, pf_point_q16 at)
 {
     const int32_t half = t->klt.half, x = (at.x >> 16) - half, y = (at.y >> 16) - half;
     uint32_t count = 0;
     if (x < 0 || y < 0 || x + t->klt.window > (int32_t)image->width || y + t->klt.window > (int32_t)image->height)
-        return false;
+        return 0;
     for (int32_t j = 0; j < t->klt.window; j++) {
         const uint8_t *row = image->data + (size_t)(y + j) * image->stride + (size_t)x;
         for (int32_t i = 0; i < t->klt.window; i++)
-            count += row[i] >= BRIGHT;
+            count += row[i] >= BRIGHT || row[i] <= BLACK;
     }
-    return count > most;
+    return count;
 }

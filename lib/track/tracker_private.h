@@ -9,7 +9,7 @@
 #define SECTORS    12u /* detection in polar cells: sectors of 30 degrees */
 #define RINGS      6u
 #define CANDIDATES 4u /* for corners, times the tracks there may be: most stand too near a stronger one */
-#define SATURATED  4u /* at most this fraction of a window may be saturated */
+#define CLIPPED    4u /* at most this fraction of a window may be clipped */
 
 typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */
@@ -18,6 +18,7 @@ typedef struct pf_slot {  /* the hidden part of a live track */
     int32_t radial, flow; /* what of them is radial, and the same of its ring: see follow.c */
     pf_expected expected; /* by the caller, of the next frame */
     pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
+    uint32_t clipped;     /* pixels of its template's window */
     pf_anchor anchor;
 } pf_slot;
 
@@ -99,8 +100,8 @@ void pf_mask_learn(pf_tracker *t);
 /* What is at `at` has been seen to stand still. */
 void pf_mask_condemn(pf_tracker *t, pf_point_q16 at);
 
-/* Whether more than `most` of the window's pixels are saturated. */
-bool pf_mask_saturated(const pf_tracker *t, const pf_image *image, pf_point_q16 at, uint32_t most);
+/* Pixels of the window around `at` that are clipped, at either end. */
+uint32_t pf_mask_clipped(const pf_tracker *t, const pf_image *image, pf_point_q16 at);
 
 /* --- the scene (measure.c) */
 

@@ -36,7 +36,8 @@ typedef enum pf_track_reason {
     PF_TRACK_MASKED = 8,   /* ran into a masked part of the picture */
     PF_TRACK_STATIC = 9,   /* stands still, or nearly, while all around it moves: a reflection of the lamp, dirt on the
                             * lens, the camera's own shadow */
-    PF_TRACK_SATURATED = 10, /* over a quarter of its window is saturated */
+    PF_TRACK_SATURATED = 10, /* over a quarter of its window is clipped, white (250 and above) or black (2 and below),
+                              * or a twentieth more or less than of its template */
     PF_TRACK_REASONS = 11,
 } pf_track_reason;
 
