@@ -56,6 +56,7 @@ struct pf_tracker {
     uint32_t *value; /* scratch for medians, a number a track */
     pf_block *block;
     uint32_t block_w, block_h, static_blocks;
+    uint32_t usable_blocks;        /* not outside */
     bool is_mask_stale;            /* blocks have become static, or ceased to be, since is_closed was worked out */
     uint32_t slice;                /* every SLICES-th row of blocks learns at a time: which ones next */
     uint32_t travel_q16;           /* median motion since the last lesson */
@@ -77,6 +78,9 @@ bool pf_grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach);
 
 /* Finds every live track in the new frame, or loses it. */
 void pf_tracks_follow(pf_tracker *t);
+
+/* A coordinate of a start, brought within 64 px of a picture of `size`: differences and their squares then fit. */
+int32_t pf_guess_clamp(int64_t v, uint32_t size);
 
 /* The centre of the flow: the circle's, or the picture's. */
 pf_point_q16 pf_flow_centre(const pf_tracker *t);

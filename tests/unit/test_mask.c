@@ -108,6 +108,23 @@ static void test_parts_that_stand_still_are_learned(void)
     TEST_ASSERT_GREATER_THAN_UINT32(1, live_in(184, 154, 224, 186, 1));
 }
 
+/* Proves: on a weakly textured wall (sigma 6, less than the lamp's fall across a block) the mask does not grow: over
+ * 600 frames it stays below 3 % of the 484 blocks; dirt is found there as well, and forgotten when it is gone. What is
+ * masked lies where the tube's end begins to be seen. */
+static void test_weak_walls_are_not_masked(void)
+{
+    start();
+    view.contrast = 0.2;
+    view.noise = 1;
+    for (int k = 0; k < 900; k++) {
+        feed(k < 300 ? paint_plate : NULL);
+        view.z += 5;
+        if (k == 299)
+            TEST_ASSERT_GREATER_OR_EQUAL_UINT32(20, pf_tracker_last_stats(tracker)->scene.static_blocks);
+    }
+    TEST_ASSERT_LESS_OR_EQUAL_UINT32(12, pf_tracker_last_stats(tracker)->scene.static_blocks);
+}
+
 /* Proves: at a standstill nothing is dropped and nothing learned, however long it lasts. */
 static void test_standing_still_teaches_nothing(void)
 {
@@ -234,6 +251,7 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_nothing_is_tracked_in_the_users_mask);
     RUN_TEST(test_parts_that_stand_still_are_learned);
+    RUN_TEST(test_weak_walls_are_not_masked);
     RUN_TEST(test_standing_still_teaches_nothing);
     RUN_TEST(test_reflections_are_not_followed);
     RUN_TEST(test_walls_are_not_called_static);

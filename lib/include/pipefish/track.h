@@ -71,7 +71,8 @@ typedef struct pf_tracker_config {
                                  * it is 0.1 less */
     uint32_t noise_q8;          /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
     pf_point_q16 circle;        /* centre of the image circle, Q16.16 px, each within +-16384 */
-    uint32_t circle_radius_q16; /* its radius, up to 16384; 0 = the whole image is used */
+    uint32_t circle_radius_q16; /* its radius, from `window` px (less holds no window) up to 16384; 0 =
+                                 * the whole image is used */
     const pf_image *mask;       /* of the frame's size, 0 = nothing may be tracked here, in blocks of 8 x 8: one such
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
@@ -150,7 +151,8 @@ pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, ui
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
 const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 
-/* Forgets all tracks (a break in the video). Ids go on; none is reused. */
+/* Forgets all tracks (a break in the video). Ids go on; none is reused. The parts found to stand still stay masked:
+ * dirt on the lens outlives a break; what is gone is released as the picture moves on. */
 void pf_tracker_reset(pf_tracker *tracker);
 
 /* Bearings: unit rays of track positions, from the table of rays. Items outside the image or the camera's domain get
