@@ -7,7 +7,6 @@
 #define PULL_MAX     (3 << 16) /* the template may move a track by 3 px from where half resolution put it */
 #define DRIFT_SLACK  3277      /* the template may look 0.1 less similar than the previous patch */
 #define CERTAIN      (2 << 16) /* a track found this near its start is next sought from half resolution on */
-#define GUESS_MARGIN (64 << 16)
 #define GUESS_MOST   (4096 << 16)
 #define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
 #define WARPED_APART 49152     /* 3/4 px: the two starts of a warped template differ by 1.7 px */
@@ -60,10 +59,10 @@ static bool farther(pf_point_q16 a, pf_point_q16 b, int64_t reach)
     return dx * dx + dy * dy > reach * reach;
 }
 
-static int32_t clamp_guess(int64_t v, uint32_t size)
+int32_t pf_guess_clamp(int64_t v, uint32_t size)
 {
-    const int64_t most = ((int64_t)size << 16) + GUESS_MARGIN;
-    return (int32_t)(v < -GUESS_MARGIN ? -GUESS_MARGIN : v > most ? most : v);
+    const int64_t margin = 64 << 16, most = ((int64_t)size << 16) + margin;
+    return (int32_t)(v < -margin ? -margin : v > most ? most : v);
 }
 
 /* --- where to look ----------------------------------------------------------------------------------------------- */
@@ -121,8 +120,8 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
         return n;
     int32_t like[STARTS];
     for (uint32_t i = 0; i < n; i++) {
-        const pf_point_q16 to = {clamp_guess((int64_t)at.x + start[i].x, t->config.width),
-                                 clamp_guess((int64_t)at.y + start[i].y, t->config.height)};
+        const pf_point_q16 to = {pf_guess_clamp((int64_t)at.x + start[i].x, t->config.width),
+                                 pf_guess_clamp((int64_t)at.y + start[i].y, t->config.height)};
         like[i] = coarse_likeness(t, at, to) - (int32_t)i * MARGIN;
     }
     for (uint32_t i = 1; i < n; i++)
@@ -194,8 +193,8 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
 {
     const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
     const pf_point_q16 old = track->pos;
-    const pf_point_q16 guess = {clamp_guess((int64_t)old.x + move.x, t->config.width),
-                                clamp_guess((int64_t)old.y + move.y, t->config.height)};
+    const pf_point_q16 guess = {pf_guess_clamp((int64_t)old.x + move.x, t->config.width),
+                                pf_guess_clamp((int64_t)old.y + move.y, t->config.height)};
     pf_point_q16 at = guess;
     const pf_fit coarse = pf_klt_track(&t->klt, from, to, old, &at, top, last);
     *reached = at;
@@ -238,7 +237,7 @@ static pf_fit fit_warped(pf_tracker *t, uint16_t slot, const pf_anchor *before, 
     for (int32_t i = 0; i < 2; i++)
         for (int32_t j = 0; j < 2; j++)
             a->a[2 * i + j] = pf_clamp_i64(
-                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, 4 << 16);
+                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, WARP_MOST);
     return pf_anchor_fit(&t->klt, &t->pyramid[t->now].level[0], a, t->pixels + (size_t)slot * t->patch_bytes, start);
 }
 

@@ -11,10 +11,11 @@
 #include "pipefish/image.h"
 #include "pipefish/track.h"
 
-#define EDGE_ROW 48             /* row stride of a copy at the image's edge: 5 groups and a pixel */
-#define GAIN_ONE 16384          /* gains are Q14 */
-#define GAIN_MIN (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
-#define GAIN_MAX (GAIN_ONE * 8)
+#define EDGE_ROW  48             /* row stride of a copy at the image's edge: 5 groups and a pixel */
+#define GAIN_ONE  16384          /* gains are Q14 */
+#define GAIN_MIN  (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
+#define GAIN_MAX  (GAIN_ONE * 8)
+#define WARP_MOST (4 << 16) /* no entry of a warp is larger */
 
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {

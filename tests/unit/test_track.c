@@ -351,6 +351,51 @@ static void test_shifts_of_60_px_are_recovered_with_prediction(void)
     }
 }
 
+/* Proves: expectations from all over the number line, with warps, do no harm: nothing overflows (the sanitizers see to
+ * that), and a picture that stands still is found where it was. */
+static void test_absurd_expectations_do_no_harm(void)
+{
+    static const int32_t far[] = {INT32_MAX, INT32_MIN + 1, 1 << 30, -1, 65536, INT32_MIN};
+    static pf_expected at[400];
+    pf_tracker *t = start(NULL);
+    uint32_t n;
+    render(frame[0], &still, 2, 0);
+    feed(t, frame[0]);
+    for (int k = 0; k < 6; k++) {
+        const bool is_lost = k == 5;
+        const pf_track *now = pf_tracker_tracks(t, &n);
+        for (uint32_t i = 0; i < n; i++)
+            at[i] = (pf_expected){.at = {far[(i + (uint32_t)k) % 5], far[(i + i / 5) % 6]},
+                                  .warp_q16 = {far[i % 6], far[(i + 1) % 6], far[(i + 2) % 6], far[i % 5]}};
+        memcpy(before, now, n * sizeof before[0]);
+        const uint32_t live = pf_tracker_last_stats(t)->live;
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_expect(t, at, n));
+        render(frame[(k + 1) % 2], &still, 2, is_lost ? 3 : 0);
+        feed(t, frame[(k + 1) % 2]);
+        if (!is_lost)
+            TEST_ASSERT_GREATER_OR_EQUAL_UINT32(live - live / 10, pf_tracker_last_stats(t)->tracked);
+    }
+}
+
+/* Proves: covariances are positive definite down to the least noise, where their entries round to a few units. */
+static void test_covariances_are_positive_definite(void)
+{
+    for (uint32_t noise = 1; noise <= 64u << 8; noise *= 8) {
+        const pf_tracker_config c = {.noise_q8 = noise, .min_eigen = 1, .window = 9};
+        const motion m = {{1, 0, 0, 1}, {0.4, 0.2}, 0.4, 60};
+        uint32_t n;
+        pf_tracker *t = start(&c);
+        for (int k = 0; k < 2; k++) {
+            render(frame[k], k ? &m : &still, 1, 0);
+            feed(t, frame[k]);
+            const pf_track *now = pf_tracker_tracks(t, &n);
+            for (uint32_t i = 0; i < n; i++)
+                TEST_ASSERT_TRUE((double)now[i].cov_xx_q20 * now[i].cov_yy_q20 >
+                                 (double)now[i].cov_xy_q20 * now[i].cov_xy_q20);
+        }
+    }
+}
+
 /* Proves: when the scene shrinks and tracks run together the younger is lost as CROWDED: no two stay within a quarter
  * of a cell. */
 static void test_tracks_that_run_together_are_thinned(void)
@@ -441,6 +486,7 @@ static void test_each_bound_of_the_configuration_is_checked(void)
     bad[n++].window = 20, bad[n++].window = 33, bad[n++].iterations = 31, bad[n++].cell = 15, bad[n++].cell = 257;
     bad[n++].min_eigen = 16385, bad[n++].fb_q16 = (16u << 16) + 1u, bad[n++].min_zncc_q15 = 32768;
     bad[n++].noise_q8 = (64u << 8) + 1u, bad[n++].circle_radius_q16 = (16384u << 16) + 1u;
+    bad[n++].circle_radius_q16 = (21u << 16) - 1u;
     bad[n++].circle.x = (16384 << 16) + 1, bad[n++].circle.y = -(16384 << 16) - 1;
     for (uint32_t i = 0; i < n; i++) {
         TEST_ASSERT_EQUAL_size_t(0, pf_tracker_workspace_size(&bad[i]));
@@ -474,6 +520,8 @@ int main(void)
     RUN_TEST(test_vanished_spot_is_not_mistaken_for_its_twin);
     RUN_TEST(test_forward_backward_distance_is_enforced);
     RUN_TEST(test_shifts_of_60_px_are_recovered_with_prediction);
+    RUN_TEST(test_absurd_expectations_do_no_harm);
+    RUN_TEST(test_covariances_are_positive_definite);
     RUN_TEST(test_tracks_that_run_together_are_thinned);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);

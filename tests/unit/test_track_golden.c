@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x2A31F083u
+#define GOLDEN 0x0D80508Cu
 
 void setUp(void) {}
 void tearDown(void) {}
