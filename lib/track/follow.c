@@ -15,6 +15,8 @@
 #define COARSE_HALF  5
 #define MARGIN       1638      /* 0.05 of similarity */
 #define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
+#define NEAR_LEAST   5u        /* of those within 45 degrees */
+#define NEAR_PART    16        /* a sector at less than this part of its ring's pace does not count */
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
@@ -276,28 +278,43 @@ pf_point_q16 pf_flow_centre(const pf_tracker *t)
     return (pf_point_q16){(int32_t)(t->config.width << 15), (int32_t)(t->config.height << 15)};
 }
 
-/* Length along its radius of a track's last move, outward positive, Q16 px; and the ring that it is in. */
-static int32_t radial_move(const pf_tracker *t, uint32_t row, uint32_t *ring)
+/* Length along its radius of a track's last move, outward positive, Q16 px; and the polar cell that it is in. */
+static int32_t radial_move(const pf_tracker *t, uint32_t row, uint32_t *cell)
 {
     const pf_point_q16 centre = pf_flow_centre(t), p = t->table[row].pos, move = t->slots[t->slot_of[row]].move;
     const int64_t x = ((int64_t)p.x - centre.x) >> 8, y = ((int64_t)p.y - centre.y) >> 8;
     const int64_t r = pf_isqrt64((uint64_t)(x * x + y * y)) + 1u; /* Q8 */
     const uint32_t side = t->config.width < t->config.height ? t->config.width : t->config.height;
     const int64_t reach = t->config.circle_radius_q16 ? t->config.circle_radius_q16 >> 8 : (int64_t)side << 7;
-    *ring = r * RINGS < reach * RINGS ? (uint32_t)(r * RINGS / reach) : RINGS - 1u;
+    *cell = (r < reach ? (uint32_t)(r * RINGS / reach) : RINGS - 1u) * SECTORS + pf_sector_of(x, y);
     return (int32_t)((x * move.x + y * move.y) / r);
 }
 
-/* The median radial move of each ring's tracks: in a tube it hardly depends on the azimuth. Too few: 0. */
-static void measure_flow(pf_tracker *t, int32_t flow[RINGS])
+/* The median radial move of the tracks in a ring, within `reach` sectors of `sector`; 0 with fewer than `least`. */
+static int32_t median_flow(const pf_tracker *t, uint32_t ring, uint32_t sector, uint32_t reach, uint32_t least)
+{
+    uint32_t n = 0;
+    for (uint32_t i = 0; i < t->n; i++) {
+        const uint32_t apart = (t->cell_of[i] % SECTORS + SECTORS - sector) % SECTORS;
+        if (t->table[i].status == PF_TRACK_TRACKED && t->cell_of[i] / SECTORS == ring &&
+            (apart <= reach || apart >= SECTORS - reach))
+            t->value[n++] = (uint32_t)((int64_t)t->radial[i] + ((int64_t)1 << 31));
+    }
+    return n < least ? 0 : (int32_t)((int64_t)pf_value_of_rank(t->value, n, n / 2u) - ((int64_t)1 << 31));
+}
+
+/* What tracks in each polar cell should move by along the radius: the median of the ring within 45 degrees. On the
+ * tube's axis the azimuth would not matter; low above the invert the crown moves at an eighth of the invert's pace.
+ * Where too few tracks are near, or they hardly move (dirt may fill a sector), the whole ring's. */
+static void measure_flow(const pf_tracker *t, int32_t flow[RINGS * SECTORS])
 {
     for (uint32_t ring = 0; ring < RINGS; ring++) {
-        uint32_t n = 0;
-        for (uint32_t i = 0; i < t->n; i++)
-            if (t->table[i].status == PF_TRACK_TRACKED && t->ring_of[i] == ring)
-                t->value[n++] = (uint32_t)((int64_t)t->radial[i] + ((int64_t)1 << 31));
-        flow[ring] =
-            n < FLOW_LEAST ? 0 : (int32_t)((int64_t)pf_value_of_rank(t->value, n, n / 2u) - ((int64_t)1 << 31));
+        const int32_t whole = median_flow(t, ring, 0, SECTORS, FLOW_LEAST);
+        for (uint32_t sector = 0; sector < SECTORS; sector++) {
+            const int32_t near = median_flow(t, ring, sector, 1, NEAR_LEAST);
+            const int64_t size = near < 0 ? -(int64_t)near : near, most = whole < 0 ? -(int64_t)whole : whole;
+            flow[ring * SECTORS + sector] = NEAR_PART * size > most ? near : whole;
+        }
     }
 }
 
@@ -307,7 +324,7 @@ static int32_t forget_and_add(int32_t sum, int32_t more)
     return pf_clamp_i64((int64_t)sum - sum / 8 + more, 1 << 24);
 }
 
-/* Whether the track has stood still, or nearly, while its ring has moved on. */
+/* Whether the track has stood still, or nearly, while those around it have moved on. */
 static bool stands_still(pf_slot *s, int32_t radial, int32_t flow)
 {
     s->own = (pf_point_q16){forget_and_add(s->own.x, s->move.x), forget_and_add(s->own.y, s->move.y)};
@@ -330,14 +347,14 @@ static void lose(pf_tracker *t, uint32_t row, pf_track_reason reason)
 /* Tracks that stick to something that goes with the camera are lost; what they stick to is masked. */
 static void drop_stuck(pf_tracker *t)
 {
-    int32_t flow[RINGS];
+    int32_t flow[RINGS * SECTORS];
     for (uint32_t i = 0; i < t->n; i++)
         if (t->table[i].status == PF_TRACK_TRACKED)
-            t->radial[i] = radial_move(t, i, &t->ring_of[i]);
+            t->radial[i] = radial_move(t, i, &t->cell_of[i]);
     measure_flow(t, flow);
     for (uint32_t i = 0; i < t->n; i++)
         if (t->table[i].status == PF_TRACK_TRACKED &&
-            stands_still(&t->slots[t->slot_of[i]], t->radial[i], flow[t->ring_of[i]])) {
+            stands_still(&t->slots[t->slot_of[i]], t->radial[i], flow[t->cell_of[i]])) {
             lose(t, i, PF_TRACK_STATIC);
             pf_mask_condemn(t, t->table[i].pos);
             t->stats.tracked--;

@@ -84,7 +84,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     (void)carve(base, &used, sizeof *t);
     PLACE(table, 2u * tracks);
     PLACE(slot_of, 2u * tracks);
-    PLACE(ring_of, 2u * tracks);
+    PLACE(cell_of, 2u * tracks);
     PLACE(radial, 2u * tracks);
     PLACE(slots, tracks);
     PLACE(pixels, (size_t)tracks * patch_bytes);

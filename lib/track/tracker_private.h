@@ -15,7 +15,7 @@ typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */
     bool sure;            /* which its start met within CERTAIN */
     pf_point_q16 own;     /* its moves summed with forgetting; */
-    int32_t radial, flow; /* what of them is radial, and the same of its ring: see follow.c */
+    int32_t radial, flow; /* what of them is radial, and the same of those around: see follow.c */
     pf_expected expected; /* by the caller, of the next frame */
     pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
     uint32_t clipped;     /* pixels of its template's window */
@@ -40,7 +40,7 @@ struct pf_tracker {
     uint64_t last_id;
     pf_track *table;
     uint16_t *slot_of; /* of each live row of the table */
-    uint32_t *ring_of; /* scratch: ring and radial move of each row */
+    uint32_t *cell_of; /* scratch: polar cell (ring * SECTORS + sector) and radial move of each row */
     int32_t *radial;
     uint32_t n;
     pf_slot *slots;
@@ -88,6 +88,9 @@ pf_point_q16 pf_flow_centre(const pf_tracker *t);
 /* --- new tracks (detect.c) */
 
 void pf_tracks_detect(pf_tracker *t);
+
+/* The sector of 30 degrees, 0 .. SECTORS - 1 from x to y, that (dx, dy), |.| < 2^40, lies in. */
+uint32_t pf_sector_of(int64_t dx, int64_t dy);
 
 /* --- masks (mask.c) */
 
