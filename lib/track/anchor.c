@@ -306,13 +306,38 @@ static int64_t template_covariance(const pf_anchor *anchor, int32_t i, int32_t j
     return m > COV_MOST ? COV_MOST : m < -COV_MOST ? -COV_MOST : m;
 }
 
+/* r C s for rows r, s of a warp and C (xx, xy, yy), to nearest. */
+static int64_t turned(const int32_t r[2], const int32_t s[2], const int64_t cov[3])
+{
+    const int64_t x = (cov[0] * s[0] + cov[1] * s[1] + 32768) >> 16, y = (cov[1] * s[0] + cov[2] * s[1] + 32768) >> 16;
+    return (r[0] * x + r[1] * y + 32768) >> 16;
+}
+
+/* What is carried and what the fit adds at `factor_q8`, in the picture's axes: xx, xy, yy. */
+static void whole_covariance(const pf_anchor *anchor, uint32_t noise_q8, int64_t factor_q8, int64_t out[3])
+{
+    const int32_t *x = anchor->a, *y = anchor->a + 2;
+    const int64_t cov[3] = {anchor->carried[0] + template_covariance(anchor, 0, 0, noise_q8, factor_q8),
+                            anchor->carried[1] + template_covariance(anchor, 1, 0, noise_q8, factor_q8),
+                            anchor->carried[2] + template_covariance(anchor, 1, 1, noise_q8, factor_q8)};
+    out[0] = turned(x, x, cov);
+    out[1] = turned(x, y, cov);
+    out[2] = turned(y, y, cov);
+}
+
+void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried[3])
+{
+    whole_covariance(anchor, noise_q8, 256, carried);
+    for (int32_t i = 0; i < 3; i++)
+        carried[i] = carried[i] > COV_MOST ? COV_MOST : carried[i] < -COV_MOST ? -COV_MOST : carried[i];
+}
+
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track)
 {
     const int64_t gain2 = ((int64_t)gain_q14 * gain_q14) >> 14; /* Q14 */
-    const int64_t factor_q8 = 256 + ((int64_t)256 << 14) / gain2;
-    const int64_t xx = template_covariance(anchor, 0, 0, noise_q8, factor_q8) + PF_TRACK_COV_FLOOR_Q20;
-    const int64_t yy = template_covariance(anchor, 1, 1, noise_q8, factor_q8) + PF_TRACK_COV_FLOOR_Q20;
-    const int64_t xy = template_covariance(anchor, 1, 0, noise_q8, factor_q8);
+    int64_t cov[3];
+    whole_covariance(anchor, noise_q8, 256 + ((int64_t)256 << 14) / gain2, cov);
+    const int64_t xx = cov[0] + PF_TRACK_COV_FLOOR_Q20, xy = cov[1], yy = cov[2] + PF_TRACK_COV_FLOOR_Q20;
     track->cov_xx_q20 = xx > UINT32_MAX ? UINT32_MAX : (uint32_t)xx;
     track->cov_yy_q20 = yy > UINT32_MAX ? UINT32_MAX : (uint32_t)yy;
     /* rounding and saturation must not make it indefinite */

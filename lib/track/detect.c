@@ -106,6 +106,7 @@ static void add_track(pf_tracker *t, pf_point_q16 at)
     t->slot_of[row] = slot;
     t->table[row] = (pf_track){.id = ++t->last_id, .pos = at, .status = PF_TRACK_NEW, .reason = PF_TRACK_OK};
     pf_anchor_take(&t->klt, image, t->table[row].pos, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);
+    s->anchor.carried[0] = s->anchor.carried[1] = s->anchor.carried[2] = 0;
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, GAIN_ONE, &t->table[row]);
     pf_grid_insert(t, row);
     t->stats.detected++;

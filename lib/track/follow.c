@@ -1,4 +1,6 @@
 /* Live tracks in a new frame: where to look, what to believe. */
+#include <string.h>
+
 #include "tracker_private.h"
 
 /* A template is renewed when its warp has moved this far from identity: the affine model then leaves, at the edge of a
@@ -179,8 +181,11 @@ static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 f
     for (int32_t k = 0; k < 4; k++) {
         const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
         if (d > RENEW || d < -RENEW) {
+            int64_t carried[3];
+            pf_anchor_carry(&s->anchor, t->config.noise_q8, carried);
             pf_anchor_take(&t->klt, &t->pyramid[t->now].level[0], fine, &s->anchor,
                            t->pixels + (size_t)slot * t->patch_bytes);
+            memcpy(s->anchor.carried, carried, sizeof carried);
             s->clipped = pf_mask_clipped(t, &t->pyramid[t->now].level[0], fine);
             break;
         }

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x0D80508Cu
+#define GOLDEN 0x3E5AB81Eu
 
 void setUp(void) {}
 void tearDown(void) {}

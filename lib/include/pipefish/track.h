@@ -44,9 +44,10 @@ typedef enum pf_track_reason {
 typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
     pf_point_q16 pos; /* in the current frame; last known where lost */
-    /* Q12.20 px^2, saturating: covariance of the position against the track's template. With noise sigma in both
-     * patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of (sum J J^T)^-1, J the
-     * derivatives of the template by position and affine warp with gain and bias eliminated; plus the floor. New
+    /* Q12.20 px^2, saturating, positive definite: covariance of the position against where the track was first seen.
+     * With noise sigma in both patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of
+     * (sum J J^T)^-1, J the derivatives of the template by position and affine warp with gain and bias eliminated;
+     * plus the first term of each template before it; turned by the warp into the picture's axes; plus the floor. New
      * tracks: g = 1. */
     uint32_t cov_xx_q20, cov_yy_q20;
     int32_t cov_xy_q20;
