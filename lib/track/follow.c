@@ -380,6 +380,15 @@ static bool has_warp(const pf_expected *e)
            (e->warp_q16[0] != 65536 || e->warp_q16[1] != 0 || e->warp_q16[2] != 0 || e->warp_q16[3] != 65536);
 }
 
+/* Takes one of the frame's further attempts; false if there are none left. */
+static bool may_try(pf_tracker *t)
+{
+    if (t->extra == 0)
+        return false;
+    t->extra--;
+    return true;
+}
+
 static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
 {
     pf_slot *s = &t->slots[slot];
@@ -395,27 +404,28 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
             return reason;
     }
     reason = attempt(t, track, slot, start[0], top, 0, &reached);
-    if (worth_another(reason) && has_warp(&expected)) {
+    if (worth_another(reason) && has_warp(&expected) && may_try(t)) {
         const pf_track_reason first = reason;
         reason = attempt_warped(t, track, slot, expected.warp_q16, reached);
-        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2))
+        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2) && may_try(t))
             reason = attempt_warped(t, track, slot, expected.warp_q16, expected.at);
         if (reason == PF_TRACK_OK)
             return reason;
         reason = first;
     }
-    for (uint32_t i = 1; i < n && worth_another(reason); i++)
+    for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
     if (!worth_another(reason) || !neighbours_move(t, track->pos, &near))
         return reason;
     for (uint32_t i = 0; i < n; i++)
         if (!farther(near, start[i], SAME_START))
             return reason;
-    return attempt(t, track, slot, near, top, 0, &other);
+    return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
 }
 
 void pf_tracks_follow(pf_tracker *t)
 {
+    t->extra = t->config.max_tracks / 2u;
     for (uint32_t i = 0; i < t->n; i++)
         t->table[i].status = PF_TRACK_NEW; /* not yet found in this frame */
     for (uint32_t i = 0; i < t->n; i++) {

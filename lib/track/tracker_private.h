@@ -48,8 +48,9 @@ struct pf_tracker {
     uint32_t patch_bytes;
     uint16_t *spare; /* free slots */
     uint32_t spare_n;
-    int32_t *head; /* grid: first table row of each cell, -1 = none */
-    int32_t *next; /* grid: next table row in the same cell, by table row */
+    uint32_t extra; /* attempts that may still be made in this frame beyond two a track */
+    int32_t *head;  /* grid: first table row of each cell, -1 = none */
+    int32_t *next;  /* grid: next table row in the same cell, by table row */
     uint32_t grid_w, grid_h;
     pf_corner *found; /* heap of candidates, weakest on top */
     uint32_t found_n;

@@ -130,7 +130,9 @@ typedef enum pf_tracker_stage {
  * `frame` has the configured size and must stay valid and unchanged until the next call of pf_tracker_frame or
  * pf_tracker_reset returns (it is the next frame's reference; nothing is copied).
  * `clock` (may be NULL) is read between stages, nanoseconds; stage_ns[PF_STAGES] (may be NULL) gets the times.
- * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
+ * A track that is not found where it was sought first is sought once more from the top of the pyramid; beyond that
+ * there are max_tracks / 2 further attempts a frame, the oldest tracks' first: at worst 2.5 attempts a track, usually
+ * one. Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
 pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
 
 /* What is expected of a track in the next frame. */
