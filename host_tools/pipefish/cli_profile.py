@@ -13,7 +13,11 @@ from typing import Any
 from pipefish.cli import Result, UsageError, add_command, not_negative, positive, table
 from pipefish.errors import ArgumentError, ProfileError
 
-# The forms of `profile convert --to`: formats.WRITERS, whose import costs time here, and our own two.
+# The forms of --from and --to: formats.READERS and WRITERS, whose import costs time here.
+READ = (
+    *("json", "binary", "opencv-fisheye", "opencv", "opencv-omnidir", "ros", "kalibr", "basalt", "orbslam3", "stella"),
+    *("svo", "adapter", "boofcv", "woodscape", "pyocamcalib", "colmap", "ocam", "toolbox", "mrcal"),
+)
 WRITTEN = ("json", "binary", "opencv-fisheye", "ros", "kalibr", "colmap", "basalt", "orbslam3", "mrcal", "toolbox")
 
 
@@ -125,7 +129,10 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
     from pipefish.files import write_atomically
     from pipefish.formats import write
 
-    loaded, out = load_profile(args), Path(args.out)
+    out = Path(args.out)
+    if out.exists() and Path(args.profile).exists() and out.samefile(args.profile):
+        raise UsageError(f"profile convert: {out} would be written over what it is made from")
+    loaded = load_profile(args)
     camera, fit, notes = loaded.camera, loaded.fit, list(loaded.notes)
     form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
     if form in ("json", "binary"):
@@ -138,7 +145,7 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
     document = {
         "file": str(out),
         "form": form,
-        "bytes": out.stat().st_size,
+        "bytes": out.stat().st_size if out.is_file() else None,
         "read_as": loaded.form,
         "read_fit": fit_document(fit),
         "written_fit": fit_document(written_fit),
@@ -218,7 +225,9 @@ def angles(text: str) -> tuple[float, float, float]:
 def add_profile_input(parser: argparse.ArgumentParser) -> None:
     """Options of everything that reads a profile: how to take another program's file."""
     group = parser.add_argument_group("how to take the profile, or another program's calibration")
-    group.add_argument("--from", metavar="FORMAT", help="what the file is [told by its content]; docs/formats.md")
+    group.add_argument(
+        "--from", choices=READ, metavar="FORMAT", help=f"what the file is [told by its content]: {', '.join(READ)}"
+    )
     group.add_argument("--camera", metavar="NAME", help="which camera, by name or number, of a file of several [first]")
     group.add_argument("--camera-size", type=size_of, metavar="WxH", help="picture size, where the file does not say")
     group.add_argument("--model", choices=("auto", "p6", "p9", "p23", "cpoly"), default="auto", help="to fit [auto]")

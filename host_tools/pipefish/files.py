@@ -10,7 +10,15 @@ from .errors import file_error
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file that is there, on the disk, as a whole or not at all. Raises OSError that names `path`."""
+    """Writes a file that is there, on the disk, as a whole or not at all. A link stays a link, to a new file; what is
+    no file (a device, a pipe) is written into, not replaced. Raises OSError that names `path`."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        try:
+            path.write_bytes(data)
+        except OSError as error:
+            raise file_error(error, path) from error
+        return
+    path = path.resolve() if path.is_symlink() else path
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with open(temporary, "wb") as stream:

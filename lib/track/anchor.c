@@ -8,14 +8,16 @@
 
 #include "track_private.h"
 
-#define SETTLED       1311 /* 0.02 px: the next step would be a tenth of it */
-#define SETTLED_WARP  8000 /* Q16, times half the window: 0.12 px at the window's edge */
+#define SETTLED       1311  /* 0.02 px: the next step would be a tenth of it */
+#define SETTLED_WARP  8000  /* Q16, times half the window: 0.12 px at the window's edge */
+#define NOT_SETTLED   13107 /* a last step above 0.2 px means it still wanders */
 #define STEP_MAX      (2 << 16)
 #define WARP_STEP_MAX (1 << 14)
 /* Added to the unit diagonal, Q20. It changes no fixed point (there the right-hand side is zero); it keeps directions
  * that the texture does not determine where they were, and every entry of the inverse below 2^10. */
 #define RIDGE      1024
 #define RIDGE_WARP 16384
+#define COV_MOST   ((int64_t)1 << 40)
 
 static int32_t magnitude(int32_t v)
 {
@@ -257,6 +259,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
     pf_reference reference;
     take_reference(klt, anchor, pixels, centre, &reference);
+    int32_t moved = 0;
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
@@ -273,36 +276,71 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
         for (int32_t k = 2; k < 6; k++)
             warp = magnitude(d[k]) > warp ? magnitude(d[k]) : warp;
         for (int32_t k = 0; k < 4; k++)
-            if (magnitude(anchor->a[k]) > 4 * 65536)
+            if (magnitude(anchor->a[k]) > WARP_MOST)
                 fit.reason = PF_TRACK_DRIFT;
         if (fit.reason != PF_TRACK_OK)
             return fit;
-        if (magnitude(d[0]) < SETTLED && magnitude(d[1]) < SETTLED && warp * klt->half < SETTLED_WARP)
+        moved = magnitude(d[0]) > magnitude(d[1]) ? magnitude(d[0]) : magnitude(d[1]);
+        if (moved < SETTLED && warp * klt->half < SETTLED_WARP)
             break;
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
     fit.zncc_q15 = pf_zncc(rhs.cov, reference.var, rhs.var);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
+    if (moved > NOT_SETTLED)
+        fit.reason = PF_TRACK_DIVERGED;
     return fit;
+}
+
+/* Entry (i, j) of the template's covariance times `factor_q8` (below 2^15), Q20 px^2, to nearest. */
+static int64_t template_covariance(const pf_anchor *anchor, int32_t i, int32_t j, uint32_t noise_q8, int64_t factor_q8)
+{
+    int64_t m = inverse_at(anchor, i, j) * ((int64_t)noise_q8 * noise_q8);
+    int32_t shift = 18 + anchor->scale[i] + anchor->scale[j];
+    while (m >= (int64_t)1 << 46 || m <= -((int64_t)1 << 46)) { /* 2^58 at most; the factor needs its room */
+        m /= 2;
+        shift--;
+    }
+    m = (m * factor_q8 + ((int64_t)1 << (shift - 1))) >> shift;
+    return m > COV_MOST ? COV_MOST : m < -COV_MOST ? -COV_MOST : m;
+}
+
+/* r C s for rows r, s of a warp and C (xx, xy, yy), to nearest. */
+static int64_t turned(const int32_t r[2], const int32_t s[2], const int64_t cov[3])
+{
+    const int64_t x = (cov[0] * s[0] + cov[1] * s[1] + 32768) >> 16, y = (cov[1] * s[0] + cov[2] * s[1] + 32768) >> 16;
+    return (r[0] * x + r[1] * y + 32768) >> 16;
+}
+
+/* What is carried and what the fit adds at `factor_q8`, in the picture's axes: xx, xy, yy. */
+static void whole_covariance(const pf_anchor *anchor, uint32_t noise_q8, int64_t factor_q8, int64_t out[3])
+{
+    const int32_t *x = anchor->a, *y = anchor->a + 2;
+    const int64_t cov[3] = {anchor->carried[0] + template_covariance(anchor, 0, 0, noise_q8, factor_q8),
+                            anchor->carried[1] + template_covariance(anchor, 1, 0, noise_q8, factor_q8),
+                            anchor->carried[2] + template_covariance(anchor, 1, 1, noise_q8, factor_q8)};
+    out[0] = turned(x, x, cov);
+    out[1] = turned(x, y, cov);
+    out[2] = turned(y, y, cov);
+}
+
+void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried[3])
+{
+    whole_covariance(anchor, noise_q8, 256, carried);
+    for (int32_t i = 0; i < 3; i++)
+        carried[i] = carried[i] > COV_MOST ? COV_MOST : carried[i] < -COV_MOST ? -COV_MOST : carried[i];
 }
 
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track)
 {
-    static const uint8_t row[3] = {0, 1, 0}, col[3] = {0, 1, 1};
     const int64_t gain2 = ((int64_t)gain_q14 * gain_q14) >> 14; /* Q14 */
-    const int64_t factor_q8 = 256 + ((int64_t)256 << 14) / gain2;
     int64_t cov[3];
-    for (int32_t i = 0; i < 3; i++) {
-        const int64_t m = inverse_at(anchor, row[i], col[i]);
-        const int32_t shift = 10 + anchor->scale[row[i]] + anchor->scale[col[i]];
-        const int64_t v = (m * ((int64_t)noise_q8 * noise_q8)) >> shift;
-        cov[i] = v > (int64_t)1 << 40 ? (int64_t)1 << 40 : v < -((int64_t)1 << 40) ? -((int64_t)1 << 40) : v;
-        cov[i] = (cov[i] * factor_q8) >> 8;
-    }
-    cov[0] += PF_TRACK_COV_FLOOR_Q20;
-    cov[1] += PF_TRACK_COV_FLOOR_Q20;
-    track->cov_xx_q20 = cov[0] > UINT32_MAX ? UINT32_MAX : (uint32_t)cov[0];
-    track->cov_yy_q20 = cov[1] > UINT32_MAX ? UINT32_MAX : (uint32_t)cov[1];
-    track->cov_xy_q20 = pf_clamp_i64(cov[2], INT32_MAX);
+    whole_covariance(anchor, noise_q8, 256 + ((int64_t)256 << 14) / gain2, cov);
+    const int64_t xx = cov[0] + PF_TRACK_COV_FLOOR_Q20, xy = cov[1], yy = cov[2] + PF_TRACK_COV_FLOOR_Q20;
+    track->cov_xx_q20 = xx > UINT32_MAX ? UINT32_MAX : (uint32_t)xx;
+    track->cov_yy_q20 = yy > UINT32_MAX ? UINT32_MAX : (uint32_t)yy;
+    /* rounding and saturation must not make it indefinite */
+    const uint32_t most = pf_isqrt64((uint64_t)track->cov_xx_q20 * track->cov_yy_q20) - 1u;
+    track->cov_xy_q20 = pf_clamp_i64(xy, most > INT32_MAX ? INT32_MAX : (int32_t)most);
 }

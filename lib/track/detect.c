@@ -53,6 +53,15 @@ static bool corner_allowed(const void *context, int32_t x, int32_t y)
     return place_allowed(context, (pf_point_q16){x * 65536, y * 65536});
 }
 
+uint32_t pf_sector_of(int64_t dx, int64_t dy)
+{
+    /* turned into the first quadrant; tan 30 = 0.577, tan 60 = 1.732 */
+    const uint32_t quadrant = dy < 0 ? (dx < 0 ? 2u : 3u) : dx < 0 ? 1u : 0u;
+    const int64_t ax = dx < 0 ? -dx : dx, ay = dy < 0 ? -dy : dy;
+    const int64_t along = quadrant % 2u ? ay : ax, across = quadrant % 2u ? ax : ay;
+    return quadrant * 3u + (1000 * across < 577 * along ? 0u : 1000 * across < 1732 * along ? 1u : 2u);
+}
+
 /* The polar cell of a point; -1 in the circle's inner part. */
 static int32_t bin_of(const pf_tracker *t, pf_point_q16 at)
 {
@@ -63,19 +72,15 @@ static int32_t bin_of(const pf_tracker *t, pf_point_q16 at)
         return -1;
     while (ring < RINGS - 1u && RINGS * RINGS * square >= (int64_t)((ring + 1u) * (ring + 1u)) * r * r)
         ring++;
-    /* turned into the first quadrant; tan 30 = 0.577, tan 60 = 1.732 */
-    const uint32_t quadrant = dy < 0 ? (dx < 0 ? 2u : 3u) : dx < 0 ? 1u : 0u;
-    const int64_t ax = dx < 0 ? -dx : dx, ay = dy < 0 ? -dy : dy;
-    const int64_t along = quadrant % 2u ? ay : ax, across = quadrant % 2u ? ax : ay;
-    const uint32_t third = 1000 * across < 577 * along ? 0u : 1000 * across < 1732 * along ? 1u : 2u;
-    return (int32_t)(ring * SECTORS + quadrant * 3u + third);
+    return (int32_t)(ring * SECTORS + pf_sector_of(dx, dy));
 }
 
-/* Whether a candidate may become a track: not in the glare, and with room in its polar cell, where it takes a place. */
+/* Whether a candidate may become a track: neither in the glare nor in the dark, and with room in its polar cell, where
+ * it takes a place. */
 static bool take_place(pf_tracker *t, pf_point_q16 at)
 {
     const uint32_t most = (3u * t->config.max_tracks + 2u * SECTORS * RINGS - 1u) / (2u * SECTORS * RINGS);
-    if (pf_mask_saturated(t, &t->pyramid[t->now].level[0], at, t->config.window * t->config.window / SATURATED))
+    if (CLIPPED * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
         return false;
     if (!t->config.polar)
         return true;
@@ -97,9 +102,11 @@ static void add_track(pf_tracker *t, pf_point_q16 at)
     s->expected.at.x = PF_NO_GUESS;
     s->sure = false;
     s->from = at;
+    s->clipped = pf_mask_clipped(t, image, at);
     t->slot_of[row] = slot;
     t->table[row] = (pf_track){.id = ++t->last_id, .pos = at, .status = PF_TRACK_NEW, .reason = PF_TRACK_OK};
     pf_anchor_take(&t->klt, image, t->table[row].pos, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);
+    s->anchor.carried[0] = s->anchor.carried[1] = s->anchor.carried[2] = 0;
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, GAIN_ONE, &t->table[row]);
     pf_grid_insert(t, row);
     t->stats.detected++;

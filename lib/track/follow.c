@@ -1,4 +1,6 @@
 /* Live tracks in a new frame: where to look, what to believe. */
+#include <string.h>
+
 #include "tracker_private.h"
 
 /* A template is renewed when its warp has moved this far from identity: the affine model then leaves, at the edge of a
@@ -7,7 +9,6 @@
 #define PULL_MAX     (3 << 16) /* the template may move a track by 3 px from where half resolution put it */
 #define DRIFT_SLACK  3277      /* the template may look 0.1 less similar than the previous patch */
 #define CERTAIN      (2 << 16) /* a track found this near its start is next sought from half resolution on */
-#define GUESS_MARGIN (64 << 16)
 #define GUESS_MOST   (4096 << 16)
 #define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
 #define WARPED_APART 49152     /* 3/4 px: the two starts of a warped template differ by 1.7 px */
@@ -16,9 +17,12 @@
 #define COARSE_HALF  5
 #define MARGIN       1638      /* 0.05 of similarity */
 #define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
+#define NEAR_LEAST   5u        /* of those within 45 degrees */
+#define NEAR_PART    16        /* a sector at less than this part of its ring's pace does not count */
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
+#define CLIP_CHANGE  20u /* a twentieth of the window: with it the worst is at 5 sigma */
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
 {
@@ -59,10 +63,10 @@ static bool farther(pf_point_q16 a, pf_point_q16 b, int64_t reach)
     return dx * dx + dy * dy > reach * reach;
 }
 
-static int32_t clamp_guess(int64_t v, uint32_t size)
+int32_t pf_guess_clamp(int64_t v, uint32_t size)
 {
-    const int64_t most = ((int64_t)size << 16) + GUESS_MARGIN;
-    return (int32_t)(v < -GUESS_MARGIN ? -GUESS_MARGIN : v > most ? most : v);
+    const int64_t margin = 64 << 16, most = ((int64_t)size << 16) + margin;
+    return (int32_t)(v < -margin ? -margin : v > most ? most : v);
 }
 
 /* --- where to look ----------------------------------------------------------------------------------------------- */
@@ -120,8 +124,8 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
         return n;
     int32_t like[STARTS];
     for (uint32_t i = 0; i < n; i++) {
-        const pf_point_q16 to = {clamp_guess((int64_t)at.x + start[i].x, t->config.width),
-                                 clamp_guess((int64_t)at.y + start[i].y, t->config.height)};
+        const pf_point_q16 to = {pf_guess_clamp((int64_t)at.x + start[i].x, t->config.width),
+                                 pf_guess_clamp((int64_t)at.y + start[i].y, t->config.height)};
         like[i] = coarse_likeness(t, at, to) - (int32_t)i * MARGIN;
     }
     for (uint32_t i = 1; i < n; i++)
@@ -136,8 +140,18 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
     return n;
 }
 
-/* What a track must pass wherever it was found: `fit` of its template in the new frame at `fine`. */
-static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_q16 fine, int32_t least_q15)
+/* Whether too much of a window is clipped, or much more or less than of its template: what is clipped in one of them
+ * only has a shape of its own, and pulls by up to half a pixel. */
+static bool is_clipped(const pf_tracker *t, uint32_t now, uint32_t before)
+{
+    const uint32_t area = t->config.window * t->config.window, change = now > before ? now - before : before - now;
+    return CLIPPED * now > area || CLIP_CHANGE * change > area;
+}
+
+/* What a track must pass wherever it was found: `fit` of its template, `clipped` pixels of it clipped, in the new frame
+ * at `fine`. */
+static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_q16 fine, int32_t least_q15,
+                               uint32_t clipped)
 {
     const pf_image *image = &t->pyramid[t->now].level[0];
     if (fit->reason != PF_TRACK_OK)
@@ -148,7 +162,7 @@ static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_
         return PF_TRACK_LEFT;
     if (!pf_mask_allows(t, fine))
         return PF_TRACK_MASKED;
-    if (pf_mask_saturated(t, image, fine, t->config.window * t->config.window / SATURATED))
+    if (is_clipped(t, pf_mask_clipped(t, image, fine), clipped))
         return PF_TRACK_SATURATED;
     if (pf_grid_near(t, fine, (int64_t)t->config.cell << 14))
         return PF_TRACK_CROWDED;
@@ -167,8 +181,12 @@ static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 f
     for (int32_t k = 0; k < 4; k++) {
         const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
         if (d > RENEW || d < -RENEW) {
+            int64_t carried[3];
+            pf_anchor_carry(&s->anchor, t->config.noise_q8, carried);
             pf_anchor_take(&t->klt, &t->pyramid[t->now].level[0], fine, &s->anchor,
                            t->pixels + (size_t)slot * t->patch_bytes);
+            memcpy(s->anchor.carried, carried, sizeof carried);
+            s->clipped = pf_mask_clipped(t, &t->pyramid[t->now].level[0], fine);
             break;
         }
     }
@@ -182,8 +200,8 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
 {
     const pf_pyramid *from = &t->pyramid[1u - t->now], *to = &t->pyramid[t->now];
     const pf_point_q16 old = track->pos;
-    const pf_point_q16 guess = {clamp_guess((int64_t)old.x + move.x, t->config.width),
-                                clamp_guess((int64_t)old.y + move.y, t->config.height)};
+    const pf_point_q16 guess = {pf_guess_clamp((int64_t)old.x + move.x, t->config.width),
+                                pf_guess_clamp((int64_t)old.y + move.y, t->config.height)};
     pf_point_q16 at = guess;
     const pf_fit coarse = pf_klt_track(&t->klt, from, to, old, &at, top, last);
     *reached = at;
@@ -207,7 +225,7 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
     if (reason == PF_TRACK_OK && farther(fine, at, PULL_MAX))
         reason = PF_TRACK_DRIFT;
     if (reason == PF_TRACK_OK)
-        reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK);
+        reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK, s->clipped);
     if (reason == PF_TRACK_OK) {
         s->sure = !farther(fine, guess, CERTAIN);
         accept(t, track, slot, fine, &anchored, fit.zncc_q15);
@@ -226,7 +244,7 @@ static pf_fit fit_warped(pf_tracker *t, uint16_t slot, const pf_anchor *before, 
     for (int32_t i = 0; i < 2; i++)
         for (int32_t j = 0; j < 2; j++)
             a->a[2 * i + j] = pf_clamp_i64(
-                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, 4 << 16);
+                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, WARP_MOST);
     return pf_anchor_fit(&t->klt, &t->pyramid[t->now].level[0], a, t->pixels + (size_t)slot * t->patch_bytes, start);
 }
 
@@ -243,7 +261,7 @@ static pf_track_reason attempt_warped(pf_tracker *t, pf_track *track, uint16_t s
     pf_track_reason reason = first.reason;
     if (reason == PF_TRACK_OK) {
         const pf_fit second = fit_warped(t, slot, &saved, warp, &two);
-        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15);
+        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15, t->slots[slot].clipped);
         if (reason == PF_TRACK_OK && farther(one, two, t->config.fb_q16))
             reason = PF_TRACK_DIVERGED;
         if (reason == PF_TRACK_OK) {
@@ -265,28 +283,43 @@ pf_point_q16 pf_flow_centre(const pf_tracker *t)
     return (pf_point_q16){(int32_t)(t->config.width << 15), (int32_t)(t->config.height << 15)};
 }
 
-/* Length along its radius of a track's last move, outward positive, Q16 px; and the ring that it is in. */
-static int32_t radial_move(const pf_tracker *t, uint32_t row, uint32_t *ring)
+/* Length along its radius of a track's last move, outward positive, Q16 px; and the polar cell that it is in. */
+static int32_t radial_move(const pf_tracker *t, uint32_t row, uint32_t *cell)
 {
     const pf_point_q16 centre = pf_flow_centre(t), p = t->table[row].pos, move = t->slots[t->slot_of[row]].move;
     const int64_t x = ((int64_t)p.x - centre.x) >> 8, y = ((int64_t)p.y - centre.y) >> 8;
     const int64_t r = pf_isqrt64((uint64_t)(x * x + y * y)) + 1u; /* Q8 */
     const uint32_t side = t->config.width < t->config.height ? t->config.width : t->config.height;
     const int64_t reach = t->config.circle_radius_q16 ? t->config.circle_radius_q16 >> 8 : (int64_t)side << 7;
-    *ring = r * RINGS < reach * RINGS ? (uint32_t)(r * RINGS / reach) : RINGS - 1u;
+    *cell = (r < reach ? (uint32_t)(r * RINGS / reach) : RINGS - 1u) * SECTORS + pf_sector_of(x, y);
     return (int32_t)((x * move.x + y * move.y) / r);
 }
 
-/* The median radial move of each ring's tracks: in a tube it hardly depends on the azimuth. Too few: 0. */
-static void measure_flow(pf_tracker *t, int32_t flow[RINGS])
+/* The median radial move of the tracks in a ring, within `reach` sectors of `sector`; 0 with fewer than `least`. */
+static int32_t median_flow(const pf_tracker *t, uint32_t ring, uint32_t sector, uint32_t reach, uint32_t least)
+{
+    uint32_t n = 0;
+    for (uint32_t i = 0; i < t->n; i++) {
+        const uint32_t apart = (t->cell_of[i] % SECTORS + SECTORS - sector) % SECTORS;
+        if (t->table[i].status == PF_TRACK_TRACKED && t->cell_of[i] / SECTORS == ring &&
+            (apart <= reach || apart >= SECTORS - reach))
+            t->value[n++] = (uint32_t)((int64_t)t->radial[i] + ((int64_t)1 << 31));
+    }
+    return n < least ? 0 : (int32_t)((int64_t)pf_value_of_rank(t->value, n, n / 2u) - ((int64_t)1 << 31));
+}
+
+/* What tracks in each polar cell should move by along the radius: the median of the ring within 45 degrees. On the
+ * tube's axis the azimuth would not matter; low above the invert the crown moves at an eighth of the invert's pace.
+ * Where too few tracks are near, or they hardly move (dirt may fill a sector), the whole ring's. */
+static void measure_flow(const pf_tracker *t, int32_t flow[RINGS * SECTORS])
 {
     for (uint32_t ring = 0; ring < RINGS; ring++) {
-        uint32_t n = 0;
-        for (uint32_t i = 0; i < t->n; i++)
-            if (t->table[i].status == PF_TRACK_TRACKED && t->ring_of[i] == ring)
-                t->value[n++] = (uint32_t)((int64_t)t->radial[i] + ((int64_t)1 << 31));
-        flow[ring] =
-            n < FLOW_LEAST ? 0 : (int32_t)((int64_t)pf_value_of_rank(t->value, n, n / 2u) - ((int64_t)1 << 31));
+        const int32_t whole = median_flow(t, ring, 0, SECTORS, FLOW_LEAST);
+        for (uint32_t sector = 0; sector < SECTORS; sector++) {
+            const int32_t near = median_flow(t, ring, sector, 1, NEAR_LEAST);
+            const int64_t size = near < 0 ? -(int64_t)near : near, most = whole < 0 ? -(int64_t)whole : whole;
+            flow[ring * SECTORS + sector] = NEAR_PART * size > most ? near : whole;
+        }
     }
 }
 
@@ -296,7 +329,7 @@ static int32_t forget_and_add(int32_t sum, int32_t more)
     return pf_clamp_i64((int64_t)sum - sum / 8 + more, 1 << 24);
 }
 
-/* Whether the track has stood still, or nearly, while its ring has moved on. */
+/* Whether the track has stood still, or nearly, while those around it have moved on. */
 static bool stands_still(pf_slot *s, int32_t radial, int32_t flow)
 {
     s->own = (pf_point_q16){forget_and_add(s->own.x, s->move.x), forget_and_add(s->own.y, s->move.y)};
@@ -319,14 +352,14 @@ static void lose(pf_tracker *t, uint32_t row, pf_track_reason reason)
 /* Tracks that stick to something that goes with the camera are lost; what they stick to is masked. */
 static void drop_stuck(pf_tracker *t)
 {
-    int32_t flow[RINGS];
+    int32_t flow[RINGS * SECTORS];
     for (uint32_t i = 0; i < t->n; i++)
         if (t->table[i].status == PF_TRACK_TRACKED)
-            t->radial[i] = radial_move(t, i, &t->ring_of[i]);
+            t->radial[i] = radial_move(t, i, &t->cell_of[i]);
     measure_flow(t, flow);
     for (uint32_t i = 0; i < t->n; i++)
         if (t->table[i].status == PF_TRACK_TRACKED &&
-            stands_still(&t->slots[t->slot_of[i]], t->radial[i], flow[t->ring_of[i]])) {
+            stands_still(&t->slots[t->slot_of[i]], t->radial[i], flow[t->cell_of[i]])) {
             lose(t, i, PF_TRACK_STATIC);
             pf_mask_condemn(t, t->table[i].pos);
             t->stats.tracked--;
@@ -347,6 +380,15 @@ static bool has_warp(const pf_expected *e)
            (e->warp_q16[0] != 65536 || e->warp_q16[1] != 0 || e->warp_q16[2] != 0 || e->warp_q16[3] != 65536);
 }
 
+/* Takes one of the frame's further attempts; false if there are none left. */
+static bool may_try(pf_tracker *t)
+{
+    if (t->extra == 0)
+        return false;
+    t->extra--;
+    return true;
+}
+
 static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
 {
     pf_slot *s = &t->slots[slot];
@@ -362,27 +404,28 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
             return reason;
     }
     reason = attempt(t, track, slot, start[0], top, 0, &reached);
-    if (worth_another(reason) && has_warp(&expected)) {
+    if (worth_another(reason) && has_warp(&expected) && may_try(t)) {
         const pf_track_reason first = reason;
         reason = attempt_warped(t, track, slot, expected.warp_q16, reached);
-        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2))
+        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2) && may_try(t))
             reason = attempt_warped(t, track, slot, expected.warp_q16, expected.at);
         if (reason == PF_TRACK_OK)
             return reason;
         reason = first;
     }
-    for (uint32_t i = 1; i < n && worth_another(reason); i++)
+    for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
     if (!worth_another(reason) || !neighbours_move(t, track->pos, &near))
         return reason;
     for (uint32_t i = 0; i < n; i++)
         if (!farther(near, start[i], SAME_START))
             return reason;
-    return attempt(t, track, slot, near, top, 0, &other);
+    return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
 }
 
 void pf_tracks_follow(pf_tracker *t)
 {
+    t->extra = t->config.max_tracks / 2u;
     for (uint32_t i = 0; i < t->n; i++)
         t->table[i].status = PF_TRACK_NEW; /* not yet found in this frame */
     for (uint32_t i = 0; i < t->n; i++) {

@@ -11,9 +11,15 @@
 #define UNSEEN       UINT16_MAX
 #define STILL_Q6     96 /* 1.5 grey: noise of sigma 2 leaves 0.5 at this level */
 #define MOVES_Q6     192
-#define CONTRAST     10 /* grey levels within the block: less than this is no corner */
-#define SENTENCE     40 /* lessons for which a block where a track got stuck stays closed, whatever its own pixel does */
-#define BRIGHT       250
+/* Where a wall goes by, its pixel deviates by about a fifth of the block's range: weakly textured ones are known by
+ * that, with a margin either way. */
+#define STILL_PART  8
+#define MOVES_PART  6
+#define CONTRAST_Q6 (8 * 64) /* range of the block about its plane: less is no corner; less than half, bare ground */
+#define MOST_STATIC 3u       /* no more is learned once a third of the picture is masked: it would be no picture */
+#define SENTENCE    40 /* lessons for which a block where a track got stuck stays closed, whatever its own pixel does */
+#define BRIGHT      250 /* from here on, and */
+#define BLACK       2   /* down from here, a pixel is clipped, or its noise is */
 
 /* New tracks keep a block's distance from static ones: a window reaches further than the pixel it is centred on. */
 static void close_blocks(pf_tracker *t)
@@ -52,6 +58,9 @@ void pf_mask_init(pf_tracker *t, const pf_image *mask)
         for (uint32_t x = 0; x < mask->width; x++)
             if (mask->data[(size_t)y * mask->stride + x] == 0)
                 t->block[y / BLOCK * t->block_w + x / BLOCK].is_masked = 1;
+    t->usable_blocks = 0;
+    for (uint32_t i = 0; i < t->block_w * t->block_h; i++)
+        t->usable_blocks += !t->block[i].is_outside;
     close_blocks(t);
 }
 
@@ -81,21 +90,31 @@ void pf_mask_condemn(pf_tracker *t, pf_point_q16 at)
     t->is_mask_stale = true;
 }
 
-/* Largest difference among the block's pixels at level 1. */
-static uint32_t contrast(const pf_image *image, uint32_t x, uint32_t y, uint32_t side)
+/* Range of the block's pixels at level 1 about their best plane, Q6 grey: the lamp's light slides over a bare wall, and
+ * that is nothing to hold on to. */
+static int32_t contrast(const pf_image *image, uint32_t x, uint32_t y, uint32_t side)
 {
-    uint8_t low = 255, high = 0;
-    for (uint32_t j = y; j < y + side && j < image->height; j++)
-        for (uint32_t i = x; i < x + side && i < image->width; i++) {
-            const uint8_t v = image->data[(size_t)j * image->stride + i];
-            low = v < low ? v : low;
-            high = v > high ? v : high;
-        }
-    return high > low ? (uint32_t)(high - low) : 0u;
+    const int32_t n = (int32_t)(side * side), most = (int32_t)side - 1; /* coordinates: -most .. most, by 2 */
+    const int32_t xx = n * ((int32_t)side * (int32_t)side - 1) / 3;
+    int32_t v[BLOCK * BLOCK], sum = 0, sx = 0, sy = 0, low = INT32_MAX, high = INT32_MIN;
+    for (int32_t i = 0; i < n; i++) {
+        const uint32_t px = x + (uint32_t)i % side, py = y + (uint32_t)i / side;
+        const int32_t u = 2 * (i % (int32_t)side) - most, w = 2 * (i / (int32_t)side) - most;
+        v[i] = image->data[(size_t)(py < image->height ? py : image->height - 1u) * image->stride +
+                           (px < image->width ? px : image->width - 1u)];
+        sum += v[i], sx += v[i] * u, sy += v[i] * w;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        const int32_t u = 2 * (i % (int32_t)side) - most, w = 2 * (i / (int32_t)side) - most;
+        const int32_t off = 64 * v[i] - 64 * sum / n - (64 * sx * u + 64 * sy * w) / xx;
+        low = off < low ? off : low;
+        high = off > high ? off : high;
+    }
+    return high - low;
 }
 
-/* True if the block has become static, or ceased to be. */
-static bool learn_block(pf_block *b, const pf_image *image, uint32_t x, uint32_t y, uint32_t side)
+/* True if the block has become static (if it `may`), or ceased to be. */
+static bool learn_block(pf_block *b, const pf_image *image, uint32_t x, uint32_t y, uint32_t side, bool may)
 {
     const uint32_t px = x + side / 2u < image->width ? x + side / 2u : image->width - 1u;
     const uint32_t py = y + side / 2u < image->height ? y + side / 2u : image->height - 1u;
@@ -107,10 +126,21 @@ static bool learn_block(pf_block *b, const pf_image *image, uint32_t x, uint32_t
         b->sentence--;
         return false;
     }
-    if (b->is_static ? b->deviation_q6 <= MOVES_Q6
-                     : b->deviation_q6 >= STILL_Q6 || contrast(image, x, y, side) < CONTRAST)
+    const int32_t range = contrast(image, x, y, side);
+    const bool is_still = b->deviation_q6 < STILL_Q6 && STILL_PART * b->deviation_q6 < range && range >= CONTRAST_Q6;
+    const bool moves = b->deviation_q6 > MOVES_Q6 || MOVES_PART * b->deviation_q6 > range || 2 * range < CONTRAST_Q6;
+    if (b->is_static ? !moves : !is_still || !may)
         return false;
     b->is_static ^= 1u;
+    return true;
+}
+
+/* Where nothing is learned only a sentence closes a block, and its end opens it. */
+static bool serve_outside(pf_block *b)
+{
+    if (!b->is_static || --b->sentence > 0)
+        return false;
+    b->is_static = 0;
     return true;
 }
 
@@ -125,8 +155,10 @@ void pf_mask_learn(pf_tracker *t)
         t->travel_q16 = 0;
         for (uint32_t y = t->slice; y < t->block_h; y += SLICES)
             for (uint32_t x = 0; x < t->block_w; x++)
-                t->is_mask_stale |= !t->block[y * t->block_w + x].is_outside &&
-                                    learn_block(&t->block[y * t->block_w + x], image, x * side, y * side, side);
+                t->is_mask_stale |= t->block[y * t->block_w + x].is_outside
+                                        ? serve_outside(&t->block[y * t->block_w + x])
+                                        : learn_block(&t->block[y * t->block_w + x], image, x * side, y * side, side,
+                                                      MOST_STATIC * t->static_blocks < t->usable_blocks);
         t->slice = (t->slice + 1u) % SLICES;
     }
     if (t->is_mask_stale)
@@ -134,16 +166,16 @@ void pf_mask_learn(pf_tracker *t)
     t->stats.scene.static_blocks = t->static_blocks;
 }
 
-bool pf_mask_saturated(const pf_tracker *t, const pf_image *image, pf_point_q16 at, uint32_t most)
+uint32_t pf_mask_clipped(const pf_tracker *t, const pf_image *image, pf_point_q16 at)
 {
     const int32_t half = t->klt.half, x = (at.x >> 16) - half, y = (at.y >> 16) - half;
     uint32_t count = 0;
     if (x < 0 || y < 0 || x + t->klt.window > (int32_t)image->width || y + t->klt.window > (int32_t)image->height)
-        return false;
+        return 0;
     for (int32_t j = 0; j < t->klt.window; j++) {
         const uint8_t *row = image->data + (size_t)(y + j) * image->stride + (size_t)x;
         for (int32_t i = 0; i < t->klt.window; i++)
-            count += row[i] >= BRIGHT;
+            count += row[i] >= BRIGHT || row[i] <= BLACK;
     }
-    return count > most;
+    return count;
 }

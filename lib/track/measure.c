@@ -16,7 +16,7 @@ static void lit_span(const pf_tracker *t, const pf_image *image, uint32_t level,
     *last = (int64_t)image->width - 2;
     if (!t->config.circle_radius_q16)
         return;
-    const int64_t r = (t->config.circle_radius_q16 >> level >> 16) - 2;
+    const int64_t r = (int64_t)(t->config.circle_radius_q16 >> level >> 16) - 2;
     const int64_t dy = y - (t->config.circle.y >> level >> 16), cx = t->config.circle.x >> level >> 16;
     const int64_t room = r * r - dy * dy;
     if (r <= 0 || room < 0) {

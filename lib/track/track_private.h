@@ -11,10 +11,11 @@
 #include "pipefish/image.h"
 #include "pipefish/track.h"
 
-#define EDGE_ROW 48             /* row stride of a copy at the image's edge: 5 groups and a pixel */
-#define GAIN_ONE 16384          /* gains are Q14 */
-#define GAIN_MIN (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
-#define GAIN_MAX (GAIN_ONE * 8)
+#define EDGE_ROW  48             /* row stride of a copy at the image's edge: 5 groups and a pixel */
+#define GAIN_ONE  16384          /* gains are Q14 */
+#define GAIN_MIN  (GAIN_ONE / 8) /* outside [1/8, 8] two patches are not the same thing in another light */
+#define GAIN_MAX  (GAIN_ONE * 8)
+#define WARP_MOST (4 << 16) /* no entry of a warp is larger */
 
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {
@@ -49,6 +50,7 @@ typedef struct pf_anchor {
     int32_t inverse[21]; /* Q12.20, of the scaled 6x6 normal matrix, lower triangle; order dx dy, the warp by rows */
     int32_t scale[6];    /* log2 of each parameter's scale */
     int32_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
+    int64_t carried[3];  /* covariance (xx, xy, yy) with which it was put there, Q20 px^2: zero at first sight */
 } pf_anchor;
 
 uint32_t pf_isqrt64(uint64_t n);
@@ -92,7 +94,12 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
  * updates both. */
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at);
 
-/* Variance of the position against the template; gain as the fit gave it. Fills the three fields of `track`. */
+/* What a template taken where this one was last fitted carries: what this one does and the noise of its own picture.
+ * That of the picture in which they meet is in the new one's; it would count twice. */
+void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried[3]);
+
+/* Covariance of the position, what the template carries included, along the picture's axes; gain as the fit gave it.
+ * Fills the three fields of `track`. */
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
 
 /* --- bearings (rotation.c) --- */

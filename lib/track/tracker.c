@@ -46,8 +46,10 @@ static bool resolve(const pf_tracker_config *in, pf_tracker_config *out)
         !within(out->max_tracks, 8, PF_TRACKS_MAX) || !within(out->levels, 1, PF_PYRAMID_LEVELS_MAX) ||
         !within(out->window, 7, WINDOW_MAX) || out->window % 2u == 0 || !within(out->iterations, 1, 30) ||
         out->min_eigen > 16384u || out->fb_q16 > 16u << 16 || out->min_zncc_q15 > 32767u || out->noise_q8 > 64u << 8 ||
-        out->circle_radius_q16 > 16384u << 16 || out->circle.x > reach || out->circle.x < -reach ||
-        out->circle.y > reach || out->circle.y < -reach || (out->polar && !out->circle_radius_q16) ||
+        out->circle_radius_q16 > 16384u << 16 ||
+        (out->circle_radius_q16 && out->circle_radius_q16 < out->window << 16) || out->circle.x > reach ||
+        out->circle.x < -reach || out->circle.y > reach || out->circle.y < -reach ||
+        (out->polar && !out->circle_radius_q16) ||
         (out->mask && (!out->mask->data || out->mask->width != out->width || out->mask->height != out->height ||
                        out->mask->stride < out->width)))
         return false;
@@ -82,7 +84,7 @@ static size_t lay_out(const pf_tracker_config *c, uint8_t *base, pf_tracker *t)
     (void)carve(base, &used, sizeof *t);
     PLACE(table, 2u * tracks);
     PLACE(slot_of, 2u * tracks);
-    PLACE(ring_of, 2u * tracks);
+    PLACE(cell_of, 2u * tracks);
     PLACE(radial, 2u * tracks);
     PLACE(slots, tracks);
     PLACE(pixels, (size_t)tracks * patch_bytes);
@@ -192,9 +194,18 @@ pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, ui
 {
     if (!tracker || n != tracker->n || (n && !expected))
         return PF_ERR_ARGUMENT;
-    for (uint32_t i = 0; i < n; i++)
-        if (tracker->table[i].status != PF_TRACK_LOST)
-            tracker->slots[tracker->slot_of[i]].expected = expected[i];
+    for (uint32_t i = 0; i < n; i++) {
+        if (tracker->table[i].status == PF_TRACK_LOST)
+            continue;
+        pf_expected *e = &tracker->slots[tracker->slot_of[i]].expected;
+        *e = expected[i];
+        if (e->at.x == PF_NO_GUESS)
+            continue;
+        e->at.x = pf_guess_clamp(e->at.x, tracker->config.width);
+        e->at.y = pf_guess_clamp(e->at.y, tracker->config.height);
+        for (uint32_t k = 0; k < 4u; k++)
+            e->warp_q16[k] = pf_clamp_i64(e->warp_q16[k], WARP_MOST);
+    }
     return PF_OK;
 }
 

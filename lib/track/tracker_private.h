@@ -9,15 +9,16 @@
 #define SECTORS    12u /* detection in polar cells: sectors of 30 degrees */
 #define RINGS      6u
 #define CANDIDATES 4u /* for corners, times the tracks there may be: most stand too near a stronger one */
-#define SATURATED  4u /* at most this fraction of a window may be saturated */
+#define CLIPPED    4u /* at most this fraction of a window may be clipped */
 
 typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */
     bool sure;            /* which its start met within CERTAIN */
     pf_point_q16 own;     /* its moves summed with forgetting; */
-    int32_t radial, flow; /* what of them is radial, and the same of its ring: see follow.c */
+    int32_t radial, flow; /* what of them is radial, and the same of those around: see follow.c */
     pf_expected expected; /* by the caller, of the next frame */
     pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
+    uint32_t clipped;     /* pixels of its template's window */
     pf_anchor anchor;
 } pf_slot;
 
@@ -39,7 +40,7 @@ struct pf_tracker {
     uint64_t last_id;
     pf_track *table;
     uint16_t *slot_of; /* of each live row of the table */
-    uint32_t *ring_of; /* scratch: ring and radial move of each row */
+    uint32_t *cell_of; /* scratch: polar cell (ring * SECTORS + sector) and radial move of each row */
     int32_t *radial;
     uint32_t n;
     pf_slot *slots;
@@ -47,14 +48,16 @@ struct pf_tracker {
     uint32_t patch_bytes;
     uint16_t *spare; /* free slots */
     uint32_t spare_n;
-    int32_t *head; /* grid: first table row of each cell, -1 = none */
-    int32_t *next; /* grid: next table row in the same cell, by table row */
+    uint32_t extra; /* attempts that may still be made in this frame beyond two a track */
+    int32_t *head;  /* grid: first table row of each cell, -1 = none */
+    int32_t *next;  /* grid: next table row in the same cell, by table row */
     uint32_t grid_w, grid_h;
     pf_corner *found; /* heap of candidates, weakest on top */
     uint32_t found_n;
     uint32_t *value; /* scratch for medians, a number a track */
     pf_block *block;
     uint32_t block_w, block_h, static_blocks;
+    uint32_t usable_blocks;        /* not outside */
     bool is_mask_stale;            /* blocks have become static, or ceased to be, since is_closed was worked out */
     uint32_t slice;                /* every SLICES-th row of blocks learns at a time: which ones next */
     uint32_t travel_q16;           /* median motion since the last lesson */
@@ -77,12 +80,18 @@ bool pf_grid_near(const pf_tracker *t, pf_point_q16 at, int64_t reach);
 /* Finds every live track in the new frame, or loses it. */
 void pf_tracks_follow(pf_tracker *t);
 
+/* A coordinate of a start, brought within 64 px of a picture of `size`: differences and their squares then fit. */
+int32_t pf_guess_clamp(int64_t v, uint32_t size);
+
 /* The centre of the flow: the circle's, or the picture's. */
 pf_point_q16 pf_flow_centre(const pf_tracker *t);
 
 /* --- new tracks (detect.c) */
 
 void pf_tracks_detect(pf_tracker *t);
+
+/* The sector of 30 degrees, 0 .. SECTORS - 1 from x to y, that (dx, dy), |.| < 2^40, lies in. */
+uint32_t pf_sector_of(int64_t dx, int64_t dy);
 
 /* --- masks (mask.c) */
 
@@ -99,8 +108,8 @@ void pf_mask_learn(pf_tracker *t);
 /* What is at `at` has been seen to stand still. */
 void pf_mask_condemn(pf_tracker *t, pf_point_q16 at);
 
-/* Whether more than `most` of the window's pixels are saturated. */
-bool pf_mask_saturated(const pf_tracker *t, const pf_image *image, pf_point_q16 at, uint32_t most);
+/* Pixels of the window around `at` that are clipped, at either end. */
+uint32_t pf_mask_clipped(const pf_tracker *t, const pf_image *image, pf_point_q16 at);
 
 /* --- the scene (measure.c) */
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,7 @@ from PIL import Image
 
 import pipefish as pf
 from pipefish import cli, lensreport
-from pipefish.cli_profile import WRITTEN
+from pipefish.cli_profile import READ, WRITTEN
 from pipefish.formats import READERS, WRITERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -175,3 +178,27 @@ def test_published_numbers_are_those_of_their_papers():
     x = 0.3 * radial + 2 * p1 * 0.3 * -0.4 + p2 * (r2 + 2 * 0.09)
     y = -0.4 * radial + p1 * (r2 + 2 * 0.16) + 2 * p2 * 0.3 * -0.4
     np.testing.assert_allclose(pixels[0], [458.654 * x + 367.215, 457.296 * y + 248.375], atol=0.02)
+
+
+def test_a_converted_profile_goes_into_a_pipe_through_a_link_and_never_over_its_source(tmp_path):
+    """Outputs that are no plain files stay what they are."""
+    source = tmp_path / "a.json"
+    source.write_bytes((Path(__file__).resolve().parents[2] / "calib_profiles/tum-vi-cam0-512.json").read_bytes())
+    command = [sys.executable, "-m", "pipefish", "profile", "convert", str(source)]
+    link, target, fifo = tmp_path / "link.json", tmp_path / "target.json", tmp_path / "fifo"
+    target.write_text("old")
+    link.symlink_to(target)
+    assert subprocess.run([*command, str(link)], check=False).returncode == 0
+    assert link.is_symlink() and json.loads(target.read_text())["format"] == "pipefish-profile"
+    os.mkfifo(fifo)
+    with subprocess.Popen(["cat", str(fifo)], stdout=subprocess.PIPE) as reader:
+        assert subprocess.run([*command, str(fifo), "--to", "json"], check=False).returncode == 0
+        assert json.loads(reader.communicate(timeout=30)[0])["format"] == "pipefish-profile"
+    assert fifo.is_fifo()
+    before = source.read_bytes()
+    assert subprocess.run([*command, str(source)], check=False).returncode == 2
+    assert source.read_bytes() == before
+
+
+def test_readers_of_the_command_are_those_of_the_package():
+    assert READ == READERS

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x8626E5DEu
+#define GOLDEN 0x3E5AB81Eu
 
 void setUp(void) {}
 void tearDown(void) {}

@@ -36,16 +36,18 @@ typedef enum pf_track_reason {
     PF_TRACK_MASKED = 8,   /* ran into a masked part of the picture */
     PF_TRACK_STATIC = 9,   /* stands still, or nearly, while all around it moves: a reflection of the lamp, dirt on the
                             * lens, the camera's own shadow */
-    PF_TRACK_SATURATED = 10, /* over a quarter of its window is saturated */
+    PF_TRACK_SATURATED = 10, /* over a quarter of its window is clipped, white (250 and above) or black (2 and below),
+                              * or a twentieth more or less than of its template */
     PF_TRACK_REASONS = 11,
 } pf_track_reason;
 
 typedef struct pf_track {
     uint64_t id;      /* unique in one boot, never reused, > 0 */
     pf_point_q16 pos; /* in the current frame; last known where lost */
-    /* Q12.20 px^2, saturating: covariance of the position against the track's template. With noise sigma in both
-     * patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of (sum J J^T)^-1, J the
-     * derivatives of the template by position and affine warp with gain and bias eliminated; plus the floor. New
+    /* Q12.20 px^2, saturating, positive definite: covariance of the position against where the track was first seen.
+     * With noise sigma in both patches and light gain g it is sigma^2 (1 + 1/g^2) times the position's block of
+     * (sum J J^T)^-1, J the derivatives of the template by position and affine warp with gain and bias eliminated;
+     * plus the first term of each template before it; turned by the warp into the picture's axes; plus the floor. New
      * tracks: g = 1. */
     uint32_t cov_xx_q20, cov_yy_q20;
     int32_t cov_xy_q20;
@@ -70,7 +72,8 @@ typedef struct pf_tracker_config {
                                  * it is 0.1 less */
     uint32_t noise_q8;          /* image noise sigma, grey levels Q8.8, up to 64, for covariances [2.0] */
     pf_point_q16 circle;        /* centre of the image circle, Q16.16 px, each within +-16384 */
-    uint32_t circle_radius_q16; /* its radius, up to 16384; 0 = the whole image is used */
+    uint32_t circle_radius_q16; /* its radius, from `window` px (less holds no window) up to 16384; 0 =
+                                 * the whole image is used */
     const pf_image *mask;       /* of the frame's size, 0 = nothing may be tracked here, in blocks of 8 x 8: one such
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
@@ -127,7 +130,9 @@ typedef enum pf_tracker_stage {
  * `frame` has the configured size and must stay valid and unchanged until the next call of pf_tracker_frame or
  * pf_tracker_reset returns (it is the next frame's reference; nothing is copied).
  * `clock` (may be NULL) is read between stages, nanoseconds; stage_ns[PF_STAGES] (may be NULL) gets the times.
- * Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
+ * A track that is not found where it was sought first is sought once more from the top of the pyramid; beyond that
+ * there are max_tracks / 2 further attempts a frame, the oldest tracks' first: at worst 2.5 attempts a track, usually
+ * one. Returns PF_OK or PF_ERR_ARGUMENT (nothing changed). */
 pf_status pf_tracker_frame(pf_tracker *tracker, const pf_image *frame, uint64_t (*clock)(void), uint64_t *stage_ns);
 
 /* What is expected of a track in the next frame. */
@@ -149,7 +154,8 @@ pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, ui
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
 const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 
-/* Forgets all tracks (a break in the video). Ids go on; none is reused. */
+/* Forgets all tracks (a break in the video). Ids go on; none is reused. The parts found to stand still stay masked:
+ * dirt on the lens outlives a break; what is gone is released as the picture moves on. */
 void pf_tracker_reset(pf_tracker *tracker);
 
 /* Bearings: unit rays of track positions, from the table of rays. Items outside the image or the camera's domain get
