@@ -21,7 +21,18 @@ from test_daemon import Crawler
 def test_a_folder_of_real_images_becomes_a_survey(real_data, tmp_path: Path, name: str, frames: int, size: tuple):
     # The camera stands still and a board is moved by hundreds of pixels between images: tracks on the room must stay
     # where they are, those on the board must be lost or follow it, and all of it must arrive.
-    crawler = Crawler(tmp_path, camera__path=real_data(name), keyframe__min_interval=1, keyframe__min_common=400)
+    # Every other image is a keyframe by the encoder that is put beside them: by common tracks alone there would be few.
+    readings = tmp_path / "telemetry.csv"
+    rows = (f"{i},{i * 100_000_000},{5 * i}\n" for i in range(frames))
+    readings.write_text("sequence,time_ns,encoder_count\n" + "".join(rows))
+    crawler = Crawler(
+        tmp_path,
+        camera__path=real_data(name),
+        camera__csv=readings,
+        encoder__metres_per_count=0.001,
+        keyframe__step_mm=10,
+        keyframe__min_interval=1,
+    )
     crawler.start()
     try:
         receive(open_transport(f"tcp://127.0.0.1:{crawler.port}"), tmp_path / "survey.mcap", quiet=True)
