@@ -59,7 +59,8 @@ pf_status pf_remap_apply(const pf_image *source, uint32_t channels, size_t n, co
                 out[c] = fill;
             continue;
         }
-        const uint8_t *p = source->data + (size_t)e.y * source->stride + (size_t)e.x * channels;
+        const size_t x = (uint16_t)e.x, y = (uint16_t)e.y, stride = source->stride;
+        const uint8_t *p = source->data + y * stride + x * channels;
         const size_t next = e.x_q8 ? channels : 0, below = e.y_q8 ? source->stride : 0;
         const uint32_t right = e.x_q8, left = 256 - right, low = e.y_q8, high = 256 - low;
         for (uint32_t c = 0; c < channels; c++) {
