@@ -95,7 +95,7 @@ def check_profile_store() -> list[dict]:
 
 def check_daemon_kills() -> list[dict]:
     """kill -9 at 10 times as many moments: nothing acknowledged is lost, nothing arrives twice."""
-    command = (sys.executable, "-m", "pytest", "-q", "tests/python/test_daemon.py", "-k", "kill")
+    command = (sys.executable, "-m", "pytest", "-q", "tests/python/test_daemon_spool.py", "-k", "kill")
     failures = sum(run(*command, PIPEFISH_TEST_SEED=str(i + 1)).returncode != 0 for i in range(10))
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 

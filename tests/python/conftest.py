@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from crawler import Crawler, write_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,3 +28,13 @@ def real_data() -> Callable[[str], Path]:
         return top / name
 
     return find
+
+
+@pytest.fixture
+def crawler(tmp_path: Path) -> Iterator[Crawler]:
+    """A daemon with a recording of 40 frames."""
+    write_recording(tmp_path / "survey.y4m", 40)
+    crawler = Crawler(tmp_path)
+    yield crawler
+    if crawler.process is not None:
+        crawler.kill()

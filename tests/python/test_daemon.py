@@ -2,238 +2,38 @@
 
 import contextlib
 import hashlib
-import io
-import json
 import os
-import random
 import select
-import signal
 import socket
-import sqlite3
-import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-import pipefish as pf
-from pipefish import pipefish_pb2 as pb
-from pipefish.client import ACCEPT, STORED, Client, Handlers
-from pipefish.survey import lost_indices
-from pipefish.transport import TcpTransport, TransportClosed
-
-ROOT = Path(__file__).resolve().parents[2]
-START, KEYFRAME, END = 1, 2, 3
-SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
-WIDTH, HEIGHT = 192, 160
-COUNTS_PER_FRAME = 10
-RESET_GAP = 5  # tracker.reset_gap's default
-EVERY_FRAME = (
-    *("--set", "keyframe.step_mm=1", "--set", "keyframe.min_interval=1"),
-    *("--set", "keyframe.jpeg_quality=100"),
+from crawler import (
+    COUNTS_PER_FRAME,
+    END,
+    EVERY_FRAME,
+    HEIGHT,
+    KEYFRAME,
+    ROOT,
+    START,
+    WIDTH,
+    Crawler,
+    Store,
+    free_port,
+    receive_all,
+    run,
+    serve,
+    spooled,
+    wait_for_log,
+    write_recording,
 )
-
-
-def find_daemon() -> Path:
-    """PIPEFISH_BUILD (a build folder) or the first of build/release and build/debug that has it."""
-    folders = [os.environ["PIPEFISH_BUILD"]] if "PIPEFISH_BUILD" in os.environ else ["build/release", "build/debug"]
-    for folder in folders:
-        program = ROOT / folder / "firmware" / "pipefishd"
-        if program.exists():
-            return program
-    pytest.fail("pipefishd is not built: run `make build`")
-
-
-def texture(seed: int) -> np.ndarray:
-    """A (HEIGHT, 4 WIDTH) uint8 pattern with corners at several scales, periodic to the right."""
-    rng = np.random.default_rng(seed)
-    image = np.zeros((HEIGHT, 4 * WIDTH))
-    for cell in (4, 8, 16):
-        image += np.kron(rng.normal(size=(HEIGHT // cell, 4 * WIDTH // cell)), np.ones((cell, cell))) * 25
-    image = sum(np.roll(image, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)) / 9
-    return np.clip(image + 128, 0, 255).astype(np.uint8)
-
-
-def write_recording(path: Path, frames: int, rate: int = 25, skip: tuple[int, ...] = (), seed: int = 1) -> list[str]:
-    """A Y4M of a pattern that moves 2 px a frame, with encoder; `skip`: sequence numbers that were dropped.
-
-    Returns the SHA-256 of each frame."""
-    pattern = texture(seed)
-    rows, hashes = ["sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad"], []
-    with path.open("wb") as out:
-        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F{rate}:1 Ip A1:1 Cmono\n".encode())
-        sequence = 0
-        for i in range(frames):
-            while sequence in skip:
-                sequence += 1
-            pixels = np.ascontiguousarray(np.roll(pattern, -2 * i, axis=1)[:, :WIDTH]).tobytes()
-            out.write(b"FRAME\n" + pixels)
-            hashes.append(hashlib.sha256(pixels).hexdigest())
-            rows.append(f"{sequence},{10**9 + sequence * 10**9 // rate},{i * COUNTS_PER_FRAME},0.01,-0.02,0.005")
-            sequence += 1
-    path.with_suffix(".csv").write_text("\n".join(rows) + "\n")
-    return hashes
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-class Crawler:
-    """A daemon's settings and its process, which may be started again and again on the same spool."""
-
-    def __init__(self, folder: Path, **settings: object) -> None:
-        self.port = free_port()
-        self.status_file = folder / "status.json"
-        self.config = folder / "pipefishd.ini"
-        self.log = folder / "log"
-        values = {
-            "camera.path": folder / "survey.y4m",
-            "camera.speed": "fast",
-            "encoder.metres_per_count": 0.0001,
-            "keyframe.step_mm": 2,  # of 1 mm a frame: every second one
-            "link.port": self.port,
-            "spool.path": folder / "spool.db",
-            "status.interval_ms": 100,
-            "status.preview_interval_ms": 100,
-            "daemon.drain_s": 20,
-            "daemon.status_file": self.status_file,
-        } | {key.replace("__", "."): value for key, value in settings.items()}
-        sections: dict[str, list[str]] = {}
-        for key, value in values.items():
-            section, name = key.split(".")
-            sections.setdefault(section, []).append(f"{name} = {value}")
-        self.config.write_text("".join(f"[{s}]\n" + "\n".join(lines) + "\n" for s, lines in sections.items()))
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def start(self, *arguments: str) -> None:
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen([find_daemon(), "--config", self.config, *arguments], stderr=log)
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-
-    def terminate(self) -> None:
-        self.process.send_signal(signal.SIGTERM)
-
-    def wait(self, timeout: float = 30) -> int:
-        return self.process.wait(timeout)
-
-    def status(self) -> dict:
-        return json.loads(self.status_file.read_text()) if self.status_file.exists() else {}
-
-    def text(self) -> str:
-        return self.log.read_text()
-
-
-class Store(Handlers):
-    """A host's durable store: what it holds outlives its clients."""
-
-    def __init__(self, port: int) -> None:
-        self.port = port
-        self.objects: dict[bytes, tuple[int, bytes]] = {}
-        self.arrivals: Counter[bytes] = Counter()
-        self.statuses: list[pb.Status] = []
-        self.previews: list[pb.Preview] = []
-
-    def on_offer(self, name: bytes, kind: int, size: int) -> int:
-        return STORED if name in self.objects else ACCEPT
-
-    def on_object(self, name: bytes, kind: int, data: bytes) -> int:
-        assert hashlib.sha256(data).digest() == name
-        self.arrivals[name] += 1
-        self.objects[name] = (kind, data)
-        return STORED
-
-    def on_status(self, status: pb.Status) -> None:
-        self.statuses.append(status)
-
-    def on_preview(self, preview: pb.Preview) -> None:
-        self.previews.append(preview)
-
-    @contextlib.contextmanager
-    def client(self) -> Iterator[Client]:
-        """A fresh client, as after the host's own restart; waits for the daemon's port."""
-        client = Client(TcpTransport("127.0.0.1", self.port), self, wants_objects=True)
-        end = time.monotonic() + 10
-        while True:
-            try:
-                client.open()
-                break
-            except TransportClosed:
-                assert time.monotonic() < end, "the daemon does not listen"
-                time.sleep(0.01)
-        try:
-            yield client
-        finally:
-            client.close()
-
-    def of_kind(self, kind: int) -> list[bytes]:
-        return [data for k, data in self.objects.values() if k == kind]
-
-    @property
-    def starts(self) -> list[pb.SurveyStart]:
-        return [pb.SurveyStart.FromString(data) for data in self.of_kind(START)]
-
-    @property
-    def keyframes(self) -> list[pb.Keyframe]:
-        return sorted((pb.Keyframe.FromString(data) for data in self.of_kind(KEYFRAME)), key=lambda k: k.index)
-
-    @property
-    def ends(self) -> list[pb.SurveyEnd]:
-        return [pb.SurveyEnd.FromString(data) for data in self.of_kind(END)]
-
-
-def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
-    """Runs the client until `until()` or the daemon's end."""
-    end = time.monotonic() + timeout
-    while not until() and crawler.process.poll() is None:
-        assert time.monotonic() < end, crawler.text()
-        client.step(0.02)
-
-
-def wait_for_log(crawler: Crawler, text: str) -> None:
-    """Until the daemon has logged `text`."""
-    end = time.monotonic() + 20
-    while text not in crawler.text():
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
-
-
-def spooled(crawler: Crawler) -> Counter[int]:
-    """How many objects of each kind the spool of a daemon that has ended holds."""
-    with contextlib.closing(sqlite3.connect(crawler.config.parent / "spool.db")) as database:
-        return Counter(kind for (kind,) in database.execute("SELECT kind FROM object"))
-
-
-def receive_all(crawler: Crawler, store: Store) -> int:
-    """Serves the daemon until it exits; returns its exit code."""
-    with store.client() as client:
-        serve(crawler, client, lambda: False)
-    return crawler.wait()
-
-
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([find_daemon(), *map(str, arguments)], capture_output=True, text=True, timeout=20)
-
-
-@pytest.fixture
-def crawler(tmp_path: Path) -> Iterator[Crawler]:
-    """A daemon with a recording of 40 frames."""
-    write_recording(tmp_path / "survey.y4m", 40)
-    crawler = Crawler(tmp_path)
-    yield crawler
-    if crawler.process is not None:
-        crawler.kill()
-
-
-# ---- settings
+from pipefish import pipefish_pb2 as pb
+from pipefish.client import Client, Handlers
+from pipefish.transport import TcpTransport
 
 
 def test_help_config_is_the_committed_example_and_a_valid_file(tmp_path: Path):
@@ -373,46 +173,6 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     assert store.previews == [] or store.previews[-1].width == WIDTH // 4
 
 
-def test_a_profile_goes_with_the_survey_and_gives_parallax_keyframes_and_the_image_circle(
-    tmp_path: Path, crawler: Crawler
-):
-    camera = pf.Camera(
-        **{"width": WIDTH, "height": HEIGHT, "f_u": 60.0, "f_v": 60.0, "c_u": 95.5, "c_v": 79.5, "theta_max": 1.5},
-        **{"circle_u": 95.5, "circle_v": 79.5, "circle_radius": 75.0},
-    )
-    profile = tmp_path / "camera.bin"
-    profile.write_bytes(camera.to_binary())
-    store = Store(crawler.port)
-    crawler.start(
-        *("--set", f"camera.profile={profile}", "--set", "keyframe.min_common=1"),
-        *("--set", "encoder.metres_per_count=0", "--set", "keyframe.parallax_deg=1"),
-    )
-    assert receive_all(crawler, store) == 0
-    assert store.starts[0].profile == camera.to_binary()
-    causes = Counter(k.cause for k in store.keyframes)
-    assert causes[pb.KEYFRAME_CAUSE_FIRST] == 1
-    assert causes[pb.KEYFRAME_CAUSE_PARALLAX] >= 2
-    assert len(store.keyframes) < 20
-    for k in store.keyframes:
-        pixels = np.asarray(Image.open(io.BytesIO(k.jpeg)))
-        assert pixels[:8, :8].max() == 0  # outside of the circle
-        assert pixels[60:100, 60:130].min() > 0
-        x, y = np.array(k.observations.x_q16) / 65536, np.array(k.observations.y_q16) / 65536
-        assert np.hypot(x - 95.5, y - 79.5).max() <= 75
-    done = run(
-        "--config", crawler.config, "--set", f"camera.profile={profile}", "--set", f"camera.path={other(tmp_path)}"
-    )
-    assert done.returncode == 1
-    assert "the profile is for 192 x 160, the camera gives 64 x 64" in done.stderr
-
-
-def other(folder: Path) -> Path:
-    """A recording of another size."""
-    path = folder / "other.y4m"
-    path.write_bytes(b"YUV4MPEG2 W64 H64 F25:1 Ip A1:1 Cmono\nFRAME\n" + bytes(4096))
-    return path
-
-
 def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_once(tmp_path: Path, crawler: Crawler):
     device = tmp_path / "ttyPipe"
     crawler.start("--set", "link.transport=serial", "--set", f"link.device={device}")
@@ -431,127 +191,6 @@ def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_
     time.sleep(1)  # four tries
     assert crawler.text().count(missing) == 2  # before it came, and after it went
     assert crawler.text().count("hung up") == 1
-
-
-@pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 2)])
-def test_runs_of_one_recording_are_the_same_with_one_thread_and_with_two(tmp_path: Path, threads: tuple[int, int]):
-    write_recording(tmp_path / "survey.y4m", 60, skip=(20, *range(31, 39)))  # a dropped frame, and a break
-    runs = []
-    for name, count in zip("ab", threads, strict=True):
-        folder = tmp_path / name
-        folder.mkdir()
-        crawler = Crawler(folder, camera__path=tmp_path / "survey.y4m", daemon__threads=count)
-        store = Store(crawler.port)
-        crawler.start()
-        assert receive_all(crawler, store) == 0
-        runs.append(store.keyframes)
-        for keyframe in runs[-1]:  # all but what belongs to the run
-            keyframe.ClearField("survey_id")
-            keyframe.ClearField("time")
-            keyframe.telemetry.ClearField("time")
-    assert len(runs[0]) > 20
-    assert [k.break_reason for k in runs[0] if k.after_break] == ["gap of 8 frames"]
-    assert [k.SerializeToString(deterministic=True) for k in runs[0]] == [
-        k.SerializeToString(deterministic=True) for k in runs[1]
-    ]
-
-
-def write_pgm(path: Path, pixels: np.ndarray) -> None:
-    path.write_bytes(b"P5\n%d %d\n255\n" % pixels.shape[::-1] + pixels.astype(np.uint8).tobytes())
-
-
-def test_nothing_is_tracked_under_the_mask_of_the_configuration(tmp_path: Path):
-    mask = np.full((HEIGHT, WIDTH), 255)
-    mask[:, 96:160] = 0
-    write_pgm(tmp_path / "mask.pgm", mask)
-    write_recording(tmp_path / "survey.y4m", 20)
-    crawler = Crawler(tmp_path, tracker__mask=tmp_path / "mask.pgm")
-    store = Store(crawler.port)
-    crawler.start()
-    assert receive_all(crawler, store) == 0
-    x = np.concatenate([np.array(k.observations.x_q16) / 65536 for k in store.keyframes])
-    assert len(x) > 50 and not np.any((x >= 96) & (x < 160))
-    assert store.ends[0].last_status.tracking.lost_masked > 0  # the pattern moves to the left, into the mask
-
-
-@pytest.mark.parametrize(
-    ("mask", "what"),
-    [
-        (np.zeros((5, 7)), "tracker.mask: {path}: 7 x 5 pixels, but the camera gives 192 x 160"),
-        (None, "tracker.mask: {path}: No such file or directory"),
-        (b"GIF89a", "tracker.mask: {path}: byte 0: neither PNG, JPEG nor binary PGM"),
-    ],
-)
-def test_a_mask_that_does_not_fit_is_a_clear_error(tmp_path: Path, crawler: Crawler, mask, what: str):
-    path = tmp_path / "mask.pgm"
-    if isinstance(mask, bytes):
-        path.write_bytes(mask)
-    elif mask is not None:
-        write_pgm(path, mask)
-    crawler.start("--set", f"tracker.mask={path}")
-    assert crawler.wait() == 1
-    assert what.format(path=path) in crawler.text()
-
-
-def test_polar_cells_without_a_circle_are_a_clear_error(crawler: Crawler):
-    crawler.start("--set", "tracker.cells=polar")
-    assert crawler.wait() == 1
-    assert "tracker.cells = polar: needs an image circle" in crawler.text()
-
-
-def write_states(path: Path, black: int = 0, white: int = 255) -> None:
-    """Moving, standing, dark, moving: 30 frames each, by a camera with these levels."""
-    pattern = texture(3)
-    with path.open("wb") as out:
-        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F25:1 Ip A1:1 Cmono\n".encode())
-        shift = 0
-        for i in range(120):
-            part = i // 30
-            shift += 2 if part in (0, 3) else 0
-            frame = np.roll(pattern, -shift, axis=1)[:, :WIDTH]
-            grey = black + (frame // (60 if part == 2 else 1)).astype(int) * (white - black) // 255
-            out.write(b"FRAME\n" + np.ascontiguousarray(grey.astype(np.uint8)).tobytes())
-    path.with_suffix(".csv").unlink(missing_ok=True)
-
-
-@pytest.mark.parametrize(("black", "white"), [(0, 255), (16, 235)])
-def test_states_of_the_scene_reach_the_host_and_the_log(tmp_path: Path, black: int, white: int):
-    write_states(tmp_path / "survey.y4m", black, white)
-    crawler = Crawler(
-        tmp_path,
-        encoder__metres_per_count=0,
-        keyframe__min_common=2000,
-        camera__black_level=black,
-        camera__white_level=white,
-    )
-    store = Store(crawler.port)
-    crawler.start()
-    assert receive_all(crawler, store) == 0
-    log = crawler.text()
-    order = ["standing still", "dark", "no longer dark"]
-    at = [log.index(f": {text}\n") for text in order]
-    assert at == sorted(at)
-    last = store.ends[0].last_status.tracking
-    assert last.frames == 120 and not last.dark and not last.standing
-    lost = last.lost_residual + last.lost_flat + last.lost_backward + last.lost_diverged + last.lost_drift
-    assert lost > 0  # in the dark
-    assert crawler.status()["tracking"]["frames"] == 120
-    assert sum(k.tracking.frames for k in store.keyframes) <= 120
-    assert last.state_frames[0] >= 15 and last.state_frames[2] >= 20  # standing; dark
-    assert sum(k.tracking.state_frames[0] for k in store.keyframes if k.tracking.state_frames) >= 15
-
-
-def test_dropped_frames_are_counted_and_a_long_gap_is_a_marked_break(tmp_path: Path, crawler: Crawler):
-    write_recording(tmp_path / "survey.y4m", 30, skip=(5, *range(20, 32)))
-    store = Store(crawler.port)
-    crawler.start()
-    assert receive_all(crawler, store) == 0
-    assert crawler.status()["frames_dropped"] == 13
-    breaks = [k for k in store.keyframes if k.after_break]
-    assert [(k.frame_sequence, k.break_reason, k.cause) for k in breaks] == [
-        (32, "gap of 12 frames", pb.KEYFRAME_CAUSE_FIRST)
-    ]
-    assert set(breaks[0].observations.status) == {pb.TRACK_STATUS_NEW}
 
 
 def test_sigterm_ends_the_survey_and_drains(tmp_path: Path, crawler: Crawler):
@@ -729,115 +368,3 @@ def test_a_damaged_recording_ends_the_survey_and_the_daemon_with_1(tmp_path: Pat
     assert end.frames == 10
     assert len(store.keyframes) == end.keyframes == 5
     assert "survey.y4m" in crawler.text()
-
-
-def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
-    store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
-    wait_for_log(crawler, "make room")
-    assert receive_all(crawler, store) == 0
-    [end_message] = store.ends
-    assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
-    assert list(end_message.lost_first) == []
-
-
-def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
-    done = run("--config", crawler.config, "--set", "spool.quota_mb=0.05")
-    assert done.returncode == 1
-    assert "spool.quota_mb = 0.05: an object of this camera may have" in done.stderr
-
-
-def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
-    write_recording(tmp_path / "survey.y4m", 40, rate=20)
-    store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
-    wait_for_log(crawler, "survey ends")
-    assert receive_all(crawler, store) == 0
-    [end_message] = store.ends
-    lost, got = lost_indices(end_message), {k.index for k in store.keyframes}
-    assert lost
-    assert lost & got == set()
-    assert lost | got == set(range(end_message.keyframes))
-    assert crawler.status()["keyframes_dropped"] == len(lost)
-
-
-# ---- kill -9
-
-
-def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -> None:
-    """`frames`: of one loop of the recording.
-
-    Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
-    [end] = store.ends
-    assert {k.survey_id for k in store.keyframes} == {end.survey_id}
-    assert [k.index for k in store.keyframes] == list(range(end.keyframes))
-    assert list(end.lost_first) == []
-    assert 1 < end.boots <= kills + 1
-    # One start for each boot that came to store it; each boot's first keyframe is marked.
-    boots = [s.time.boot_id for s in store.starts]
-    assert len(set(boots)) == len(boots) <= end.boots
-    before, loop = None, 0
-    for k in store.keyframes:
-        assert k.time.boot_id in boots
-        is_first = k.time.boot_id != before
-        is_wrap = not is_first and k.frame_sequence // (frames + RESET_GAP + 1) != loop
-        assert k.after_break == ((is_first and k.index > 0) or is_wrap), k.index
-        if k.after_break:
-            assert k.break_reason == ("restart" if is_first else f"gap of {RESET_GAP + 1} frames")
-        before, loop = k.time.boot_id, k.frame_sequence // (frames + RESET_GAP + 1)
-
-
-def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path, crawler: Crawler):
-    # No host at all while it is being killed; then one that takes what the boots have left.
-    write_recording(tmp_path / "survey.y4m", 120)
-    rng = random.Random(SEED + 3)
-    kills = 15
-    for _ in range(kills):
-        crawler.start("--set", "camera.loops=0")
-        time.sleep(rng.uniform(0.02, 0.25))
-        crawler.kill()
-    store = Store(crawler.port)
-    crawler.start()
-    assert receive_all(crawler, store) == 0
-    check_everything_arrived_once(store, kills)
-
-
-@pytest.mark.parametrize("change", ["survey.name=the next pipe", "encoder.metres_per_count=0.0002"])
-def test_after_kill_9_another_setup_begins_another_survey_and_ends_the_old_one(crawler: Crawler, change: str):
-    crawler.start("--set", "camera.loops=0")
-    wait_for_log(crawler, "begins")
-    time.sleep(0.3)
-    crawler.kill()
-    store = Store(crawler.port)
-    crawler.start("--set", change)
-    assert receive_all(crawler, store) == 0
-    ends = {e.reason: e for e in store.ends}
-    old, new = ends["interrupted; another survey began"], ends["end of recording"]
-    assert [s.survey_id for s in store.starts] == [old.survey_id, new.survey_id]
-    for end in (old, new):
-        assert [k.index for k in store.keyframes if k.survey_id == end.survey_id] == list(range(end.keyframes))
-        assert (end.boots, list(end.lost_first)) == (1, [])
-    assert not next(k for k in store.keyframes if k.survey_id == new.survey_id).after_break
-
-
-def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(
-    tmp_path: Path, crawler: Crawler
-):
-    # What the host has stored but the daemon had not yet removed is offered again and answered from the store: it does
-    # not arrive twice. Every second time the host dies as well, in the middle of whatever was under way.
-    write_recording(tmp_path / "survey.y4m", 120)
-    rng = random.Random(SEED + 4)
-    kills = 20
-    store = Store(crawler.port)
-    for i in range(kills):
-        crawler.start("--set", "camera.loops=0")
-        for _ in range(1 + i % 2):
-            with store.client() as client:
-                end = time.monotonic() + rng.uniform(0.02, 0.2)
-                serve(crawler, client, lambda end=end: time.monotonic() > end)
-        crawler.kill()
-    assert len(store.objects) > kills  # it was indeed sending
-    crawler.start()
-    assert receive_all(crawler, store) == 0
-    check_everything_arrived_once(store, kills)
-    assert set(store.arrivals.values()) == {1}

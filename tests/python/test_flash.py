@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 import pipefish as pf
+from crawler import HEIGHT, SEED, WIDTH, Crawler, Store, run, serve, wait_for_log, write_recording
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
 from pipefish.transport import TcpTransport
 from spec_reader import crc32c
-from test_daemon import HEIGHT, SEED, WIDTH, Crawler, Store, run, serve, wait_for_log, write_recording
 
 
 def camera(name: str, **changes: object) -> pf.Camera:

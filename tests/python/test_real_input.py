@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crawler import Crawler
 from pipefish.receive import receive
 from pipefish.survey import Survey
 from pipefish.transport import open_transport
-from test_daemon import Crawler
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,217 @@
+"""pipefishd as a child process, its recordings, and a host that keeps what it gets: for the tests of the daemon."""
+
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import socket
+import sqlite3
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipefish import pipefish_pb2 as pb
+from pipefish.client import ACCEPT, STORED, Client, Handlers
+from pipefish.transport import TcpTransport, TransportClosed
+
+ROOT = Path(__file__).resolve().parents[2]
+START, KEYFRAME, END = 1, 2, 3
+SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
+WIDTH, HEIGHT = 192, 160
+COUNTS_PER_FRAME = 10
+RESET_GAP = 5  # tracker.reset_gap's default
+EVERY_FRAME = (
+    *("--set", "keyframe.step_mm=1", "--set", "keyframe.min_interval=1"),
+    *("--set", "keyframe.jpeg_quality=100"),
+)
+
+
+def find_daemon() -> Path:
+    """PIPEFISH_BUILD (a build folder) or the first of build/release and build/debug that has it."""
+    folders = [os.environ["PIPEFISH_BUILD"]] if "PIPEFISH_BUILD" in os.environ else ["build/release", "build/debug"]
+    for folder in folders:
+        program = ROOT / folder / "firmware" / "pipefishd"
+        if program.exists():
+            return program
+    pytest.fail("pipefishd is not built: run `make build`")
+
+
+def texture(seed: int) -> np.ndarray:
+    """A (HEIGHT, 4 WIDTH) uint8 pattern with corners at several scales, periodic to the right."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((HEIGHT, 4 * WIDTH))
+    for cell in (4, 8, 16):
+        image += np.kron(rng.normal(size=(HEIGHT // cell, 4 * WIDTH // cell)), np.ones((cell, cell))) * 25
+    image = sum(np.roll(image, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)) / 9
+    return np.clip(image + 128, 0, 255).astype(np.uint8)
+
+
+def write_recording(path: Path, frames: int, rate: int = 25, skip: tuple[int, ...] = (), seed: int = 1) -> list[str]:
+    """A Y4M of a pattern that moves 2 px a frame, with encoder; `skip`: sequence numbers that were dropped.
+
+    Returns the SHA-256 of each frame."""
+    pattern = texture(seed)
+    rows, hashes = ["sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad"], []
+    with path.open("wb") as out:
+        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F{rate}:1 Ip A1:1 Cmono\n".encode())
+        sequence = 0
+        for i in range(frames):
+            while sequence in skip:
+                sequence += 1
+            pixels = np.ascontiguousarray(np.roll(pattern, -2 * i, axis=1)[:, :WIDTH]).tobytes()
+            out.write(b"FRAME\n" + pixels)
+            hashes.append(hashlib.sha256(pixels).hexdigest())
+            rows.append(f"{sequence},{10**9 + sequence * 10**9 // rate},{i * COUNTS_PER_FRAME},0.01,-0.02,0.005")
+            sequence += 1
+    path.with_suffix(".csv").write_text("\n".join(rows) + "\n")
+    return hashes
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+class Crawler:
+    """A daemon's settings and its process, which may be started again and again on the same spool."""
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        self.port = free_port()
+        self.status_file = folder / "status.json"
+        self.config = folder / "pipefishd.ini"
+        self.log = folder / "log"
+        values = {
+            "camera.path": folder / "survey.y4m",
+            "camera.speed": "fast",
+            "encoder.metres_per_count": 0.0001,
+            "keyframe.step_mm": 2,  # of 1 mm a frame: every second one
+            "link.port": self.port,
+            "spool.path": folder / "spool.db",
+            "status.interval_ms": 100,
+            "status.preview_interval_ms": 100,
+            "daemon.drain_s": 20,
+            "daemon.status_file": self.status_file,
+        } | {key.replace("__", "."): value for key, value in settings.items()}
+        sections: dict[str, list[str]] = {}
+        for key, value in values.items():
+            section, name = key.split(".")
+            sections.setdefault(section, []).append(f"{name} = {value}")
+        self.config.write_text("".join(f"[{s}]\n" + "\n".join(lines) + "\n" for s, lines in sections.items()))
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self, *arguments: str) -> None:
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen([find_daemon(), "--config", self.config, *arguments], stderr=log)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def terminate(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+
+    def wait(self, timeout: float = 30) -> int:
+        return self.process.wait(timeout)
+
+    def status(self) -> dict:
+        return json.loads(self.status_file.read_text()) if self.status_file.exists() else {}
+
+    def text(self) -> str:
+        return self.log.read_text()
+
+
+class Store(Handlers):
+    """A host's durable store: what it holds outlives its clients."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.objects: dict[bytes, tuple[int, bytes]] = {}
+        self.arrivals: Counter[bytes] = Counter()
+        self.statuses: list[pb.Status] = []
+        self.previews: list[pb.Preview] = []
+
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        return STORED if name in self.objects else ACCEPT
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int:
+        assert hashlib.sha256(data).digest() == name
+        self.arrivals[name] += 1
+        self.objects[name] = (kind, data)
+        return STORED
+
+    def on_status(self, status: pb.Status) -> None:
+        self.statuses.append(status)
+
+    def on_preview(self, preview: pb.Preview) -> None:
+        self.previews.append(preview)
+
+    @contextlib.contextmanager
+    def client(self) -> Iterator[Client]:
+        """A fresh client, as after the host's own restart; waits for the daemon's port."""
+        client = Client(TcpTransport("127.0.0.1", self.port), self, wants_objects=True)
+        end = time.monotonic() + 10
+        while True:
+            try:
+                client.open()
+                break
+            except TransportClosed:
+                assert time.monotonic() < end, "the daemon does not listen"
+                time.sleep(0.01)
+        try:
+            yield client
+        finally:
+            client.close()
+
+    def of_kind(self, kind: int) -> list[bytes]:
+        return [data for k, data in self.objects.values() if k == kind]
+
+    @property
+    def starts(self) -> list[pb.SurveyStart]:
+        return [pb.SurveyStart.FromString(data) for data in self.of_kind(START)]
+
+    @property
+    def keyframes(self) -> list[pb.Keyframe]:
+        return sorted((pb.Keyframe.FromString(data) for data in self.of_kind(KEYFRAME)), key=lambda k: k.index)
+
+    @property
+    def ends(self) -> list[pb.SurveyEnd]:
+        return [pb.SurveyEnd.FromString(data) for data in self.of_kind(END)]
+
+
+def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
+    """Runs the client until `until()` or the daemon's end."""
+    end = time.monotonic() + timeout
+    while not until() and crawler.process.poll() is None:
+        assert time.monotonic() < end, crawler.text()
+        client.step(0.02)
+
+
+def wait_for_log(crawler: Crawler, text: str) -> None:
+    """Until the daemon has logged `text`."""
+    end = time.monotonic() + 20
+    while text not in crawler.text():
+        assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+
+
+def spooled(crawler: Crawler) -> Counter[int]:
+    """How many objects of each kind the spool of a daemon that has ended holds."""
+    with contextlib.closing(sqlite3.connect(crawler.config.parent / "spool.db")) as database:
+        return Counter(kind for (kind,) in database.execute("SELECT kind FROM object"))
+
+
+def receive_all(crawler: Crawler, store: Store) -> int:
+    """Serves the daemon until it exits; returns its exit code."""
+    with store.client() as client:
+        serve(crawler, client, lambda: False)
+    return crawler.wait()
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([find_daemon(), *map(str, arguments)], capture_output=True, text=True, timeout=20)

@@ -1,0 +1,122 @@
+"""pipefishd: a full spool, and being killed: nothing acknowledged is lost, nothing comes twice."""
+
+import random
+import time
+from pathlib import Path
+
+import pytest
+
+from crawler import EVERY_FRAME, RESET_GAP, SEED, Crawler, Store, receive_all, run, serve, wait_for_log, write_recording
+from pipefish.survey import lost_indices
+
+
+def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
+    wait_for_log(crawler, "make room")
+    assert receive_all(crawler, store) == 0
+    [end_message] = store.ends
+    assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
+    assert list(end_message.lost_first) == []
+
+
+def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
+    done = run("--config", crawler.config, "--set", "spool.quota_mb=0.05")
+    assert done.returncode == 1
+    assert "spool.quota_mb = 0.05: an object of this camera may have" in done.stderr
+
+
+def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 40, rate=20)
+    store = Store(crawler.port)
+    crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
+    wait_for_log(crawler, "survey ends")
+    assert receive_all(crawler, store) == 0
+    [end_message] = store.ends
+    lost, got = lost_indices(end_message), {k.index for k in store.keyframes}
+    assert lost
+    assert lost & got == set()
+    assert lost | got == set(range(end_message.keyframes))
+    assert crawler.status()["keyframes_dropped"] == len(lost)
+
+
+# ---- kill -9
+
+
+def check_everything_arrived_once(store: Store, kills: int, frames: int = 120) -> None:
+    """`frames`: of one loop of the recording.
+
+    Nothing acknowledged is lost, nothing arrives twice: the keyframes are 0..n-1, each once, in one survey."""
+    [end] = store.ends
+    assert {k.survey_id for k in store.keyframes} == {end.survey_id}
+    assert [k.index for k in store.keyframes] == list(range(end.keyframes))
+    assert list(end.lost_first) == []
+    assert 1 < end.boots <= kills + 1
+    # One start for each boot that came to store it; each boot's first keyframe is marked.
+    boots = [s.time.boot_id for s in store.starts]
+    assert len(set(boots)) == len(boots) <= end.boots
+    before, loop = None, 0
+    for k in store.keyframes:
+        assert k.time.boot_id in boots
+        is_first = k.time.boot_id != before
+        is_wrap = not is_first and k.frame_sequence // (frames + RESET_GAP + 1) != loop
+        assert k.after_break == ((is_first and k.index > 0) or is_wrap), k.index
+        if k.after_break:
+            assert k.break_reason == ("restart" if is_first else f"gap of {RESET_GAP + 1} frames")
+        before, loop = k.time.boot_id, k.frame_sequence // (frames + RESET_GAP + 1)
+
+
+def test_kill_9_while_spooling_loses_nothing_and_doubles_nothing(tmp_path: Path, crawler: Crawler):
+    # No host at all while it is being killed; then one that takes what the boots have left.
+    write_recording(tmp_path / "survey.y4m", 120)
+    rng = random.Random(SEED + 3)
+    kills = 15
+    for _ in range(kills):
+        crawler.start("--set", "camera.loops=0")
+        time.sleep(rng.uniform(0.02, 0.25))
+        crawler.kill()
+    store = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    check_everything_arrived_once(store, kills)
+
+
+@pytest.mark.parametrize("change", ["survey.name=the next pipe", "encoder.metres_per_count=0.0002"])
+def test_after_kill_9_another_setup_begins_another_survey_and_ends_the_old_one(crawler: Crawler, change: str):
+    crawler.start("--set", "camera.loops=0")
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.kill()
+    store = Store(crawler.port)
+    crawler.start("--set", change)
+    assert receive_all(crawler, store) == 0
+    ends = {e.reason: e for e in store.ends}
+    old, new = ends["interrupted; another survey began"], ends["end of recording"]
+    assert [s.survey_id for s in store.starts] == [old.survey_id, new.survey_id]
+    for end in (old, new):
+        assert [k.index for k in store.keyframes if k.survey_id == end.survey_id] == list(range(end.keyframes))
+        assert (end.boots, list(end.lost_first)) == (1, [])
+    assert not next(k for k in store.keyframes if k.survey_id == new.survey_id).after_break
+
+
+def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_nothing(
+    tmp_path: Path, crawler: Crawler
+):
+    # What the host has stored but the daemon had not yet removed is offered again and answered from the store: it does
+    # not arrive twice. Every second time the host dies as well, in the middle of whatever was under way.
+    write_recording(tmp_path / "survey.y4m", 120)
+    rng = random.Random(SEED + 4)
+    kills = 20
+    store = Store(crawler.port)
+    for i in range(kills):
+        crawler.start("--set", "camera.loops=0")
+        for _ in range(1 + i % 2):
+            with store.client() as client:
+                end = time.monotonic() + rng.uniform(0.02, 0.2)
+                serve(crawler, client, lambda end=end: time.monotonic() > end)
+        crawler.kill()
+    assert len(store.objects) > kills  # it was indeed sending
+    crawler.start()
+    assert receive_all(crawler, store) == 0
+    check_everything_arrived_once(store, kills)
+    assert set(store.arrivals.values()) == {1}
