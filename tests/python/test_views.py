@@ -109,6 +109,18 @@ def test_every_view_shows_the_world_where_its_rays_point(camera, world, kind, fo
     assert table.valid.sum() > 5000 and inner.mean() > 0.97  # the rest touches the black rim
 
 
+@pytest.mark.parametrize(("kind", "fov"), [("perspective", 100), ("cylinder", 300), ("equirect", 170)])
+def test_the_vertical_field_of_view_is_that_of_the_rays(kind, fov):
+    """Between the outer edges of the first and the last row: half a row beyond their centres."""
+    rays = views.view_rays(kind, 301, 201, fov)[:, 150]
+    angle = np.arctan2(rays[:, 1], rays[:, 2])
+    if kind == "equirect":
+        expected = (angle[-1] - angle[0]) * 201 / 200
+    else:
+        expected = 2 * np.arctan(np.tan(angle[-1]) * 201 / 200)
+    assert views.vertical_fov(kind, 301, 201, fov) == pytest.approx(np.degrees(expected), rel=1e-12)
+
+
 def test_turns_are_right_up_and_clockwise():
     forward = np.array([0, 0, 1.0])
     assert views.rotation(30, 0, 0) @ forward == pytest.approx([0.5, 0, math.cos(math.pi / 6)])
