@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +121,22 @@ def test_the_vertical_field_of_view_is_that_of_the_rays(kind, fov):
     else:
         expected = 2 * np.arctan(np.tan(angle[-1]) * 201 / 200)
     assert views.vertical_fov(kind, 301, 201, fov) == pytest.approx(np.degrees(expected), rel=1e-12)
+
+
+def test_the_python_page_is_true(tmp_path, monkeypatch):
+    """Its examples run, and the names in its tables exist."""
+    root = Path(__file__).resolve().parents[2]
+    page = (root / "docs" / "python.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(re.sub(r'"(calib_profiles|tests)/', rf'"{root}/\1/', code), names)
+    assert names["ok"].tolist() == [True, True, False] and np.isnan(names["pixels"][2]).all()
+    assert names["loaded"].form == "kalibr" and (tmp_path / "cameras.txt").exists()
+    assert names["flat"].shape == (480, 640) and names["table"].valid.any()
+    fields = {field.name for field in dataclasses.fields(pf.Camera)}
+    for name in re.findall(r"(?:amera|, `|`)\.(\w+)", "".join(re.findall(r"^\| `.*$", page, re.MULTILINE))):
+        assert hasattr(pf.Camera, name) or name in fields, name
 
 
 def test_turns_are_right_up_and_clockwise():
