@@ -325,6 +325,7 @@ ROS = (
 )
 BAD = [
     ("a: [1, 2", "line"),
+    ("", "the file is empty"),
     ("nothing: here", "not a camera calibration"),
     ("when: 2026-02-31\nwhat: !!timestamp never", "not a camera calibration"),
     ("1 OPENCV_FISHEYE 800 600 1 2 3", "8 belong"),

@@ -153,6 +153,8 @@ def load(
             data = stream.read(BYTES_MAX + 1)
     except OSError as error:
         raise ProfileError(path, None, error.strerror or str(error)) from None
+    if not data.strip():
+        raise ProfileError(path, None, "the file is empty")
     try:
         if form in (None, "binary") and (data[:4] == b"PFPR" or form == "binary"):
             return _own("binary", Camera.from_binary(data), camera, size, model, max_error, max_theta)
