@@ -250,10 +250,12 @@ void Tube::set_radius_bounds(Segment &segment, double largest, double from, doub
     b.by_ss = 0.75 * std::pow(a, 5) * f_s * f_s + 0.5 * a * a * a * f_ss;
     b.by_phiphi = 3.0 * std::pow(a, 5) * k * k + 2.0 * a * a * a * k;
     b.by_sphi = 0.75 * std::pow(a, 5) * f_s * 2.0 * k + 0.5 * a * a * a * 4.0 * l * l * l * segment.slope;
-    segment.calm = b;
+    segment.calm = segment.cover = b;
     for (const Relief *relief : segment.reliefs) {
         const HeightBounds more = relief->bounds(from, to);
         b.add(more);
+        segment.cover.add(relief->cover_bounds(from, to));
+        segment.cover_depth = std::max(segment.cover_depth, relief->cover_depth());
         if (relief->deposit < 0) {
             segment.calm.add(more);
         }
@@ -396,7 +398,8 @@ Frame3 Tube::ride(double s) const
     return frame(s);
 }
 
-double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const
+double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum,
+                       bool cover) const
 {
     Section sec = segment.constant;
     if (segment.varying) {
@@ -419,7 +422,7 @@ double Tube::radius_at(const Segment &segment, double s, double clock, double ux
     }
     for (const Relief *relief : segment.reliefs) {
         if (s > relief->from && s < relief->to) {
-            relief->add(s, clock, sum);
+            cover ? relief->add_cover(s, clock, sum) : relief->add(s, clock, sum);
         }
     }
     return sum.h;
