@@ -461,6 +461,18 @@ WallPoint Tube::to_section(const Segment &segment, const Eigen::Vector3d &p)
     return {segment.s0 + segment.bend_radius * std::atan2(p.z(), u), wrap_clock(std::atan2(x, -y)), std::hypot(x, y)};
 }
 
+int Tube::water_over(const Eigen::Vector3d &world) const
+{
+    WallPoint at{};
+    const int index = find(world, at);
+    const int water = index >= 0 ? segments_[static_cast<size_t>(index)].water : -1;
+    if (water < 0) {
+        return -1;
+    }
+    const WaterPlane &plane = planes_[static_cast<size_t>(water)];
+    return plane.normal.dot(world) < plane.level ? water : -1;
+}
+
 int Tube::find(const Eigen::Vector3d &world, WallPoint &out) const
 {
     double best = std::max(1.5 * radius_, 1.2 * largest_radius_);

@@ -98,6 +98,8 @@ public:
     // The nearest section through a world point within 1.5 radii of the centreline (or 1.2 of the largest). False when
     // there is none.
     bool locate(const Eigen::Vector3d &world, WallPoint &out) const;
+    // Index of the water that a world point in the pipe lies under, or -1.
+    int water_over(const Eigen::Vector3d &world) const;
 
 private:
     struct Segment;
