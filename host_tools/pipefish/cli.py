@@ -261,7 +261,8 @@ def run_simulate(args: argparse.Namespace) -> Result:
         room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
         return {"files": [args.contact_sheet]}, table([("written", args.contact_sheet)])
     if args.picture:
-        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set))
+        width = {} if args.width is None else {"width": args.width}
+        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set), **width)
         return {"files": [args.picture]}, table([("written", args.picture)])
     document = room.simulate(
         args.scene,
@@ -449,6 +450,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, help="of all that is random [the scene's]")
     p.add_argument("--frame", type=int, metavar="N", help="which, for --picture [at three quarters of the drive]")
 
+    p.add_argument("--width", type=positive, metavar="PIXELS", help="--picture is shrunk to [480]")
+
     def scene_is_named(args: argparse.Namespace, refuse: Callable[[str], None] = p.error) -> None:
         if args.scene is None and not (args.list or args.contact_sheet):
             refuse("which SCENE? `pipefish simulate --list` tells what there is")
@@ -456,8 +459,8 @@ def build_parser() -> argparse.ArgumentParser:
             refuse("--frames and --seed are for a recording: -o STEM")
         if args.set and not (args.output or args.picture):
             refuse("--set is for -o and --picture")
-        if args.frame is not None and not args.picture:
-            refuse("--frame is for --picture")
+        if not args.picture and (args.frame is not None or args.width is not None):
+            refuse("--frame and --width are for --picture")
 
     p.set_defaults(check=scene_is_named)
 
