@@ -128,6 +128,7 @@ class Data:
         names: dict[str, int] = {}
         self.frame_of = np.array([names.setdefault(v.name or f"\0{i}", len(names)) for i, v in enumerate(self.views)])
         self.frames = len(names)
+        self.renumbered: dict[int, Array] = {}  # motions of the board that gave a view's points other numbers
         self.camera_of = np.array([self.cameras.index(v.camera) for v in self.views])
         self.board_of = np.array([self.board_ids.index(v.board) for v in self.views])
         counts = [len(v.pixels) for v in self.views]
@@ -140,6 +141,13 @@ class Data:
         self.xyz = np.ascontiguousarray(
             np.concatenate([self.place(self.board_of[i], v.board_xyz) for i, v in enumerate(self.views)])
         )
+
+    def copy(self) -> Data:
+        """With points of its own; the views are shared."""
+        other = object.__new__(Data)
+        other.__dict__.update(self.__dict__)
+        other.xyz, other.renumbered = self.xyz.copy(), dict(self.renumbered)
+        return other
 
     def place(self, board: int, xyz: Array) -> Array:
         """The user's points of a board (index) in our frame of it."""
@@ -196,7 +204,14 @@ def check_views(views: Sequence[View], sizes: Sequence[tuple[int, int]]) -> None
     """Raises what makes a calibration impossible before it starts."""
     if len(views) < 3:
         raise CalibrationError(f"{len(views)} views are too few: give at least 3, better 15, tilted and near the rim")
+    seen: dict[tuple[str, int, int], int] = {}
     for i, view in enumerate(views):
+        first = seen.setdefault((view.name or f"\0{i}", view.board, view.camera), i)
+        if first != i:
+            raise CalibrationError(
+                f"views {first} and {i} are both of board {view.board} by camera {view.camera} at '{view.name}': views "
+                "of one name must differ in board or camera"
+            )
         label = f"view {i}" + (f" ({view.name})" if view.name else "")
         if len(view.pixels) < 4:
             raise CalibrationError(f"{label}: {len(view.pixels)} points are too few: at least 4 are needed")
@@ -209,7 +224,7 @@ def check_views(views: Sequence[View], sizes: Sequence[tuple[int, int]]) -> None
                 f"{label}: {outside.sum()} points lie outside the image of {width} x {height}: another camera's image, "
                 "or image_size is wrong"
             )
-        if len(np.unique(view.board_xyz, axis=0)) < len(view.board_xyz):
+        if len({p.tobytes() for p in view.board_xyz}) < len(view.board_xyz):
             raise CalibrationError(f"{label}: a point of the board is given twice")
 
 

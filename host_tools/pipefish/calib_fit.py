@@ -170,6 +170,7 @@ class Fit:
         self.model = Model()
         self.used: Mask = np.ones(len(data.pixels), dtype=bool)
         self.view_reason: dict[int, str] = {}
+        self.notes: list[str] = []
         self.sigma = np.ones(len(data.pixels))
         self.noise: list[tuple[Array, Array]] = []
         self.camera_linked = [False] * len(data.cameras)  # by frames to another camera: its pose is an unknown
@@ -183,6 +184,27 @@ class Fit:
         other.used, other.sigma = self.used.copy(), self.sigma.copy()
         other.view_reason = dict(self.view_reason)
         return other
+
+    def with_data(self, data: Data) -> Fit:
+        """The same state with other points of the boards."""
+        other = self.copy()
+        other.data = data
+        other.reload()
+        return other
+
+    def reload(self) -> None:
+        """A bundle for the points of the boards as they are numbered now, in the state of the old one."""
+        old, self.bundle = self.bundle, self.data.bundle()
+        for c in range(len(self.data.cameras)):
+            self.bundle.set_camera(c, old.camera(c))
+            self.bundle.set_camera_pose(c, old.camera_pose(c))
+        for b, board in enumerate(self.data.boards):
+            self.bundle.set_board_pose(b, old.board_pose(b))
+            self.bundle.set_shape(b, old.shape(b), *board.centre, board.half)
+        for f in range(self.data.frames):
+            self.bundle.set_frame(f, old.frame(f))
+        self.bundle.set_used(self.used)
+        self.bundle.set_sigma(self.sigma)
 
     # ------------------------------------------------------------------ state
 
@@ -398,25 +420,34 @@ def assemble(fit: Fit, view_poses: dict[int, Array]) -> None:
 # ---------------------------------------------------------------------- what is wrong with a view
 
 
-def diagnose(data: Data, view: int) -> str:
-    """Why a view fits no pose: its points' order, or its camera. A smooth map from the board to the image exists
-    whatever the lens; where there is none, points and board do not go together."""
+def smooth_error(data: Data, view: int) -> float | None:
+    """Median distance, pixels, to the best smooth map from the board to the image, which exists whatever the lens is:
+    a polynomial of degree 2 to 4; None for few points or a board that is not plane."""
     part = data.of_view(view)
     board, pixels = data.xyz[part], data.pixels[part]
     if not data.boards[data.board_of[view]].planar or len(board) < 15:
-        return "no pose of the board explains it"
-    middle, size = board[:, :2].mean(axis=0), np.ptp(board[:, :2], axis=0).max()
-    x, y = ((board[:, :2] - middle) / size * 2).T
-    degree = 3 if len(board) >= 30 else 2
+        return None
+    x, y = ((board[:, :2] - board[:, :2].mean(axis=0)) / np.ptp(board[:, :2], axis=0).max() * 2).T
+    degree = 4 if len(board) >= 45 else 3 if len(board) >= 30 else 2
     basis = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = np.ones(len(board))
+    error = weight
     for _ in range(8):
         solved = np.linalg.lstsq(basis * weight[:, None], pixels * weight[:, None], rcond=None)[0]
         error = np.hypot(*(pixels - basis @ solved).T)
         weight = 1 / (1 + (error / (2 * np.median(error) + 1e-9)) ** 2)
+    return float(np.median(error))
+
+
+def diagnose(data: Data, view: int) -> str:
+    """Why a view fits no pose: its points' order, or its camera."""
+    error = smooth_error(data, view)
+    if error is None:
+        return "no pose of the board explains it"
+    pixels = data.pixels[data.of_view(view)]
     gaps = np.hypot(*(pixels[:, None] - pixels[None]).transpose(2, 0, 1))
     np.fill_diagonal(gaps, np.inf)
-    if np.median(error) > 0.2 * np.median(gaps.min(axis=1)):
+    if error > 0.2 * np.median(gaps.min(axis=1)):
         return "its points do not lie on the board as given: wrong board size (rows, columns), or their order is mixed"
     return "it shows the board, but not through this lens: the image of another camera, or another board"
 

@@ -23,20 +23,20 @@ _NEAR, _FAR = math.radians(30), math.radians(80)  # a wall point is seen at both
 class Uncertainty:
     """Covariance of one camera with the poses that it came from, for the uncertainty of projections.
 
-    border (G, G): of camera, rig and boards; slope (G of it, n): parameters (41) by the border's unknowns; frames: for
-    each used one its translation (3,), slope (6, G) and own covariance (6, 6). All scaled by the residuals.
+    border (G, G): covariance of the unknowns of cameras, rig and boards. parameter_slope (41, G): the parameters by
+    them. The frames' poses stand for the world, on average: a small motion (turn, shift) of it in the rig, motion_slope
+    (6, G) by the border's unknowns and motion_own (6, 6), the covariance of the rest. All scaled by the residuals.
     """
 
     border: Array
-    parameter_slope: Array  # (41, G)
+    parameter_slope: Array
     free: list[int]
-    rig: Array  # camera from rig (3, 4)
-    rig_slope: Array  # (6, G)
-    translations: Array  # (F, 3)
-    slopes: Array  # (F, 6, G)
-    alone: Array  # (F, 6, 6)
-    distance: float  # metres: of the boards, median
-    scale: float  # s: of residuals to what their noise says
+    rig: Array  #: camera from rig (3, 4)
+    rig_slope: Array  #: its motion by the border's unknowns, (6, G)
+    motion_slope: Array
+    motion_own: Array
+    distance: float  #: metres: of the boards, median
+    scale: float  #: of the residuals to what their noise says
     camera: Camera | None = None
 
     def parameters(self) -> Array:
@@ -45,53 +45,43 @@ class Uncertainty:
         out = slope @ self.border @ slope.T
         return (out + out.T) / 2
 
+    def _slopes(self, pixels: Array, distance: Array | float | None) -> tuple[Array, Array]:
+        """Of where the points of pixels (N, 2) are seen: by the border's unknowns (N, 2, G), by the world's own motion
+        (N, 2, 6)."""
+        assert self.camera is not None
+        rays, _ = self.camera.unproject(pixels)
+        given = np.broadcast_to(np.asarray(self.distance if distance is None else distance, dtype=float), len(pixels))
+        near = np.isfinite(given)
+        points = rays * np.where(near, given, 1.0)[:, None] + self.camera.origins(pixels)
+        _, _, by_point, by_parameter = self.camera.project_jacobian(np.nan_to_num(points, nan=1.0))
+        by_point = np.where(np.isfinite(rays).all(axis=1)[:, None, None], by_point, np.nan)
+        rotation, shift = self.rig[:, :3], self.rig[:, 3] * near[:, None]
+
+        def moved(x: Array) -> Array:
+            return np.concatenate([-_cross(x), np.eye(3) * near[:, None, None]], axis=2)
+
+        by_motion = by_point @ rotation @ moved((points - shift) @ rotation)
+        by_border = by_parameter @ self.parameter_slope + by_motion @ self.motion_slope
+        return by_border + by_point @ moved(points - shift) @ self.rig_slope, by_motion
+
     def joint(self, pixels: Array, distance: Array | float | None = None) -> Array:
         """Covariance (2N, 2N) of where the points of `pixels` (N, 2) at `distance` metres (boards' median, inf: at
         infinity) are seen, by mrcal's definition: points fixed to the boards' frames, which stand for the world, move
         with the poses; the camera sees them with its own error. NaN outside the model."""
-        assert self.camera is not None
-        pixels = np.atleast_2d(np.asarray(pixels, dtype=float))
-        rays, _ = self.camera.unproject(pixels)
-        given = np.broadcast_to(np.asarray(self.distance if distance is None else distance, dtype=float), len(pixels))
-        far = ~np.isfinite(given)
-        reach = np.where(far, 1.0, given)
-        points = rays * reach[:, None] + self.camera.origins(pixels)
-        _, _, by_point, by_parameter = self.camera.project_jacobian(np.nan_to_num(points, nan=1.0))
-        by_point = np.where(np.isfinite(rays).all(axis=1)[:, None, None], by_point, np.nan)
-        rotation, shift = self.rig[:, :3], self.rig[:, 3]
-        in_rig = (points - shift) @ rotation  # before the camera's own pose
-        count = len(self.translations)
-        # By each frame's pose: K = [-[x - t]x, 1], x in the rig; at infinity only the turn counts.
-        arms = in_rig[None] - self.translations[:, None]
-        arms = np.where(far[None, :, None], in_rig[None] + (rotation.T @ shift)[None, None], arms)
-        k = np.zeros((count, len(pixels), 3, 6))
-        k[..., :3] = -_cross(arms)
-        k[..., 3:] = np.eye(3) * ~far[:, None, None]
-        jk = np.einsum("nij,jk,fnkl->fnil", by_point, rotation, k)
-        m = np.einsum("nip,pg->nig", by_parameter, self.parameter_slope) + np.einsum(
-            "fnil,flg->nig", jk / count, self.slopes
-        )
-        own = np.zeros((len(pixels), 3, 6))
-        own[:, :, :3] = -_cross(np.where(far[:, None], points, points - shift))
-        own[:, :, 3:] = np.eye(3) * ~far[:, None, None]
-        m += np.einsum("nij,njl,lg->nig", by_point, own, self.rig_slope)
-        m = m.reshape(2 * len(pixels), -1)
-        jk = jk.reshape(count, 2 * len(pixels), 6) / count
-        half = np.einsum("fml,flk->fmk", jk, np.linalg.cholesky(self.alone))
-        half = half.transpose(1, 0, 2).reshape(2 * len(pixels), -1)
-        return m @ self.border @ m.T + half @ half.T
+        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        m, k = m.reshape(2 * len(m), -1), k.reshape(2 * len(k), 6)
+        return m @ self.border @ m.T + k @ self.motion_own @ k.T
+
+    def covariances(self, pixels: Array, distance: Array | float | None = None) -> Array:
+        """The blocks of `joint` of each pixel, (N, 2, 2)."""
+        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        return m @ self.border @ m.swapaxes(1, 2) + k @ self.motion_own @ k.swapaxes(1, 2)
 
     def sigma(self, pixels: Array, distance: float | None = None) -> Array:
         """Standard deviation (N,) in the worst direction, pixels, of where points are seen; see `joint`."""
-        pixels = np.atleast_2d(np.asarray(pixels, dtype=float))
-        out = np.full(len(pixels), np.nan)
-        for part in np.array_split(np.arange(len(pixels)), max(1, len(pixels) // 64)):
-            joint = self.joint(pixels[part], distance)
-            for i, n in enumerate(part):
-                block = joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
-                if np.isfinite(block).all():
-                    out[n] = math.sqrt(max(float(np.linalg.eigvalsh(block)[1]), 0.0))
-        return out
+        c = self.covariances(pixels, distance)
+        half, difference = (c[:, 0, 0] + c[:, 1, 1]) / 2, (c[:, 0, 0] - c[:, 1, 1]) / 2
+        return np.sqrt(np.maximum(half + np.hypot(difference, c[:, 0, 1]), 0.0))
 
     def diameter(self, dn_mm: float) -> dict[str, float]:
         """What the calibration alone leaves open of the mean diameter of a pipe, millimetres, one standard deviation:
@@ -165,6 +155,9 @@ def covariance_of(fit: Fit, noise: str) -> list[Uncertainty]:
             rig_slope[:, pose_at[c] : pose_at[c] + 6] = np.eye(6)
         mine = fit.used & (data.camera_of[data.view_of] == c)
         seen = np.unique(data.frame_of[data.view_of[mine]])
+        # A pose turns about its own origin, which lies off the rig's.
+        arms = np.tile(np.eye(6), (len(seen), 1, 1))
+        arms[:, 3:, :3] = _cross(np.array([bundle.frame(int(f))[:, 3] for f in seen]))
         out.append(
             Uncertainty(
                 border=border * square,
@@ -172,9 +165,8 @@ def covariance_of(fit: Fit, noise: str) -> list[Uncertainty]:
                 free=fit.model.parameters,
                 rig=bundle.camera_pose(c),
                 rig_slope=rig_slope,
-                translations=np.array([bundle.frame(int(f))[:, 3] for f in seen]),
-                slopes=slopes[seen],
-                alone=alone[seen] * square,
+                motion_slope=(arms @ slopes[seen]).mean(axis=0),
+                motion_own=(arms @ alone[seen] @ arms.swapaxes(1, 2)).sum(axis=0) * square / len(seen) ** 2,
                 distance=float(np.median(np.linalg.norm(points[mine], axis=1))),
                 scale=math.sqrt(square),
             )
@@ -327,11 +319,8 @@ def _marginal(uncertainty: Uncertainty, profile: Any, pixels: Array, fit: Fit, i
             continue
     if uncertainty.camera is None:
         return np.full(len(pixels), np.nan)
-    out = []
-    for part in np.array_split(pixels, max(1, len(pixels) // 64)):
-        variance = np.diag(uncertainty.joint(part, math.inf)).reshape(-1, 2).mean(axis=1)
-        out.append(variance[np.isfinite(variance)])
-    return np.array([np.mean(np.concatenate(out))])
+    variance = np.trace(uncertainty.covariances(pixels, math.inf), axis1=1, axis2=2) / 2
+    return np.array([np.nanmean(variance)])
 
 
 # ---------------------------------------------------------------------- the report
@@ -344,7 +333,6 @@ def describe(
     notes: list[str],
     cameras: dict[int, Camera],
     uncertainty: list[Uncertainty],
-    poses: Array,
 ) -> dict[str, Any]:
     """Everything that a report of the calibration shows, as plain values."""
     data = fit.data
@@ -416,9 +404,6 @@ def describe(
         report["notes"].append(
             "every view shows the board mirrored: seen through a mirror, or its X and Y are not right and down"
         )
-    elif any(h < 0 for h in hands):
-        few = [data.label(v) for v in range(len(hands)) if hands[v] == (-1 if sum(hands) > 0 else 1)]
-        report["notes"].append(f"numbered mirrored against the other views: {', '.join(few)}")
     for c, number in enumerate(data.cameras):
         camera = cameras[number]
         knots, sigma = fit.noise[c]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -32,6 +33,7 @@ from .calib_data import (
 )
 from .calib_fit import Fit, Single, assemble, diagnose
 from .calib_model import Model, named
+from .calib_order import by_shape, consistent, same_side
 from .calib_report import Uncertainty, covariance_of, describe
 from .camera import PARAMETERS, Camera, Provenance
 from .errors import ArgumentError, ProfileError
@@ -71,7 +73,7 @@ class Calibration:
     camera: of camera 0 of the rig (cameras: all, by index). poses: camera from board for each view (V, 3, 4), NaN for
     rejected ones. camera_poses: camera from rig (3, 4) by index, the first one is the rig. boards: by index; board: the
     first one. rms: root mean square distance of the used points, pixels. covariance: (n, n) over
-    camera.covariance_parameters. uncertainty: of projections. report: all of it, as plain values (docs/calibration.md).
+    camera.covariance_parameters. uncertainty: of projections, by camera. report: all of it, as plain values.
     """
 
     camera: Camera
@@ -84,8 +86,14 @@ class Calibration:
     covariance: Array
     covariances: dict[int, Array]
     uncertainty: dict[int, Uncertainty]
-    report: dict[str, Any]
     model: str
+    circle_radius: float
+    _describe: Callable[[], dict[str, Any]] = dataclasses.field(repr=False)
+
+    @functools.cached_property
+    def report(self) -> dict[str, Any]:
+        """Everything that a report shows (docs/calibration.md); made when first asked for."""
+        return self._describe()
 
     def test(self, views: Sequence[View]) -> float:
         """Root mean square distance, pixels, over all points of other views: cameras and boards as they are, poses
@@ -100,7 +108,7 @@ class Calibration:
                 raise ArgumentError(f"{view.label}: camera {view.camera} or board {view.board} was not calibrated")
         size = max(self.cameras) + 1
         sizes = [(self.camera.width, self.camera.height)] * size
-        data = Data(views, sizes, self.report["circle_radius_m"])
+        data = Data(views, sizes, self.circle_radius)
         data.boards = [self.boards[b].frame for b in data.board_ids]
         data.xyz = np.ascontiguousarray(
             np.concatenate([data.place(int(data.board_of[i]), v.board_xyz) for i, v in enumerate(views)])
@@ -151,6 +159,7 @@ def _view_poses(fit: Fit) -> Array:
                 fit.bundle.camera_pose(int(data.camera_of[v])),
                 fit.bundle.frame(int(data.frame_of[v])),
                 fit.bundle.board_pose(int(data.board_of[v])),
+                data.renumbered.get(v, np.eye(3, 4)),
                 data.boards[data.board_of[v]].plane,
             )
             for v in range(len(data.views))
@@ -197,23 +206,29 @@ def calibrate(
     tell("start values", 0.0)
     fit = _start(data, image_circle)
     tell("p9 on a flat board", 0.1)
-    notes = _settle(fit, Model(), noise, robust)
+    _settle(fit, Model(), noise, robust)
+    notes = fit.notes
+    _refuse_one_pose(fit)
     flat = fit.copy()
     table: list[dict[str, Any]] = []
+    if board == "shape" and robust:
+        _by_shape(fit, noise)
     if asked is None:
         chosen, table = choose(fit, board == "shape", lambda share: tell("choice of the model", 0.15 + 0.75 * share))
     else:
         chosen = asked
     if chosen != Model():
         fit.descend(chosen)
-        notes += _settle(fit, chosen, noise, robust)
+        _settle(fit, chosen, noise, robust)
     tell("uncertainty", 0.92)
     return _result(fit, flat, table, notes, asked is None, noise, robust, image_circle, name)
 
 
 def _start(data: Data, image_circle: tuple[float, float, float] | None) -> Fit:
     """Every camera alone, then the rig."""
+    refused = same_side(data)
     fit = Fit(data)
+    fit.notes += [f"{data.label(v)}: its points were numbered mirrored; put right" for v in sorted(data.renumbered)]
     poses: dict[int, Array] = {}
     cameras = {}
     for c in range(len(data.cameras)):
@@ -224,12 +239,22 @@ def _start(data: Data, image_circle: tuple[float, float, float] | None) -> Fit:
         cameras[c] = single.bundle.camera(c)
         medians = single.view_errors(single.bundle)
         for i, v in enumerate(single.views):
-            if single.lost[i] or medians[i] > max(8 * single.median, 0.5):
+            if v in refused:
+                fit.reject_view(v, refused[v])
+            elif single.lost[i] or medians[i] > max(8 * single.median, 0.5):
                 fit.reject_view(v, diagnose(data, v))
             else:
                 poses[v] = single.bundle.frame(i)
     _refuse_too_many(fit)
     assemble(fit, poses)
+    if len(poses) > len({int(data.frame_of[v]) for v in poses}):  # a rig
+        before = dict(data.renumbered)
+        poses = consistent(fit, poses)
+        turned = sorted(v for v in data.renumbered if before.get(v) is not data.renumbered[v])
+        fit.notes += [f"{data.label(v)}: its points were numbered the other way round; put right" for v in turned]
+        if turned:
+            fit.reload()
+            assemble(fit, poses)
     for c, profile in cameras.items():
         fit.bundle.set_camera(c, profile)
     return fit
@@ -260,14 +285,47 @@ def _refuse_too_many(fit: Fit) -> None:
             )
 
 
-def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> list[str]:
+def _by_shape(fit: Fit, noise: str) -> None:
+    """Numbers the views as the board's shape says, in as many turns as change something."""
+    shaped = fit.copy()
+    for _ in range(4):
+        shaped.fit(Model(shape="z2"), iterations=15, tolerance=1e-5)
+        changed = by_shape(shaped)
+        fit.notes += changed
+        if not changed:
+            break
+    if fit.data.renumbered:
+        fit.bundle = shaped.bundle
+        fit.fit(Model(), iterations=30, tolerance=1e-8)
+        fit.measure_noise(noise)
+
+
+def _refuse_one_pose(fit: Fit) -> None:
+    """Fewer than three poses of the board that differ say too little, however many views there are."""
+    poses = _view_poses(fit)[fit.used_views()]
+    distinct: list[Array] = []
+    for pose in poses:
+        near = False
+        for other in distinct:
+            turn = float(np.arccos(np.clip((np.trace(pose[:, :3] @ other[:, :3].T) - 1) / 2, -1, 1)))
+            near |= turn < 0.02 and bool(np.linalg.norm(pose[:, 3] - other[:, 3]) < 0.03 * np.linalg.norm(pose[:, 3]))
+        if not near:
+            distinct.append(pose)
+        if len(distinct) >= 3:
+            return
+    raise CalibrationError(
+        f"the views show the board in {len(distinct)} pose{'s' if len(distinct) > 1 else ''} only: move and tilt it "
+        "between views, at least 3 poses are needed, better 15"
+    )
+
+
+def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> None:
     """Fits a model with noise and rejections that go with it."""
     if not robust:
         fit.sigma[:] = max(float(np.median(fit.errors()[fit.used])), 1e-6)
         fit.fit(model, huber=0.0, iterations=200, tolerance=1e-14)
         fit.measure_noise("uniform")
-        return []
-    notes: list[str] = []
+        return
     fit.measure_noise(noise)
     fit.fit(model, iterations=40, tolerance=1e-6)
     for _ in range(6):
@@ -287,7 +345,6 @@ def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> list[str]:
         if changed <= 0.0005 * len(fit.used):
             break
     fit.fit(model, tolerance=1e-12)
-    return notes
 
 
 def _result(
@@ -314,7 +371,10 @@ def _result(
     for c, number in enumerate(data.cameras):
         uncertainty[c].camera = cameras[number]
     boards = {number: _board(fit, b) for b, number in enumerate(data.board_ids)}
-    report = describe(fit, flat, table, notes, cameras, uncertainty, poses)
+
+    def report() -> dict[str, Any]:
+        return describe(fit, flat, table, notes, cameras, uncertainty) | {"noise": noise, "robust": robust}
+
     first = data.cameras[0]
     return Calibration(
         camera=cameras[first],
@@ -327,8 +387,9 @@ def _result(
         covariance=cameras[first].covariance,
         covariances={n: cameras[n].covariance for n in data.cameras},
         uncertainty={n: uncertainty[c] for c, n in enumerate(data.cameras)},
-        report=report | {"noise": noise, "robust": robust},
         model=fit.model.name,
+        circle_radius=data.circle_radius,
+        _describe=report,
     )
 
 
