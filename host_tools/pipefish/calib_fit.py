@@ -343,6 +343,19 @@ class Fit:
             out[mine] = np.interp(theta[mine], knots, sigma)
         return out
 
+    def misfits(self) -> list[int]:
+        """Used views that the others' camera does not explain: well above what is usual, and above what a smooth map
+        leaves of them."""
+        medians = self.view_medians()
+        overall = float(np.median(self.errors()[self.used]))
+        found = []
+        for v in np.flatnonzero(medians > max(4 * overall, 0.3)):
+            smooth = smooth_error(self.data, int(v))
+            above = medians[v] > 3 * smooth if smooth is not None else medians[v] > max(8 * overall, 0.5)
+            if int(v) not in self.view_reason and above:
+                found.append(int(v))
+        return found
+
     def view_medians(self) -> Array:
         """Median distance of the points of each view, pixels."""
         error = self.errors()

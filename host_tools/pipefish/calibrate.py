@@ -32,6 +32,7 @@ from .calib_data import (
     image_sizes,
 )
 from .calib_fit import Fit, Single, assemble, diagnose
+from .calib_mixed import refuse_two_cameras
 from .calib_model import Model, named
 from .calib_order import by_shape, consistent, same_side
 from .calib_report import Uncertainty, covariance_of, describe
@@ -40,7 +41,7 @@ from .errors import ArgumentError, ProfileError
 
 __all__ = ["Board", "Calibration", "CalibrationError", "View", "calibrate"]
 
-_MOST_LOST = 0.35  # of the views; with more rejected, nobody knows which ones are right
+_MOST_LOST = 0.3  # of the views; with more rejected, nobody knows which ones are right
 _BEYOND = 1.4  # of the largest angle observed: a polynomial says nothing of the lens farther out
 
 
@@ -209,6 +210,7 @@ def calibrate(
     _settle(fit, Model(), noise, robust)
     notes = fit.notes
     _refuse_one_pose(fit)
+    refuse_two_cameras(fit)
     flat = fit.copy()
     table: list[dict[str, Any]] = []
     if board == "shape" and robust:
@@ -330,15 +332,12 @@ def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> None:
     fit.fit(model, iterations=40, tolerance=1e-6)
     for _ in range(6):
         fit.measure_noise(noise)
-        medians = fit.view_medians()
-        overall = float(np.median(fit.errors()[fit.used]))
-        for v in np.flatnonzero(medians > max(8 * overall, 0.5)):
-            if int(v) not in fit.view_reason:
-                fit.reject_view(int(v), diagnose(fit.data, int(v)))
+        for v in fit.misfits():
+            fit.reject_view(v, diagnose(fit.data, v))
         changed = fit.reject_points()
         for v in range(len(fit.data.views)):
             part = fit.data.of_view(v)
-            if v not in fit.view_reason and fit.used[part].sum() < max(4, 0.4 * len(fit.used[part])):
+            if v not in fit.view_reason and fit.used[part].sum() < max(4, 0.7 * len(fit.used[part])):
                 fit.reject_view(v, f"only {fit.used[part].sum()} of its {len(fit.used[part])} points fit")
         _refuse_too_many(fit)
         fit.fit(model, iterations=40, tolerance=1e-6)
