@@ -40,7 +40,8 @@ def refuse_two_cameras(fit: Fit) -> None:
         if len(few) >= 2:
             raise CalibrationError(
                 f"two lenses explain the views {1 / gain:.1f} times better than one: images of two cameras, or of "
-                f"boards of two sizes, are mixed: {', '.join(few[:6])}{', ...' if len(few) > 6 else ''} against the others"
+                f"boards of two sizes, are mixed: {', '.join(few[:6])}{', ...' if len(few) > 6 else ''} "
+                "against the others"
             )
 
 

@@ -31,7 +31,7 @@ from .calib_data import (
     homogeneous,
     image_sizes,
 )
-from .calib_fit import Fit, Single, assemble, diagnose
+from .calib_fit import Fit, Single, assemble, diagnose, smooth_error
 from .calib_mixed import refuse_two_cameras
 from .calib_model import Model, named
 from .calib_order import by_shape, consistent, same_side
@@ -335,10 +335,15 @@ def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> None:
         for v in fit.misfits():
             fit.reject_view(v, diagnose(fit.data, v))
         changed = fit.reject_points()
+        data, error = fit.data, fit.errors()
         for v in range(len(fit.data.views)):
-            part = fit.data.of_view(v)
-            if v not in fit.view_reason and fit.used[part].sum() < max(4, 0.7 * len(fit.used[part])):
-                fit.reject_view(v, f"only {fit.used[part].sum()} of its {len(fit.used[part])} points fit")
+            part = data.of_view(v)
+            kept = int(fit.used[part].sum())
+            if v in fit.view_reason or kept >= 0.7 * len(fit.used[part]):
+                continue
+            smooth = smooth_error(data, v)  # corners found badly, or another lens?
+            if kept < max(4, 0.4 * len(fit.used[part])) or not smooth or np.median(error[part]) > 2 * smooth:
+                fit.reject_view(v, f"only {kept} of its {len(fit.used[part])} points fit")
         _refuse_too_many(fit)
         fit.fit(model, iterations=40, tolerance=1e-6)
         if changed <= 0.0005 * len(fit.used):
