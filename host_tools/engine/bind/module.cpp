@@ -3,6 +3,7 @@
 
 namespace nb = nanobind;
 
+void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
@@ -10,7 +11,8 @@ void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
+    m.doc() = "Compiled part of pipefish: camera model, calibration, link and simulator.";
+    bind_calib(m);
     bind_camera(m);
     bind_link(m);
     bind_sim(m);
