@@ -15,6 +15,8 @@ _LAZY = {
     "Scene": "pipefish.simulate",
     "Studio": "pipefish.studio",
     "Target": "pipefish.target",
+    "Detection": "pipefish.detect",
+    "detect_target": "pipefish.detect",
     "simulate_target_views": "pipefish.studio_targets",
     "simulate_two_views": "pipefish.studio_pairs",
     "simulate_objects": "pipefish.studio_objects",

@@ -521,8 +521,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     from pipefish.cli_profile import add_profile, add_profile_input  # they need what stands above
+    from pipefish.cli_target import add_target
 
     add_profile(commands)
+    add_target(commands)
 
     p = add_command(
         commands,

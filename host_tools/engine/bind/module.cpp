@@ -5,15 +5,17 @@ namespace nb = nanobind;
 
 void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
+void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, calibration, link and simulator.";
+    m.doc() = "Compiled part of pipefish: camera model, calibration, target detector, link and simulator.";
     bind_calib(m);
     bind_camera(m);
+    bind_detect(m);
     bind_link(m);
     bind_sim(m);
     bind_sim_studio(m);
