@@ -46,6 +46,10 @@
       for (const key of ["xaxis", "yaxis", "yaxis2"]) {
         if (chart.layout[key]) axes[key] = axis;
       }
+      if (chart.layout.polar) {
+        const ring = { gridcolor: colour("--line"), linecolor: colour("--line"), tickfont: { size: 11 } };
+        axes.polar = { radialaxis: ring, angularaxis: ring };
+      }
       const whole = merge(merge(layout, axes), chart.layout);
       Plotly.react("plot-" + chart.id, chart.data, whole, { displayModeBar: false, responsive: true });
     }
