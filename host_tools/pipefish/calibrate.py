@@ -291,7 +291,7 @@ def _by_shape(fit: Fit, noise: str) -> None:
     """Numbers the views as the board's shape says, in as many turns as change something."""
     shaped = fit.copy()
     for _ in range(4):
-        shaped.fit(Model(shape="z2"), iterations=15, tolerance=1e-5)
+        shaped.fit(Model(shape="z4"), iterations=15, tolerance=1e-5)  # z2 looks the same from both ends
         changed = by_shape(shaped)
         fit.notes += changed
         if not changed:
