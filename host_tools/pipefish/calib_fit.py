@@ -445,9 +445,10 @@ def smooth_error(data: Data, view: int) -> float | None:
     basis = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = np.ones(len(board))
     error = weight
-    for _ in range(8):
-        solved = np.linalg.lstsq(basis * weight[:, None], pixels * weight[:, None], rcond=None)[0]
-        error = np.hypot(*(pixels - basis @ solved).T)
+    for _ in range(4):
+        weighted = basis * weight[:, None] ** 2
+        normal = weighted.T @ basis + 1e-9 * len(board) * np.eye(basis.shape[1])
+        error = np.hypot(*(pixels - basis @ np.linalg.solve(normal, weighted.T @ pixels)).T)
         weight = 1 / (1 + (error / (2 * np.median(error) + 1e-9)) ** 2)
     return float(np.median(error))
 

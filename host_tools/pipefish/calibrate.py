@@ -348,7 +348,7 @@ def _settle(fit: Fit, model: Model, noise: str, robust: bool) -> None:
         fit.fit(model, iterations=40, tolerance=1e-6)
         if changed <= 0.0005 * len(fit.used):
             break
-    fit.fit(model, tolerance=1e-12)
+    fit.fit(model, tolerance=1e-10)
 
 
 def _result(
