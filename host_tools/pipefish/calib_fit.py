@@ -198,6 +198,7 @@ class Fit:
         for c in range(len(self.data.cameras)):
             self.bundle.set_camera(c, old.camera(c))
             self.bundle.set_camera_pose(c, old.camera_pose(c))
+            self.bundle.set_corner(c, old.corner(c), False)
         for b, board in enumerate(self.data.boards):
             self.bundle.set_board_pose(b, old.board_pose(b))
             self.bundle.set_shape(b, old.shape(b), *board.centre, board.half)
@@ -231,6 +232,7 @@ class Fit:
         self.model = model
         for c in range(len(self.data.cameras)):
             self._clear(c, model)
+            self.bundle.set_corner(c, self.bundle.corner(c) if model.corner else [0.0, 0.0], bool(model.corner))
         for b, board in enumerate(self.data.boards):
             kept = set(model.shape_terms)
             shape = [value if i in kept else 0.0 for i, value in enumerate(self.bundle.shape(b))]
@@ -281,6 +283,7 @@ class Fit:
         """Leaves only the frames' poses free, with the points that are used now, in least squares."""
         for c in range(len(self.data.cameras)):
             self.bundle.free_camera(c, [], False)
+            self.bundle.set_corner(c, self.bundle.corner(c), False)
         for b in range(len(self.data.boards)):
             self.bundle.free_board(b, [], False)
         self.bundle.set_used(self.used)

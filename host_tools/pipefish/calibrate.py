@@ -89,6 +89,7 @@ class Calibration:
     uncertainty: dict[int, Uncertainty]
     model: str
     circle_radius: float
+    corner_shifts: dict[int, tuple[float, float]]  #: of checkerboard corners by their detector, by camera (docs)
     _describe: Callable[[], dict[str, Any]] = dataclasses.field(repr=False)
 
     @functools.cached_property
@@ -117,6 +118,7 @@ class Calibration:
         fit = Fit(data)
         for i, c in enumerate(data.cameras):
             fit.bundle.set_camera(i, self.cameras[c]._profile)
+            fit.bundle.set_corner(i, list(self.corner_shifts[c]), False)
         for i, b in enumerate(data.board_ids):
             board = self.boards[b]
             fit.bundle.set_shape(i, list(board.coefficients), *board.frame.centre, board.frame.half)
@@ -394,6 +396,7 @@ def _result(
         uncertainty={n: uncertainty[c] for c, n in enumerate(data.cameras)},
         model=fit.model.name,
         circle_radius=data.circle_radius,
+        corner_shifts={n: tuple(fit.bundle.corner(c)) for c, n in enumerate(data.cameras)},
         _describe=report,
     )
 
