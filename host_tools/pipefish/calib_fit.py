@@ -18,8 +18,8 @@ Mask = npt.NDArray[np.bool_]
 
 _THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median of the distance in units of sigma per axis
-_HUBER = 3.0  # sigma: the mild bend
-_GROSS = 5.5  # sigma: a point beyond is no measurement of this corner (one in 4 million of Gaussian noise)
+_HUBER = 5.0  # sigma: the mild bend; real corners have tails that Gaussian noise has not
+_GROSS = 10.0  # sigma: a point beyond is no measurement of this corner
 
 
 def errors_of(bundle: _engine.Bundle, data_pixels: Array) -> Array:
@@ -363,6 +363,18 @@ class Fit:
         """Median distance of the points of each view, pixels."""
         error = self.errors()
         return np.array([np.median(error[self.data.of_view(v)]) for v in range(len(self.data.views))])
+
+
+def view_pose(fit: Fit, view: int) -> Array:
+    """Camera from our frame of the board (3, 4)."""
+    data, bundle = fit.data, fit.bundle
+    return np.ascontiguousarray(
+        compose(
+            bundle.camera_pose(int(data.camera_of[view])),
+            bundle.frame(int(data.frame_of[view])),
+            bundle.board_pose(int(data.board_of[view])),
+        )
+    )
 
 
 # ---------------------------------------------------------------------- rigs

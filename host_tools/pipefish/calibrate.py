@@ -31,7 +31,7 @@ from .calib_data import (
     homogeneous,
     image_sizes,
 )
-from .calib_fit import Fit, Single, assemble, diagnose, smooth_error
+from .calib_fit import Fit, Single, assemble, diagnose, smooth_error, view_pose
 from .calib_mixed import refuse_two_cameras
 from .calib_model import Model, named
 from .calib_order import by_shape, consistent, same_side
@@ -159,9 +159,7 @@ def _view_poses(fit: Fit) -> Array:
     return np.array(
         [
             compose(
-                fit.bundle.camera_pose(int(data.camera_of[v])),
-                fit.bundle.frame(int(data.frame_of[v])),
-                fit.bundle.board_pose(int(data.board_of[v])),
+                view_pose(fit, v),
                 data.renumbered.get(v, np.eye(3, 4)),
                 data.boards[data.board_of[v]].plane,
             )
