@@ -22,7 +22,10 @@
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
-#define CLIP_CHANGE  20u /* a twentieth of the window: with it the worst is at 5 sigma */
+/* px^2, Q20: beyond 0.3 px of standard deviation (root of the sum of both variances) it is no longer known well enough
+ * that this is the point first seen. Covariances leave out what light does to relief: then errors are twice as large */
+#define VAGUE       94372u
+#define CLIP_CHANGE 20u /* a twentieth of the window: with it the worst is at 5 sigma */
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
 {
@@ -440,7 +443,9 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
     if (is_expected && has_near)
         e->at = (pf_point_q16){pf_guess_clamp((int64_t)given.x + miss.x, t->config.width),
                                pf_guess_clamp((int64_t)given.y + miss.y, t->config.height)};
-    const pf_track_reason reason = seek(t, track, slot, has_near ? &around : NULL);
+    pf_track_reason reason = seek(t, track, slot, has_near ? &around : NULL);
+    if (reason == PF_TRACK_OK && (uint64_t)track->cov_xx_q20 + track->cov_yy_q20 > VAGUE)
+        reason = PF_TRACK_DRIFT;
     e->at.x = PF_NO_GUESS;
     s->miss = (pf_point_q16){0, 0};
     if (is_expected && reason == PF_TRACK_OK)
