@@ -422,12 +422,13 @@ static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const
         return PF_TRACK_OK;
     for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
-    if (!worth_another(reason) || !around)
+    pf_point_q16 near = around ? *around : (pf_point_q16){0, 0}, miss;
+    if (!worth_another(reason) || (!around && !look_around(t, track->pos, &near, &miss)))
         return reason;
     for (uint32_t i = 0; i < n; i++)
-        if (!farther(*around, start[i], SAME_START))
+        if (!farther(near, start[i], SAME_START))
             return reason;
-    return may_try(t) ? attempt(t, track, slot, *around, top, 0, &other) : reason;
+    return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
 }
 
 /* Finds one track. What is expected of it is first put right by how far its neighbours were from where they were
@@ -439,7 +440,7 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
     const pf_point_q16 given = e->at;
     const bool is_expected = given.x != PF_NO_GUESS;
     pf_point_q16 around, miss;
-    const bool has_near = look_around(t, track->pos, &around, &miss);
+    const bool has_near = (is_expected || track->age == 0) && look_around(t, track->pos, &around, &miss);
     if (is_expected && has_near)
         e->at = (pf_point_q16){pf_guess_clamp((int64_t)given.x + miss.x, t->config.width),
                                pf_guess_clamp((int64_t)given.y + miss.y, t->config.height)};
