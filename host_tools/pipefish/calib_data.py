@@ -180,10 +180,28 @@ class Data:
         for i in sorted({int(self.board_of[v]) for v in chosen}):
             board = self.boards[i]
             bundle.set_shape(i, [0.0] * 41, *board.centre, board.half)
+        bundle.set_parity(self.parity()[points])
         if self.circle_radius > 0:
             across, down = self.disc_planes()
             bundle.set_planes(np.ascontiguousarray(across[points]), np.ascontiguousarray(down[points]))
         return bundle
+
+    def parity(self) -> Array:
+        """Of each point (N,), +1 and -1 like the squares of a checkerboard; 0 where the points are no square grid of
+        corners."""
+        out = np.zeros(len(self.xyz))
+        if self.circle_radius > 0:
+            return out
+        for i, board in enumerate(self.boards):
+            mine = self.board_of[self.view_of] == i
+            if not board.planar or len(board.points) < 4 or not mine.any():
+                continue
+            gaps = np.hypot(*(board.points[1:, :2] - board.points[0, :2]).T)
+            step = gaps[gaps > 1e-6 * board.half].min()
+            cell = (self.xyz[mine][:, :2] - board.points[0, :2]) / step
+            if np.abs(cell - np.round(cell)).max() < 1e-3:
+                out[mine] = 1.0 - 2.0 * (np.round(cell).astype(int).sum(axis=1) % 2)
+        return out
 
     def disc_planes(self) -> tuple[Array, Array]:
         """Two unit vectors (N, 3) in the plane of each disc: that of the board, or of the nearest discs on it."""

@@ -18,8 +18,8 @@ Mask = npt.NDArray[np.bool_]
 
 _THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median of the distance in units of sigma per axis
-_HUBER = 3.0  # sigma: the mild bend
-_GROSS = 5.5  # sigma: a point beyond is no measurement of this corner (one in 4 million of Gaussian noise)
+_HUBER = 5.0  # sigma: the mild bend; real corners have tails that Gaussian noise has not
+_GROSS = 10.0  # sigma: a point beyond is no measurement of this corner
 
 
 def errors_of(bundle: _engine.Bundle, data_pixels: Array) -> Array:
@@ -198,6 +198,7 @@ class Fit:
         for c in range(len(self.data.cameras)):
             self.bundle.set_camera(c, old.camera(c))
             self.bundle.set_camera_pose(c, old.camera_pose(c))
+            self.bundle.set_corner(c, old.corner(c), False)
         for b, board in enumerate(self.data.boards):
             self.bundle.set_board_pose(b, old.board_pose(b))
             self.bundle.set_shape(b, old.shape(b), *board.centre, board.half)
@@ -231,6 +232,7 @@ class Fit:
         self.model = model
         for c in range(len(self.data.cameras)):
             self._clear(c, model)
+            self.bundle.set_corner(c, self.bundle.corner(c) if model.corner else [0.0, 0.0], bool(model.corner))
         for b, board in enumerate(self.data.boards):
             kept = set(model.shape_terms)
             shape = [value if i in kept else 0.0 for i, value in enumerate(self.bundle.shape(b))]
@@ -281,6 +283,7 @@ class Fit:
         """Leaves only the frames' poses free, with the points that are used now, in least squares."""
         for c in range(len(self.data.cameras)):
             self.bundle.free_camera(c, [], False)
+            self.bundle.set_corner(c, self.bundle.corner(c), False)
         for b in range(len(self.data.boards)):
             self.bundle.free_board(b, [], False)
         self.bundle.set_used(self.used)
@@ -360,6 +363,18 @@ class Fit:
         """Median distance of the points of each view, pixels."""
         error = self.errors()
         return np.array([np.median(error[self.data.of_view(v)]) for v in range(len(self.data.views))])
+
+
+def view_pose(fit: Fit, view: int) -> Array:
+    """Camera from our frame of the board (3, 4)."""
+    data, bundle = fit.data, fit.bundle
+    return np.ascontiguousarray(
+        compose(
+            bundle.camera_pose(int(data.camera_of[view])),
+            bundle.frame(int(data.frame_of[view])),
+            bundle.board_pose(int(data.board_of[view])),
+        )
+    )
 
 
 # ---------------------------------------------------------------------- rigs
@@ -445,9 +460,10 @@ def smooth_error(data: Data, view: int) -> float | None:
     basis = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = np.ones(len(board))
     error = weight
-    for _ in range(8):
-        solved = np.linalg.lstsq(basis * weight[:, None], pixels * weight[:, None], rcond=None)[0]
-        error = np.hypot(*(pixels - basis @ solved).T)
+    for _ in range(4):
+        weighted = basis * weight[:, None] ** 2
+        normal = weighted.T @ basis + 1e-9 * len(board) * np.eye(basis.shape[1])
+        error = np.hypot(*(pixels - basis @ np.linalg.solve(normal, weighted.T @ pixels)).T)
         weight = 1 / (1 + (error / (2 * np.median(error) + 1e-9)) ** 2)
     return float(np.median(error))
 

@@ -13,6 +13,7 @@ RADIAL = (1, 2, 3, 4)  # how many of k2..k5
 SHAPE = ("flat", "bend", "z2", "z4", "z6", "z6xy")
 PUPIL = ("", "e1")
 ASYMMETRY = ("", "cpoly2", "cpoly3", "p23")
+CORNER = ("", "saddle")
 
 # Coefficients of engine/calib/shape.hpp: aspect, shear, heights of degree 2 to 6 (3 + 4 + 5 + 6 + 7), in-plane 14.
 _SHAPE_TERMS = {
@@ -33,12 +34,14 @@ _ASYMMETRY_TERMS = {
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Levels of the blocks. radial: how many of k2..k5; shape, pupil, asymmetry: of SHAPE, PUPIL, ASYMMETRY."""
+    """Levels of the blocks. radial: how many of k2..k5; the others: of SHAPE, PUPIL, ASYMMETRY, CORNER (a bias
+    of the detector: corners shift where brightness falls off)."""
 
     radial: int = 4
     shape: str = "flat"
     pupil: str = ""
     asymmetry: str = ""
+    corner: str = ""
 
     @property
     def parameters(self) -> list[int]:
@@ -53,8 +56,9 @@ class Model:
 
     @property
     def freedom(self) -> tuple[int, int]:
-        """Free numbers of the camera (a gauge counts once) and of the board's shape."""
-        return len(self.parameters) - (2 if self.asymmetry == "p23" else 0), len(self.shape_terms)
+        """Free numbers of the camera (a gauge counts once) and of the board (shape, corners)."""
+        camera = len(self.parameters) - (2 if self.asymmetry == "p23" else 0)
+        return camera, len(self.shape_terms) + (2 if self.corner else 0)
 
     @property
     def name(self) -> str:
@@ -63,12 +67,14 @@ class Model:
         parts = ["p23" if self.asymmetry == "p23" and self.radial == 4 else base]
         if self.asymmetry and parts[0] != "p23":
             parts.append(self.asymmetry)
-        return " + ".join(parts + [p for p in (self.pupil, "" if self.shape == "flat" else self.shape) if p])
+        return " + ".join(
+            parts + [p for p in (self.pupil, "" if self.shape == "flat" else self.shape, self.corner) if p]
+        )
 
     def steps(self) -> list[Model]:
         """Models one or two levels up in one block, or in asymmetry any."""
         found: list[Model] = []
-        for block, levels in (("radial", RADIAL), ("shape", SHAPE), ("pupil", PUPIL)):
+        for block, levels in (("radial", RADIAL), ("shape", SHAPE), ("pupil", PUPIL), ("corner", CORNER)):
             at = levels.index(getattr(self, block))  # type: ignore[arg-type]
             found += [dataclasses.replace(self, **{block: level}) for level in levels[at + 1 : at + 3]]
         at = ASYMMETRY.index(self.asymmetry)

@@ -6,9 +6,12 @@ from __future__ import annotations
 import numpy as np
 
 from .calib_data import Array, BoardFrame, Data, compose, inverse
-from .calib_fit import Fit, handedness
+from .calib_fit import Fit, handedness, view_pose
 
-_SURER = 25.0  # of chi square: one numbering must fit better by five sigma to be taken for another
+_BETTER, _SURER = (
+    0.6,
+    25.0,
+)  # of chi square: what another numbering must come down to, by five sigma more than noise can
 
 
 def symmetries(board: BoardFrame) -> list[Array]:
@@ -68,11 +71,7 @@ def consistent(fit: Fit, poses: dict[int, Array]) -> dict[int, Array]:
     data = fit.data
     out = dict(poses)
     for v, pose in poses.items():
-        expected = compose(
-            fit.bundle.camera_pose(int(data.camera_of[v])),
-            fit.bundle.frame(int(data.frame_of[v])),
-            fit.bundle.board_pose(int(data.board_of[v])),
-        )
+        expected = view_pose(fit, v)
         board = data.boards[data.board_of[v]]
         choices = [m for m in symmetries(board) if m[2, 2] > 0]
         middle = np.array([*board.centre, 0.0])
@@ -118,7 +117,7 @@ def by_shape(fit: Fit) -> list[str]:
         for v, motion in motions.items():
             if score[v] < best[v][0]:
                 best[v] = (score[v], motion)
-    changed = [v for v in sorted(best) if best[v][0] < 0.9 * base[v] - _SURER]
+    changed = [v for v in sorted(best) if best[v][0] < _BETTER * base[v] - _SURER]
     for v in changed:
         renumber(data, v, best[v][1])
         f, b = int(data.frame_of[v]), fit.bundle.board_pose(int(data.board_of[v]))

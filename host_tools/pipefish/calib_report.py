@@ -131,7 +131,7 @@ def covariance_of(fit: Fit, noise: str) -> list[Uncertainty]:
     bundle.set_sigma(fit.sigma)
     bundle.huber = 0.0
     frames = np.unique(data.frame_of[fit.used_views()])
-    camera_at, pose_at, _, _, size = bundle.layout()
+    camera_at, pose_at, _, _, _, size = bundle.layout()
     whitened = fit.errors()[fit.used] / fit.sigma[fit.used]
     freedom = 2 * int(fit.used.sum()) - size - 6 * len(frames)
     if freedom <= 0:
@@ -412,6 +412,7 @@ def describe(
                 "camera": number,
                 "noise": {"theta": knots.tolist(), "sigma_px": sigma.tolist()},
                 "residual_scale": uncertainty[c].scale,
+                "corner_shift_px": list(fit.bundle.corner(c)),
                 "coverage": coverage(fit, c, camera, uncertainty[c]),
                 "uncertainty": uncertainty_map(camera, uncertainty[c]),
                 "pipes": [uncertainty[c].diameter(dn) for dn in DN],

@@ -17,7 +17,12 @@
  * that the texture does not determine where they were, and every entry of the inverse below 2^10. */
 #define RIDGE      1024
 #define RIDGE_WARP 16384
-#define COV_MOST   ((int64_t)1 << 40)
+/* The warp is expected to be that at which a fit begins, but for 2 % each (0.02 of slope): (2 sigma^2 / 0.02^2) in the
+ * unit of the normal matrix, Q6, with noise of sigma 2 in both patches. Texture that determines the warp has a hundred
+ * times that; where there is little of it, an arbitrary warp would move the point by tenths of a pixel a frame. */
+#define PRIOR       1280000
+#define EXCESS_MOST (16 << 8)
+#define COV_MOST    ((int64_t)1 << 40)
 
 static int32_t magnitude(int32_t v)
 {
@@ -100,6 +105,7 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     anchor->offset = (pf_point_q16){at.x - ix * 65536, at.y - iy * 65536};
     anchor->a[0] = anchor->a[3] = 65536;
     anchor->a[1] = anchor->a[2] = 0;
+    anchor->excess_q8 = 256;
     for (int32_t r = 0; r < w; r++)
         memcpy(pixels + r * w, image->data + (size_t)(iy - half - 1 + r) * image->stride + (ix - half - 1), (size_t)w);
     const pf_gradients images = gradients(klt);
@@ -124,6 +130,8 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     for (int32_t a = 0; a < 6; a++)
         if (s.h[a][a] < 0)
             s.h[a][a] = 0;
+    for (int32_t a = 2; a < 6; a++)
+        s.h[a][a] += PRIOR;
     factor(anchor, s.h);
 }
 
@@ -251,6 +259,26 @@ static pf_point_q16 warped_offset(const pf_anchor *anchor)
                           (int32_t)((anchor->a[2] * x + anchor->a[3] * y) >> 16)};
 }
 
+/* Similarity with the template, less what noise takes from it: noise adds to both variances, and a small mark on a bare
+ * wall is found as surely as brick though most of its window is noise. At least an eighth of each must be more. */
+static int32_t likeness(const pf_klt *klt, const pf_rhs *rhs, int64_t var_t)
+{
+    const int64_t noise = (int64_t)klt->window * klt->window * klt->noise_var_q8;
+    const int64_t t = var_t - noise, c = rhs->var - noise;
+    return pf_zncc(rhs->cov, t > var_t / 8 ? t : var_t / 8, c > rhs->var / 8 ? c : rhs->var / 8);
+}
+
+/* How much more is left than the noise of both patches would leave, Q8, at least 1: relief in another light, an edge in
+ * front of something. */
+static int32_t excess(const pf_klt *klt, const pf_rhs *rhs)
+{
+    const int64_t left = rhs->var - rhs->cov * rhs->gain_q14 / GAIN_ONE;
+    const int64_t gain2 = rhs->gain_q14 * rhs->gain_q14 / GAIN_ONE;
+    const int64_t noise = (int64_t)klt->window * klt->window * klt->noise_var_q8 * (GAIN_ONE + gain2) / GAIN_ONE;
+    const int64_t ratio = noise > 0 ? left * 256 / noise : EXCESS_MOST;
+    return ratio < 256 ? 256 : ratio > EXCESS_MOST ? EXCESS_MOST : (int32_t)ratio;
+}
+
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at)
 {
     pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
@@ -259,7 +287,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
     pf_reference reference;
     take_reference(klt, anchor, pixels, centre, &reference);
-    int32_t moved = 0;
+    int32_t moved = 0, gone[6] = {0}; /* from the warp at the beginning */
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
@@ -271,8 +299,12 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
             return fit;
         }
         int32_t d[6], warp = 0;
+        for (int32_t k = 2; k < 6; k++)
+            rhs.b[k] += (((int64_t)PRIOR * gone[k]) >> 15) * rhs.gain_q14 / GAIN_ONE;
         solve(anchor, &rhs, d);
         compose(anchor, d, &centre);
+        for (int32_t k = 2; k < 6; k++)
+            gone[k] -= d[k];
         for (int32_t k = 2; k < 6; k++)
             warp = magnitude(d[k]) > warp ? magnitude(d[k]) : warp;
         for (int32_t k = 0; k < 4; k++)
@@ -286,8 +318,9 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = pf_zncc(rhs.cov, reference.var, rhs.var);
+    fit.zncc_q15 = likeness(klt, &rhs, reference.var);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
+    anchor->excess_q8 = excess(klt, &rhs);
     if (moved > NOT_SETTLED)
         fit.reason = PF_TRACK_DIVERGED;
     return fit;
@@ -327,7 +360,7 @@ static void whole_covariance(const pf_anchor *anchor, uint32_t noise_q8, int64_t
 
 void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried[3])
 {
-    whole_covariance(anchor, noise_q8, 256, carried);
+    whole_covariance(anchor, noise_q8, anchor->excess_q8, carried);
     for (int32_t i = 0; i < 3; i++)
         carried[i] = carried[i] > COV_MOST ? COV_MOST : carried[i] < -COV_MOST ? -COV_MOST : carried[i];
 }
@@ -336,7 +369,7 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
 {
     const int64_t gain2 = ((int64_t)gain_q14 * gain_q14) >> 14; /* Q14 */
     int64_t cov[3];
-    whole_covariance(anchor, noise_q8, 256 + ((int64_t)256 << 14) / gain2, cov);
+    whole_covariance(anchor, noise_q8, ((256 + ((int64_t)256 << 14) / gain2) * anchor->excess_q8) >> 8, cov);
     const int64_t xx = cov[0] + PF_TRACK_COV_FLOOR_Q20, xy = cov[1], yy = cov[2] + PF_TRACK_COV_FLOOR_Q20;
     track->cov_xx_q20 = xx > UINT32_MAX ? UINT32_MAX : (uint32_t)xx;
     track->cov_yy_q20 = yy > UINT32_MAX ? UINT32_MAX : (uint32_t)yy;

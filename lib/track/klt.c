@@ -42,13 +42,14 @@ bool pf_klt_inside(const pf_klt *klt, const pf_image *image, pf_point_q16 at)
     return in_circle(klt, (dx < 0 ? -dx : dx) + reach, (dy < 0 ? -dy : dy) + reach);
 }
 
-void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen)
+void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen, uint32_t noise_q8)
 {
     klt->window = (int32_t)window;
     klt->half = klt->window / 2;
     klt->groups = (klt->window + 7) / 8;
     klt->iterations = (int32_t)iterations;
     klt->min_eigen = (int32_t)min_eigen;
+    klt->noise_var_q8 = (int32_t)((noise_q8 * noise_q8) >> 8);
     for (int32_t r = 0; r < klt->window; r++)
         for (int32_t i = 0; i < 8 * klt->groups; i++)
             klt->whole[r * PATCH_ROW + i] = (int16_t) - (i < klt->window);

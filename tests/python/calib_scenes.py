@@ -1,4 +1,4 @@
-"""Simulated views of boards for the tests of calibration: a lens, poses around it, noise and outliers, and the truth."""
+"""Simulated views of boards for the tests of calibration: a lens, poses around it, noise, outliers, and the truth."""
 
 from __future__ import annotations
 
@@ -89,8 +89,10 @@ def random_pose(random: np.random.Generator, points: Array, lens: Lens) -> Array
     face = turn(axis / max(np.linalg.norm(axis), 1e-12) * theta)
     tilt = random.uniform(0.1, 0.85)
     about = random.uniform(0, 2 * math.pi)
-    rotation = face @ turn(np.array([math.cos(about), math.sin(about), 0]) * tilt) @ turn(
-        np.array([0, 0, random.uniform(0, 2 * math.pi)])
+    rotation = (
+        face
+        @ turn(np.array([math.cos(about), math.sin(about), 0]) * tilt)
+        @ turn(np.array([0, 0, random.uniform(0, 2 * math.pi)]))
     )
     size = np.ptp(points, axis=0).max()
     spread = min(lens.end * 1.2, 1.1) * random.uniform(0.35, 0.9)

@@ -225,6 +225,10 @@ void bind_calib(nb::module_ &m)
              [](Bundle &b, const Flags &used) {
                  each_point(b, used.shape(0), [&](Observation &p, size_t i) { p.used = used.data()[i]; });
              })
+        .def("set_parity",
+             [](Bundle &b, const Column &parity) {
+                 each_point(b, parity.shape(0), [&](Observation &p, size_t i) { p.parity = parity.data()[i]; });
+             })
         .def("set_sigma",
              [](Bundle &b, const Column &sigma) {
                  each_point(b, sigma.shape(0), [&](Observation &p, size_t i) { p.sigma = sigma.data()[i]; });
@@ -238,6 +242,12 @@ void bind_calib(nb::module_ &m)
              })
         .def("set_camera_pose", [](Bundle &b, size_t i, const Matrix34 &p) { b.cameras.at(i).from_rig = to_pose(p); })
         .def("camera_pose", [](const Bundle &b, size_t i) { return from_pose(b.cameras.at(i).from_rig); })
+        .def("set_corner",
+             [](Bundle &b, size_t i, const std::array<double, 2> &corner, bool free) {
+                 b.cameras.at(i).corner = corner;
+                 b.cameras.at(i).corner_free = free;
+             })
+        .def("corner", [](const Bundle &b, size_t i) { return b.cameras.at(i).corner; })
         .def("set_board_pose", [](Bundle &b, size_t i, const Matrix34 &p) { b.boards.at(i).to_rig = to_pose(p); })
         .def("board_pose", [](const Bundle &b, size_t i) { return from_pose(b.boards.at(i).to_rig); })
         .def("set_frame", [](Bundle &b, size_t i, const Matrix34 &p) { b.frames.at(i) = to_pose(p); })
@@ -282,7 +292,7 @@ void bind_calib(nb::module_ &m)
              [](Bundle &b) {
                  b.arrange();
                  const Bundle::Layout &l = b.layout();
-                 return nb::make_tuple(l.camera, l.camera_pose, l.shape, l.board_pose, l.size);
+                 return nb::make_tuple(l.camera, l.camera_pose, l.corner, l.shape, l.board_pose, l.size);
              })
         .def("parameter_slope",
              [](Bundle &b, int i) {

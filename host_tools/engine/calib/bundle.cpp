@@ -66,6 +66,21 @@ Eigen::Matrix<double, 4, 3> tangent_of(const pf_camera &camera, int which)
     return q.rightCols<3>();
 }
 
+// Where a saddle of unit slope along the board's axes moves under a unit slope of brightness along the image's radius:
+// the board's gradient with its axes exchanged. `by_board` (2x2): pixels by the board's plane.
+Eigen::Vector2d corner_shift(const Camera &camera, const Eigen::Vector2d &pixel, const Eigen::Matrix2d &by_board)
+{
+    const Eigen::Vector2d radius(pixel.x() - camera.model.c_u, pixel.y() - camera.model.c_v);
+    const Eigen::Vector2d slope = by_board.transpose() * radius / std::max(radius.norm(), 1e-9);
+    return by_board * Eigen::Vector2d(slope.y(), slope.x()) / std::max(std::abs(by_board.determinant()), 1e-300);
+}
+
+double squared_angle(const Eigen::Vector3d &x)
+{
+    const double theta = std::atan2(std::hypot(x.x(), x.y()), x.z());
+    return theta * theta;
+}
+
 // sum over the odd powers of r' and its derivatives by k2..k5.
 double slope_at(const pf_camera &camera, double theta, double d[4])
 {
@@ -119,6 +134,7 @@ void Bundle::arrange()
     for (const Camera &camera : cameras) {
         layout_.camera.push_back(take(unknowns(camera)));
         layout_.camera_pose.push_back(take(camera.pose_free ? 6 : 0));
+        layout_.corner.push_back(take(camera.corner_free ? 2 : 0));
         tangents_.push_back({tangent_of(camera.model, 0), tangent_of(camera.model, 1)});
     }
     for (const Board &board : boards) {
@@ -155,8 +171,8 @@ Eigen::Vector3d Bundle::in_camera(const View &view, const Observation &point) co
            (frames[static_cast<size_t>(view.frame)] * (board.to_rig * board.shape.at(point.drawn, nullptr)));
 }
 
-bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, Eigen::Vector2d &pixel, double *d_frame,
-                           double *d_border, double) const
+bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, double parity, Eigen::Vector2d &pixel,
+                           double *d_frame, double *d_border) const
 {
     const size_t c = static_cast<size_t>(view.camera), b = static_cast<size_t>(view.board);
     const Camera &camera = cameras[c];
@@ -170,10 +186,25 @@ bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, Eigen
     const Eigen::Vector3d turned = frame.rotation * at_rig_board;
     const Eigen::Vector3d at_rig = turned + frame.translation;
     const Eigen::Vector3d at_camera = camera.from_rig * at_rig;
-    if (!derive) {
-        return pf_camera_project(&camera.model, at_camera.data(), pixel.data(), nullptr, nullptr) == PF_OK;
-    }
+    const bool corners = parity != 0.0 && (camera.corner_free || camera.corner[0] != 0.0 || camera.corner[1] != 0.0);
     Eigen::Matrix<double, 2, 3, Eigen::RowMajor> d_point;
+    Eigen::Vector2d shift = Eigen::Vector2d::Zero();
+    double square = 0.0; // theta^2
+    if (!derive) {
+        if (pf_camera_project(&camera.model, at_camera.data(), pixel.data(), corners ? d_point.data() : nullptr,
+                              nullptr) != PF_OK) {
+            return false;
+        }
+        if (corners) {
+            shift = parity *
+                    corner_shift(camera, pixel,
+                                 d_point *
+                                     (camera.from_rig.rotation * frame.rotation * board.to_rig.rotation).leftCols<2>());
+            square = squared_angle(at_camera);
+            pixel += (camera.corner[0] + camera.corner[1] * square) * shift;
+        }
+        return true;
+    }
     Params d_params;
     const bool wanted = layout_.camera[c] >= 0;
     if (pf_camera_project(&camera.model, at_camera.data(), pixel.data(), d_point.data(),
@@ -181,6 +212,11 @@ bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, Eigen
         return false;
     }
     const Eigen::Matrix<double, 2, 3> by_rig = d_point * camera.from_rig.rotation;
+    if (corners) { // a tenth of a pixel that hardly changes with anything but its own two numbers
+        shift = parity * corner_shift(camera, pixel, by_rig * (frame.rotation * board.to_rig.rotation).leftCols<2>());
+        square = squared_angle(at_camera);
+        pixel += (camera.corner[0] + camera.corner[1] * square) * shift;
+    }
     Eigen::Map<Row2x6> jf(d_frame);
     jf.leftCols<3>() = -by_rig * cross(turned);
     jf.rightCols<3>() = by_rig;
@@ -206,6 +242,10 @@ bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, Eigen
         jg.middleCols<3>(layout_.camera_pose[c]) = -d_point * cross(camera.from_rig.rotation * at_rig);
         jg.middleCols<3>(layout_.camera_pose[c] + 3) = d_point;
     }
+    if (layout_.corner[c] >= 0) {
+        jg.col(layout_.corner[c]) = shift;
+        jg.col(layout_.corner[c] + 1) = square * shift;
+    }
     const Eigen::Matrix<double, 2, 3> by_rig_board = by_rig * frame.rotation;
     if (derive_shape) {
         const Eigen::Matrix<double, 2, 3> by_board = by_rig_board * board.to_rig.rotation;
@@ -225,7 +265,7 @@ bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d
                      double *d_border) const
 {
     if (circle_radius <= 0.0) {
-        return project_point(view, point.drawn, pixel, d_frame, d_border, 1.0);
+        return project_point(view, point.drawn, point.parity, pixel, d_frame, d_border);
     }
     const std::array<Eigen::Vector2d, kRim> &directions = rim_directions();
     Eigen::Matrix<double, kRim, 2> rim;
@@ -237,7 +277,7 @@ bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d
         Eigen::Vector2d at;
         double *f = d_frame ? jf.data() + i * 12 : nullptr;
         double *g = d_frame ? jg.data() + i * static_cast<size_t>(2 * layout_.size) : nullptr;
-        if (!project_point(view, edge, at, f, g, 1.0)) {
+        if (!project_point(view, edge, 0.0, at, f, g)) {
             return false;
         }
         rim.row(static_cast<Eigen::Index>(i)) = at;
@@ -366,6 +406,11 @@ void Bundle::fill_common(Rows &rows) const
             }
             column++;
         }
+        if (layout_.corner[c] >= 0) {
+            for (size_t i = 0; i < 2; i++) {
+                push(camera.corner[i] / priors.corner)[layout_.corner[c] + static_cast<int>(i)] = 1.0 / priors.corner;
+            }
+        }
         if (camera.model.radial != PF_RADIAL_GENERIC || k[0] < 0) {
             continue;
         }
@@ -420,6 +465,10 @@ void Bundle::apply(const optim::Step<kFrame, 1> &step)
                     parameter(camera.model, p + i) = v[i];
                 }
             }
+        }
+        if (layout_.corner[c] >= 0) {
+            camera.corner[0] += step.g[layout_.corner[c]];
+            camera.corner[1] += step.g[layout_.corner[c] + 1];
         }
         if (layout_.camera_pose[c] >= 0) {
             camera.from_rig = camera.from_rig.moved(step.g.segment<6>(layout_.camera_pose[c]));

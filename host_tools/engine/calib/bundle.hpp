@@ -2,8 +2,9 @@
 // ones see the others. X_cam = camera_c ( frame_f ( board_b ( shape_b(x) ) ) ).
 //
 // Unknowns: six of each frame (eliminated), and in the border, in this order: for each camera its free parameters and,
-// where free, its pose in the rig; for each board its free shape coefficients and, where free, its pose in the rig.
-// The two unit vectors of Paper II's asymmetric terms take three unknowns each, in their tangent space.
+// where free, its pose in the rig and the shift of its corners; for each board its free shape coefficients and, where
+// free, its pose in the rig. The two unit vectors of Paper II's asymmetric terms take three unknowns each, in their
+// tangent space.
 #pragma once
 
 #include "calib/pose.hpp"
@@ -26,6 +27,7 @@ struct Observation {
     Eigen::Vector2d pixel;
     double sigma = 1.0; // pixels, along each axis
     bool used = true;
+    double parity = 0.0; // of a checkerboard's corner, +-1; 0: not a corner
     Eigen::Vector3d across = Eigen::Vector3d::UnitX(), down = Eigen::Vector3d::UnitY(); // plane of a circle
 };
 
@@ -40,6 +42,10 @@ struct Camera {
     std::vector<uint32_t> free; // pf_camera_param, ascending
     bool pose_free = false;
     double theta_end = 0.0; // the radius is kept rising up to here
+    // Pixels by which a detector misplaces corners: corner[0] + corner[1] theta^2 along the saddle's answer to a radial
+    // slope of brightness (light falls off towards the rim), see corner_shift().
+    std::array<double, 2> corner{};
+    bool corner_free = false;
 };
 
 struct Board {
@@ -54,6 +60,7 @@ struct Priors {
     double asymmetry = 0.1; // of asymmetric terms, in radians of the image at one radian off the axis
     double shape = 0.05;    // of shape coefficients, in half sizes of the board
     double pupil = 0.02;    // metres
+    double corner = 1.0;    // pixels
 };
 
 class Bundle
@@ -121,7 +128,7 @@ public:
     void arrange();
     // First unknown of a camera's parameters, its pose, a board's shape, its pose; -1 where there is none.
     struct Layout {
-        std::vector<int> camera, camera_pose, shape, board_pose;
+        std::vector<int> camera, camera_pose, corner, shape, board_pose;
         int size = 0;
     };
     const Layout &layout() const { return layout_; }
@@ -142,8 +149,8 @@ private:
     void fill(int frame, Rows &rows) const;
     void fill_common(Rows &rows) const;
     double loss(double square, double *weight) const;
-    bool project_point(const View &view, const Eigen::Vector3d &drawn, Eigen::Vector2d &pixel, double *d_frame,
-                       double *d_border, double share) const;
+    bool project_point(const View &view, const Eigen::Vector3d &drawn, double parity, Eigen::Vector2d &pixel,
+                       double *d_frame, double *d_border) const;
     int unknowns(const Camera &camera) const;
 
     State saved_;
