@@ -4,6 +4,7 @@
 namespace nb = nanobind;
 
 void bind_camera(nb::module_ &m);
+void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
@@ -11,8 +12,9 @@ void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link, simulator and target detector.";
+    m.doc() = "Compiled part of pipefish: camera model, conics, link, simulator and target detector.";
     bind_camera(m);
+    bind_conics(m);
     bind_detect(m);
     bind_link(m);
     bind_sim(m);
