@@ -17,6 +17,8 @@ _LAZY = {
     "Target": "pipefish.target",
     "Detection": "pipefish.detect",
     "detect_target": "pipefish.detect",
+    "homography_from_conics": "pipefish.conics",
+    "pose_from_discs": "pipefish.conics",
     "simulate_target_views": "pipefish.studio_targets",
     "simulate_two_views": "pipefish.studio_pairs",
     "simulate_objects": "pipefish.studio_objects",

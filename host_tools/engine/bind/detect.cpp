@@ -1,4 +1,6 @@
 // The target detector for Python: _engine.Board, _engine.find_target. pipefish/detect.py is what people use.
+#include "detect/candidates.hpp"
+#include "detect/disc.hpp"
 #include "detect/find.hpp"
 #include "pipefish/profile.h"
 
@@ -129,6 +131,24 @@ Detection find_guided(const Picture &image, const Board &board, const pf_profile
     return find_target_guided(view(image), board, profile.camera, rt);
 }
 
+std::vector<Eigen::Matrix<double, Eigen::Dynamic, 2, Eigen::RowMajor>> outlines_in(const Picture &image)
+{
+    std::vector<Eigen::Matrix<double, Eigen::Dynamic, 2, Eigen::RowMajor>> out;
+    const cv::Mat picture = view(image);
+    for (const Blob &blob : find_blobs(picture)) {
+        const DiscSetup setup = {blob.half_axes, 1.5};
+        const Disc disc = measure_disc(picture, blob.at, setup);
+        const auto points = disc.found ? disc_outline(picture, disc, setup, 64) : std::vector<Eigen::Vector2d>();
+        if (points.size() < 48)
+            continue;
+        Eigen::Matrix<double, Eigen::Dynamic, 2, Eigen::RowMajor> rows(points.size(), 2);
+        for (size_t k = 0; k < points.size(); k++)
+            rows.row(static_cast<Eigen::Index>(k)) = points[k].transpose();
+        out.push_back(rows);
+    }
+    return out;
+}
+
 } // namespace
 
 void bind_detect(nb::module_ &m)
@@ -137,6 +157,7 @@ void bind_detect(nb::module_ &m)
         .def("__init__", &make_board, nb::arg("kind"), nb::arg("flat"), nb::arg("sites"), nb::arg("code"),
              nb::arg("steps"), nb::arg("size"), nb::arg("radius"), nb::arg("diameter"), nb::arg("marker_bits"),
              nb::arg("marker_side"), nb::arg("marker_middles"), nb::arg("marker_codes"));
+    m.def("find_outlines", &outlines_in, nb::arg("image"), "(H,W) uint8 -> list of (K,2) outlines of dark discs.");
     m.def(
         "find_target", [](const Picture &image, const Board &board) { return to_python(find(image, board)); },
         nb::arg("image"), nb::arg("board"), "(H,W) uint8 -> dict of a Detection.");

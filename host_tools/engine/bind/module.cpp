@@ -5,6 +5,7 @@ namespace nb = nanobind;
 
 void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
+void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
@@ -12,9 +13,10 @@ void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, calibration, target detector, link and simulator.";
+    m.doc() = "Compiled part of pipefish: camera model, calibration, conics, target detector, link and simulator.";
     bind_calib(m);
     bind_camera(m);
+    bind_conics(m);
     bind_detect(m);
     bind_link(m);
     bind_sim(m);

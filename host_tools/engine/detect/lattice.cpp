@@ -250,22 +250,12 @@ double roughness(const Grid &grid)
     return count ? sum / count : 1.0;
 }
 
-// The same grid on the lattice's shortest base (Gauss's reduction of the mean steps): a seed at the border of a grid
-// may have found a slanted one.
-Grid with_short_steps(const Grid &grid)
+// The change of base that makes steps u, v as short as they can be (Gauss's reduction): new site = m * site.
+std::array<int, 4> shortening(Eigen::Vector2d u, Eigen::Vector2d v)
 {
-    Eigen::Matrix3d n = 1e-9 * Eigen::Matrix3d::Identity();
-    Eigen::Matrix<double, 3, 2> r = Eigen::Matrix<double, 3, 2>::Zero();
-    for (const auto &[site, point] : grid) {
-        const Eigen::Vector3d row(1, site[0], site[1]);
-        n += row * row.transpose();
-        r += row * point.at.transpose();
-    }
-    const Eigen::Matrix<double, 3, 2> s = n.ldlt().solve(r);
-    Eigen::Vector2d u = s.row(1), v = s.row(2);
-    // Sites are i u + j v: where u loses v, j gains i.
     std::array<int, 4> m = {1, 0, 0, 1};
     for (int round = 0; round < 20; round++) {
+        // Sites are i u + j v: where u loses v, j gains i.
         const int k = static_cast<int>(std::lround(u.dot(v) / v.squaredNorm()));
         const int l = k ? 0 : static_cast<int>(std::lround(u.dot(v) / u.squaredNorm()));
         if (!k && !l)
@@ -275,6 +265,24 @@ Grid with_short_steps(const Grid &grid)
         v -= l * u;
         m = {m[0] + l * m[2], m[1] + l * m[3], m[2], m[3]};
     }
+    return m;
+}
+
+// The same grid on the lattice's shortest base, by a vote of its sites: a seed at the border of a grid may have found a
+// slanted one.
+Grid with_short_steps(const Grid &grid)
+{
+    std::map<std::array<int, 4>, int> votes;
+    for (const auto &[site, point] : grid)
+        if (const auto f = forecast(grid, site, 0, true))
+            votes[shortening(f->cell.col(0), f->cell.col(1))]++;
+    std::array<int, 4> m = {1, 0, 0, 1};
+    int most = 0;
+    for (const auto &[matrix, count] : votes)
+        if (count > most) {
+            most = count;
+            m = matrix;
+        }
     Grid out;
     for (const auto &[site, point] : grid)
         out[{m[0] * site[0] + m[1] * site[1], m[2] * site[0] + m[3] * site[1]}] = point;
