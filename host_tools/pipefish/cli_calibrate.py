@@ -32,9 +32,16 @@ def run_calibrate(args: argparse.Namespace) -> Result:
     live: dict[str, Any] | None = None
     if args.device:
         from pipefish.calib_live import collect
+        from pipefish.transport import open_transport
 
-        recording = Path(args.recording) if args.recording else Path(args.output).with_suffix(".mcap")
-        live = collect(args, targets, recording)
+        live = collect(
+            open_transport(args.device, args.baud),
+            targets,
+            _recording(args),
+            most=args.most,
+            timeout_s=args.timeout,
+            quiet=args.json,
+        )
         sources = {"camera": [Path(live["file"])]}
     elif args.camera:
         sources = {}
@@ -49,9 +56,22 @@ def run_calibrate(args: argparse.Namespace) -> Result:
 
         tell("reading", 0.0)
         given = load_views(sources, targets, args.size)
+        if live:
+            given.pictures = [p for p in given.pictures if p.name in live["names"]]
         session = run(given, model=args.model, board=args.board, tell=tell)
         tell("report", 0.98)
         return _written(args, session, live)
+
+
+def _recording(args: argparse.Namespace) -> Path:
+    """Where the pictures of a device go. Raises UsageError if that is there already."""
+    path = Path(args.recording) if args.recording else Path(args.output).with_suffix(".mcap")
+    if path.exists():
+        raise UsageError(
+            f"calibrate: {path} exists already: name another with --recording, or calibrate from it: "
+            f"pipefish calibrate {path} ..."
+        )
+    return path
 
 
 def _written(args: argparse.Namespace, session: Any, live: dict[str, Any] | None) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -14,9 +15,13 @@ from PIL import Image
 
 import calib_scenes as scenes
 import pipefish as pf
+from device import Device
 from pipefish import cli
+from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import load_target, load_views, natural
+from pipefish.calib_live import Guide
 from pipefish.calib_verdict import verdict
+from synthetic import SURVEY, Object, as_object, end, keyframe, start
 from test_page import Outline, data_of
 
 TARGET = pf.Target("checkerboard", 9, 12, 0.03)
@@ -281,3 +286,57 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no pictures" in refused(empty)
+
+
+# ---------------------------------------------------------------------- from a device
+
+
+def device_objects(folder) -> list[Object]:
+    """A survey whose keyframes are the pictures of a folder, the first one twice."""
+    objects = [start()]
+    files = sorted(folder.iterdir(), key=lambda p: natural(p.name))
+    files = [files[0], *files]
+    for i, path in enumerate(files):
+        message = pb.Keyframe.FromString(keyframe(i)[2])
+        out = io.BytesIO()
+        Image.open(path).save(out, "JPEG", quality=92)
+        message.jpeg, message.width, message.height = out.getvalue(), 480, 360
+        objects.append(as_object(2, message))
+    return [*objects, end(len(files))]
+
+
+def test_a_device_is_calibrated_from_its_keyframes_and_they_are_kept(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    out = tmp_path / "c.json"
+    with Device(device_objects(folder), SURVEY) as device:
+        arguments = ["--device", device.address, "--target", target, "-o", out, "--model", "p9"]
+        assert run(*arguments) == 0
+    text = capsys.readouterr()
+    assert f"pipefish flash {device.address} {out}" in text.out
+    lines = text.err.splitlines()
+    assert "keyframe 0: view 1, " in lines[0] and "next: " in lines[0]
+    assert lines[1] == "keyframe 1: as in a view before; move the target"
+    assert any(line.startswith("keyframe 10: ") and "view" not in line for line in lines)  # the one without a target
+    assert pf.Camera.load(out).provenance.views == 9
+    survey = pf.Survey.open(out.with_suffix(".mcap"))
+    assert survey.complete and len(survey.keyframes) == 11
+    assert not device.spool
+    assert run(*arguments) == 2 and "calibrate from it" in capsys.readouterr().err
+
+
+def test_a_device_that_shows_no_target_is_told_so(tmp_path, target, capsys):
+    with Device([start(), keyframe(0), keyframe(1), end(2)], SURVEY) as device:
+        assert run("--device", device.address, "--target", target, "-o", tmp_path / "c.json") == 1
+    assert "0 views with the target came from the device (the survey ended)" in capsys.readouterr().err
+
+
+def test_guidance_points_where_nothing_was_seen(target):
+    guide = Guide([load_target(target)], (800, 500))
+    x, y = np.meshgrid(np.linspace(5, 795, 40), np.linspace(5, 495, 40))
+    seen = np.stack([x, y], axis=-1).reshape(-1, 2)
+    seen = seen[~((seen[:, 0] > 700) & (seen[:, 1] > 400))]
+    guide.views = [pf.View(np.random.default_rng(1).normal(size=(len(seen), 3)), seen)]
+    guide.names = ["a"]
+    guide._think()
+    assert guide.advice == "next: bottom right of the picture, tilted" and guide.seen == pytest.approx(39 / 40)
+    assert guide.map_text().splitlines()[-1].endswith("  ")
