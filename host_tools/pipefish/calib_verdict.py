@@ -10,11 +10,15 @@ _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _NARROW = math.radians(60)  # below, the wall is seen only far ahead
 _SEEN = 0.6  # of the cells of the picture
 _OVERFIT = 1.15  # held out against fitted
+_NO_FIT_PX = 2.0  # rms that no lens in focus leaves: the views do not belong together
+_BENT = 0.01  # of the target's longer side: paper that nobody glued onto anything
 
 
-def verdict(report: dict[str, Any], held_out: float | None, covered: float, index: int = 0) -> dict[str, Any]:
+def verdict(
+    report: dict[str, Any], held_out: float | None, covered: float, index: int = 0, bend: float = 0.0
+) -> dict[str, Any]:
     """Of camera `index` of a Calibration.report. held_out: pixels rms, where known; covered: radians, how far off the
-    axis the target was seen.
+    axis the target was seen; bend: of the target, as a share of its size.
 
     usable: for any pipe; dn_from, dn_to: millimetres, of the nominal diameters of `pipes` that hold; systematic_mm:
     largest of these (95 %); pipes: one entry a diameter; reasons, cautions: sentences."""
@@ -33,9 +37,11 @@ def verdict(report: dict[str, Any], held_out: float | None, covered: float, inde
                 "usable": known and bound <= SHARE * pipe["dn_mm"],
             }
         )
-    good = [p for p in pipes if p["usable"]]
+    fits = report["rms_px"] <= _NO_FIT_PX
+    good = [p for p in pipes if p["usable"] and fits]
     out: dict[str, Any] = {
         "usable": bool(good),
+        "fits": fits,
         "dn_from": good[0]["dn_mm"] if good else None,
         "dn_to": good[-1]["dn_mm"] if good else None,
         "systematic_mm": max(p["systematic_mm"] for p in good) if good else None,
@@ -46,12 +52,18 @@ def verdict(report: dict[str, Any], held_out: float | None, covered: float, inde
     out["text"] = _text(out)
     out["reasons"], out["cautions"] = (
         _reasons(report, camera, held_out, halves),
-        _cautions(report, camera, held_out, halves, covered, out),
+        _cautions(report, camera, held_out, halves, covered, out, bend),
     )
     return out
 
 
 def _text(out: dict[str, Any]) -> str:
+    if not out["fits"]:
+        return (
+            "Not usable: the best lens leaves more than two pixels. Are all pictures of one camera, with one "
+            "focus, and "
+            "is the target the one that --target describes?"
+        )
     if not out["usable"]:
         known = [p for p in out["pipes"] if p["systematic_mm"] is not None]
         if not known:
@@ -86,6 +98,7 @@ def _cautions(
     halves: float | None,
     covered: float,
     out: dict[str, Any],
+    bend: float,
 ) -> list[str]:
     """What one should know before using it, and what to do about it."""
     said = []
@@ -114,6 +127,12 @@ def _cautions(
             f"the target stood {distance:.2g} m away, walls of DN {out['dn_from']} are at "
             f"{out['dn_from'] / 2000:.2g} m: "
             "take some views as near as the walls will be"
+        )
+    if bend > _BENT:
+        said.append(
+            f"the target bends by {100 * bend:.1f} % of its size: glue it onto something flat; if it is flat, it is "
+            f"not "
+            "the one that --target describes, or the pictures are of two cameras"
         )
     lost = [v for v in report["views"] if not v["used"]]
     if lost:

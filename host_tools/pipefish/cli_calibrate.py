@@ -83,6 +83,7 @@ def _written(args: argparse.Namespace, session: Any, live: dict[str, Any] | None
     many = len(result.cameras) > 1
     files, verdicts, cameras = {}, {}, {}
     out = Path(args.output)
+    bend = max(b.warp_mm / 2000 / b.frame.half for b in result.boards.values())
     for index, (number, camera) in enumerate(result.cameras.items()):
         label = session.given.cameras[number]
         name = " ".join(filter(None, (args.name, label if many else "")))
@@ -97,7 +98,7 @@ def _written(args: argparse.Namespace, session: Any, live: dict[str, Any] | None
         cameras[number] = camera
         files[number] = out / f"{label}.json" if many else out
         covered = camera.theta_covered or camera.theta_max
-        verdicts[number] = verdict(report, rms, covered, index)
+        verdicts[number] = verdict(report, rms, covered, index, bend)
     session.result = result = dataclasses.replace(result, cameras=cameras, camera=cameras[min(cameras)])
     if many:
         out.mkdir(parents=True, exist_ok=True)
