@@ -25,7 +25,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import pipefish as pf
-from pipefish.calib_draw import cube
+from pipefish.calib_draw import cube, rows_and_columns
 from pipefish.calib_input import Given, Picture, Target3D
 from pipefish.calib_run import Session, run
 from pipefish.files import write_atomically
@@ -43,7 +43,7 @@ CAMERAS = {
 MODELS = ("p6", "p9", "p23")
 TARGET = pf.Target("asymmetric-circles", 15, 6, 0.04)
 SIZE = (960, 720)
-EDGE = 150
+WIDTH = 400  # of a picture on the sheet
 
 
 def pictures(preset: str, views: int, seed: int) -> list[np.ndarray]:
@@ -67,15 +67,20 @@ def rectified(session: Session) -> tuple[Image.Image, float]:
     best = max(views, key=lambda v: v["points"] * v["theta_max"])["view"]
     view, source = session.views[best], session.picture_of(best)
     assert source is not None
-    flat = np.round(view.board_xyz[:, :2] / (TARGET.spacing_m / 2))
-    lines = [list(np.flatnonzero(flat[:, axis] == value)) for axis in (0, 1) for value in np.unique(flat[:, axis])]
     distance = session.result.report["cameras"][0]["uncertainty"]["distance_m"]
-    made = cube(session.result.camera, source.image(), view.pixels, lines, EDGE, distance)
+    edge = WIDTH // 3
+    for _ in range(2):  # what the camera sees of the cube fills the sheet
+        lines = rows_and_columns(view.board_xyz)
+        made = cube(session.result.camera, source.image(), view.pixels, lines, edge, distance)
+        box = made.picture.getbbox()
+        assert box is not None
+        edge = edge * WIDTH // (box[2] - box[0])
+    seen = made.picture.crop(box)
     small = Image.fromarray(source.image()).convert("RGB")
-    small.thumbnail((made.picture.width, made.picture.width), Image.Resampling.LANCZOS)
-    sheet = Image.new("RGB", (made.picture.width, made.picture.height + small.height + 8), (246, 247, 249))
+    small.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    sheet = Image.new("RGB", (WIDTH, small.height + 8 + seen.height), (246, 247, 249))
     sheet.paste(small, (0, 0))
-    sheet.paste(made.picture, (0, small.height + 8))
+    sheet.paste(seen, ((WIDTH - seen.width) // 2, small.height + 8))
     return sheet, made.off_px or float("nan")
 
 

@@ -60,6 +60,17 @@ def close_up(image: Grey, measured: Array, model: Array, side: int = 25, zoom: i
     return picture
 
 
+def rows_and_columns(xyz: Array) -> list[list[int]]:
+    """Rows and columns of a flat target: numbers of points with one y, or one x."""
+    if np.ptp(xyz[:, 2]) > 1e-9:
+        return []
+    found = []
+    for axis in (0, 1):
+        values = np.round(xyz[:, axis], 7)
+        found += [list(np.flatnonzero(values == value)) for value in np.unique(values)]
+    return [line for line in found if len(line) >= 3]
+
+
 @dataclasses.dataclass(frozen=True)
 class Cube:
     """A view on the faces of a cube. off_px: root mean square distance of the target's points from the chords of their

@@ -305,7 +305,9 @@ def _cube(session: Session, view: int, number: int) -> str:
     distance = float(
         session.result.report["cameras"][list(session.result.cameras).index(number)]["uncertainty"]["distance_m"]
     )
-    made = calib_draw.cube(camera, source.image(), v.pixels, _lines(v.board_xyz), _CUBE_EDGE, distance)
+    made = calib_draw.cube(
+        camera, source.image(), v.pixels, calib_draw.rows_and_columns(v.board_xyz), _CUBE_EDGE, distance
+    )
     off = (
         f" {made.lines} rows and columns of the target are straight within {made.off_px:.2f} px rms."
         if made.off_px
@@ -313,17 +315,6 @@ def _cube(session: Session, view: int, number: int) -> str:
     )
     name = session.given.label(v.camera, v.name)
     return _figure(made.picture, f"View {name} on the faces of a cube", f"{name}.{off}")
-
-
-def _lines(xyz: Array) -> list[list[int]]:
-    """Rows and columns of a flat target: numbers of points with one y, or one x."""
-    if np.ptp(xyz[:, 2]) > 1e-9:
-        return []
-    found = []
-    for axis in (0, 1):
-        values = np.round(xyz[:, axis], 7)
-        found += [list(np.flatnonzero(values == value)) for value in np.unique(values)]
-    return [line for line in found if len(line) >= 3]
 
 
 # ---------------------------------------------------------------------- on record

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .calib_circle import Brightest, image_circle
 from .calib_data import CalibrationError, View
 from .calib_input import Given, Picture, Target3D
 from .calibrate import Calibration, calibrate
@@ -83,9 +84,12 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
     }
     views = given.views
     if not views:
-        sightings = search(given, lambda share: tell("finding the target", 0.5 * share))
+        brightest = [Brightest() for _ in given.cameras]
+        sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
         views = views_of(given, sightings)
         refuse_too_few(given, sightings)
+        if len(given.cameras) == 1 and brightest[0].picture is not None:
+            options["image_circle"] = image_circle(brightest[0].picture, [v.pixels for v in views])
         for turn in range(_ROUNDS):
             tell("first model", 0.5 + 0.1 * turn)
             first = calibrate(views, model="p9", **options)
@@ -106,8 +110,10 @@ def one_radius(targets: Sequence[Target3D]) -> float:
     return radii[0]
 
 
-def search(given: Given, share: Callable[[float], None]) -> list[Sighting]:
-    """Every target in every picture. Raises CalibrationError where pictures of two cameras are mixed."""
+def search(given: Given, brightest: list[Brightest], share: Callable[[float], None]) -> list[Sighting]:
+    """Every target in every picture; `brightest`, of each camera, takes the pictures in.
+
+    Raises CalibrationError where pictures of two cameras are mixed."""
     if not all(t.target for t in given.targets) or not given.targets:
         raise CalibrationError("pictures need a --target that can be found in them: a JSON file of `pipefish target`")
     sightings = []
@@ -121,6 +127,7 @@ def search(given: Given, share: Callable[[float], None]) -> list[Sighting]:
         if size != given.sizes[picture.camera]:
             wrong.append((picture, size))
             continue
+        brightest[picture.camera].add(image)
         for board, target in enumerate(given.targets):
             assert target.target is not None
             sightings.append(_sighting(picture, board, detect_target(image, target.target)))

@@ -109,8 +109,8 @@ def _cautions(
         said.append(f"views that it was not made from fit worse, {held_out:.3f} px rms: take more views")
     if halves is not None and halves > 1.5:
         said.append(
-            f"two halves of the views differ {halves:.1f} times as much as noise explains: the model, the board or the "
-            "focus does not hold still; the bounds above are widened by that"
+            f"two halves of the views differ {halves:.1f} times as much as noise explains: the lens is not quite what "
+            "the model can be, or focus or target have changed; the bounds above are widened by that"
         )
     if covered < _NARROW:
         said.append(
