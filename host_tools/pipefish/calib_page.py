@@ -224,7 +224,7 @@ def _lost(session: Session) -> str:
     if not figures and not points:
         return ""
     text = f"<p class='note'>and {more} more; the table below has them all.</p>" if more > 0 else ""
-    inner = f"<div class='grid'>{''.join(figures)}</div>{text}" if figures else ""
+    inner = f"<div class='grid thumbs'>{''.join(figures)}</div>{text}" if figures else ""
     return _section("lost", "What was left out, and why", inner + points)
 
 
