@@ -4,14 +4,18 @@
 namespace nb = nanobind;
 
 void bind_camera(nb::module_ &m);
+void bind_conics(nb::module_ &m);
+void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
+    m.doc() = "Compiled part of pipefish: one door for each room of the engine.";
     bind_camera(m);
+    bind_conics(m);
+    bind_detect(m);
     bind_link(m);
     bind_sim(m);
     bind_sim_studio(m);
