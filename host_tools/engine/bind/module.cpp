@@ -7,12 +7,14 @@ void bind_camera(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
+void bind_tube(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
+    m.doc() = "Compiled part of pipefish: camera model, link, simulator and tube.";
     bind_camera(m);
     bind_link(m);
     bind_sim(m);
     bind_sim_studio(m);
+    bind_tube(m);
 }
