@@ -317,7 +317,7 @@ def _reference(cloud: np.ndarray, sections: list[dict[str, Any]], path: Any) -> 
         z = x @ c["axis"]
         r = np.linalg.norm(x - z[:, None] * c["axis"], axis=1)
         z = sign * z[(np.abs(r - c["rho"]) < 4 * c["roughness"] + 0.02 * c["rho"]) & (np.abs(z) < 1.0 * typical)]
-        ends.append(sign * float(np.quantile(z, 0.995)) if len(z) else 0.0)
+        ends.append(sign * max(0.0, float(np.quantile(z, 0.995))) if len(z) else 0.0)
     first = nodes[0] + ends[0] * sections[0]["axis"]
     last = nodes[-1] + ends[1] * sections[-1]["axis"]
     nodes, rho = [first, *nodes, last], [rho[0], *rho, rho[-1]]

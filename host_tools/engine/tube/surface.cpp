@@ -24,6 +24,7 @@ constexpr int ARC = 16;             // steps of the table of chainages, a knot i
 constexpr int BINS = 60;            // of azimuth
 constexpr double FAR = 3.0;         // radii: points beyond say nothing of this pipe
 constexpr double GATE = 0.5;        // radii: distances beyond are gross whatever the scale
+constexpr int ENOUGH_A_DIAMETER = 4000; // points; more than that only cost time
 constexpr double ELLIPSE_GAP = 150.0 * std::numbers::pi / 180.0;
 
 double median(std::vector<double> v)
@@ -90,6 +91,7 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
         converged_ = solve(options.rounds / 2, true);
     }
     tabulate();
+    reweigh(true);
     describe();
 }
 
@@ -150,6 +152,8 @@ void Surface::assign(const Reference &reference)
     noise_.assign(n, 0.0);
     weight_.assign(n, 0.0);
     robust_.assign(n, 0.0);
+    used_.assign(n, 0);
+    std::vector<size_t> stretch(n, 0), count(static_cast<size_t>(line.length() / diameter_) + 2, 0);
     for (size_t i = 0; i < n; i++) {
         const Vector3d x = cloud_.points.col(static_cast<Eigen::Index>(i));
         const int sample = nearest.nearest(x, 1)[0];
@@ -173,8 +177,18 @@ void Surface::assign(const Reference &reference)
             if (u > -0.05 && u < piece.intervals + 0.05 && (x - frame(piece, u).centre).norm() < FAR * reach) {
                 of_piece_[i] = static_cast<int>(k);
                 u_[i] = u;
+                stretch[i] = static_cast<size_t>(s / diameter_);
+                count[stretch[i]]++;
             }
             break;
+        }
+    }
+    // A fixed choice where there are more than enough.
+    std::vector<size_t> seen(count.size(), 0);
+    for (size_t i = 0; i < n; i++) {
+        if (of_piece_[i] >= 0) {
+            const size_t every = 1 + count[stretch[i]] / ENOUGH_A_DIAMETER;
+            used_[i] = seen[stretch[i]]++ % every == 0;
         }
     }
 }
@@ -237,12 +251,13 @@ double Surface::foot(const Piece &piece, const Vector3d &x, double u) const
     return u;
 }
 
-void Surface::reweigh()
+// Distances, scale and weights at the present state; of all points at the end, of those in use while fitting.
+void Surface::reweigh(bool all)
 {
     std::vector<double> section(static_cast<size_t>(floats_));
     for (size_t i = 0; i < u_.size(); i++) {
         weight_[i] = robust_[i] = 0.0;
-        if (of_piece_[i] < 0) {
+        if (of_piece_[i] < 0 || (!all && !used_[i])) {
             continue;
         }
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
@@ -258,7 +273,7 @@ void Surface::reweigh()
     measure_roughness();
     const double information = 1.0 / (TUKEY_VARIANCE * correlation_), floor = 1e-9 * diameter_;
     for (size_t i = 0; i < u_.size(); i++) {
-        if (of_piece_[i] < 0 || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
+        if (of_piece_[i] < 0 || (!all && !used_[i]) || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
             continue;
         }
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
@@ -277,7 +292,7 @@ void Surface::measure_roughness()
     std::vector<std::vector<double>> r(control_.size()), noise(control_.size());
     std::vector<double> all_r, all_noise;
     for (size_t i = 0; i < u_.size(); i++) {
-        if (of_piece_[i] < 0 || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
+        if (!used_[i] || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
             continue;
         }
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
@@ -331,7 +346,7 @@ bool Surface::solve(int rounds, bool adapt)
     const size_t each = static_cast<size_t>(problem.each());
     double moved = 0.0;
     for (int round = 0; round < rounds; round++) {
-        reweigh();
+        reweigh(false);
         const std::vector<double> before = shape_;
         const std::vector<Vector3d> where = control_;
         solver.minimize(problem, {.max_iterations = 3});
@@ -382,7 +397,7 @@ bool Surface::solve(int rounds, bool adapt)
             }
         }
     }
-    reweigh();
+    reweigh(false);
     return moved < 0.3;
 }
 

@@ -86,7 +86,7 @@ private:
 
     void lay_out(const Reference &reference, double knot);
     void assign(const Reference &reference);
-    void reweigh();
+    void reweigh(bool all);
     void measure_roughness();
     void find_gaps();
     void measure_correlation();
@@ -115,6 +115,7 @@ private:
     std::array<double, 4> stiffness_{};       // 1 / variance of second differences: axis, rho, ellipse, harmonics
     std::vector<int> of_piece_;               // a point: piece or -1
     std::vector<double> u_, distance_, noise_, weight_, robust_;
+    std::vector<char> used_;                  // a point: takes part in the fit
     std::vector<double> tau_;                 // a control
     std::vector<OnSurface> placed_;
     std::vector<std::pair<double, int>> by_s_; // inliers by chainage

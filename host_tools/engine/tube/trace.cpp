@@ -24,6 +24,8 @@ namespace
 constexpr int LOOK_AT = 1200;  // points of a neighbourhood
 constexpr int SEEDS = 10;      // places
 constexpr int HYPOTHESES = 250;
+constexpr double HALF = 0.75; // of a section, radii
+constexpr double OFF = 0.3;   // radii: a section whose points lie further to one side hangs over the wall's end
 constexpr double BAND = 0.05;  // of the radius: what counts as on the wall
 
 std::vector<int> thinned(const std::vector<int> &all, int count, uint64_t stream)
@@ -231,7 +233,7 @@ namespace
 // Follows the pipe from `from`, in the direction of its axis.
 std::vector<Cylinder> follow(const Cloud &cloud, const Nearest<3> &nearest, const Cylinder &from, double radius)
 {
-    constexpr double STEP = 0.5, HALF = 0.75, BRIDGE = 4.0; // radii
+    constexpr double STEP = 0.5, BRIDGE = 4.0; // radii
     std::vector<Cylinder> out;
     Cylinder last = from;
     double bridged = 0.0;
@@ -249,7 +251,8 @@ std::vector<Cylinder> follow(const Cloud &cloud, const Nearest<3> &nearest, cons
         const bool likely = (next.status == FitStatus::ok || next.status == FitStatus::circle_only) &&
                           std::abs(next.rho - last.rho) < 0.1 * radius && next.axis.dot(last.axis) > 0.96 &&
                           next.roughness < 0.06 * radius && std::abs(next.rho - radius) < 0.3 * radius &&
-                          next.inliers > 0.5 * static_cast<double>(wall.size());
+                          next.inliers > 0.5 * static_cast<double>(wall.size()) &&
+                          std::abs((next.centre - guess.centre).dot(next.axis)) < OFF * radius;
         if (!likely) {
             continue;
         }
@@ -332,11 +335,13 @@ std::vector<Cylinder> along(const Cloud &cloud, const Eigen::Matrix3Xd &path, in
             const Cylinder &c = start[static_cast<size_t>(k)];
             const std::vector<int> near = nearest.within(c.centre, 2.8 * radius);
             const std::vector<int> wall =
-                thinned(window(cloud, near, c.centre, c.axis, radius, 0.75 * radius), 1500, static_cast<uint64_t>(k));
+                thinned(window(cloud, near, c.centre, c.axis, radius, HALF * radius), 1500, static_cast<uint64_t>(k));
             Cylinder &f = fitted[static_cast<size_t>(k)];
             f = fit_cylinder(cloud, wall, c, {.ellipse = false, .cone = 0.35, .min_inliers = 24});
             if (good(f)) { // the section of the node, not of its points' mean
-                f.centre += (c.centre - f.centre).dot(f.axis) * f.axis;
+                const double off = (c.centre - f.centre).dot(f.axis);
+                f.centre += off * f.axis;
+                f.status = std::abs(off) < OFF * radius ? f.status : FitStatus::one_sided;
             }
         });
         std::vector<double> rho;
