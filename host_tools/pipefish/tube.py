@@ -433,7 +433,7 @@ def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.ndarray]:
     s, piece = [], []
     for k, (start, end) in enumerate(tube.surface.pieces):
-        count = max(2, int(round((end - start) / spacing)) + 1)
+        count = max(2, round((end - start) / spacing) + 1)
         s.append(np.linspace(start, end, count))
         piece.append(np.full(count, k))
     s, piece = np.concatenate(s), np.concatenate(piece)

@@ -45,9 +45,33 @@ def break_candidates(coarse: Any, nodes: np.ndarray, diameter: float) -> list[fl
         k = int(chi2.argmax())
         found.append(float(s[k]))
         chi2[np.abs(s - s[k]) < 0.8 * diameter] = 0
+    placed = coarse.placed()
+    found = [_localised(placed, at, diameter) for at in found]
     total = np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum()
     scale = total / length  # the smooth axis is a little shorter than the polyline of its nodes
     return sorted(f * scale for f in found if 0.5 * diameter < f < length - 0.5 * diameter)
+
+
+def _localised(placed: np.ndarray, at: float, diameter: float) -> float:
+    """Where near `at` two smooth walls, one before and one after, leave the least residual."""
+    s, angle, distance, sigma, weight = placed[:, 0], placed[:, 1], placed[:, 3], placed[:, 4], placed[:, 5]
+    near = (placed[:, 6] >= 0) & (weight > 0) & (np.abs(s - at) < 1.2 * diameter)
+    t = (s[near] - at) / diameter
+    c, n, c2, n2 = (f(k * angle[near]) for k in (1, 2) for f in (np.cos, np.sin))
+    one = np.ones_like(t)
+    rows = np.stack([c, n, one, c2, n2, t * c, t * n, t * t * c, t * t * n, t, t * c2, t * n2], 1)
+    root = np.sqrt(weight[near]) / sigma[near]
+    rows, values = rows * root[:, None], distance[near] * root
+    tries = np.arange(-0.6, 0.601, 0.02)
+    cost = np.full(len(tries), np.inf)
+    for i, split in enumerate(tries):
+        sides = [t < split, t >= split]
+        if min(side.sum() for side in sides) >= 2 * rows.shape[1]:
+            fits = [np.linalg.lstsq(rows[side], values[side], rcond=None)[0] for side in sides]
+            cost[i] = sum(
+                float(((values[side] - rows[side] @ f) ** 2).sum()) for side, f in zip(sides, fits, strict=True)
+            )
+    return at + float(tries[int(cost.argmin())]) * diameter if np.isfinite(cost).any() else at
 
 
 def _ends(surface: Any, k: int) -> tuple[dict[str, np.ndarray], float]:
@@ -101,7 +125,8 @@ def _rings(tube: Tube) -> list[dict[str, Any]]:
     p, d = tube.points, tube.summary["d_mean"]
     out = (p["piece"] >= 0) & (p["distance"] > np.maximum(GROSS * p["sigma"], 0.005 * d)) & (p["distance"] < 0.25 * d)
     s, sextant = p["s"][out], (p["clock"][out] / (np.pi / 3)).astype(int) % 6
-    order = np.argsort(s)
+    # Where neighbours tell the same, only one of so many counts.
+    order = np.argsort(s)[:: max(1, round(tube.surface.correlation))]
     s, sextant = s[order], sextant[order]
     if len(s) < 4:
         return []
@@ -112,11 +137,17 @@ def _rings(tube: Tube) -> list[dict[str, Any]]:
         for i in np.flatnonzero(last - np.arange(len(s)) >= limit):
             inside = slice(i, last[i])
             if len(set(sextant[inside])) >= 4:
-                found.append((float((last[i] - i) / max(width, 1e-9)), s[inside]))
+                found.append((float((last[i] - i) / width), i, int(last[i])))
     found.sort(key=lambda f: -f[0])
     rings: list[dict[str, Any]] = []
-    for _, inside in found:
-        n, a, b = len(inside), float(inside[0]), float(inside[-1])
+    for density, first, after in found:
+        # Grown to the last point that follows as closely as the ring's own do.
+        reach = min(5 / density, 1 / (3 * rate)) if rate < density / 15 else 3 / density
+        while first > 0 and s[first] - s[first - 1] < reach:
+            first -= 1
+        while after < len(s) and s[after] - s[after - 1] < reach:
+            after += 1
+        n, a, b = after - first, float(s[first]), float(s[after - 1])
         if all(b < r["from"] - 0.1 * d or a > r["to"] + 0.1 * d for r in rings):
             # Ends of n points spread evenly: each misses the edge by (width / (n + 1)) on average.
             gap = (b - a) * (n + 1) / max(1, n - 1)
@@ -224,7 +255,7 @@ def _bends(tube: Tube) -> list[dict[str, Any]]:
     return found
 
 
-def _neighbours(p: dict[str, np.ndarray], side: np.ndarray) -> int:
+def _neighbours(side: np.ndarray) -> int:
     """How many neighbours a median needs so that scattered gross points seldom make its majority."""
     share = max(1e-3, float(side.mean()))
     for k in range(9, 62, 2):
@@ -232,7 +263,7 @@ def _neighbours(p: dict[str, np.ndarray], side: np.ndarray) -> int:
         chance = sum(math.comb(k, j) * share**j * (1 - share) ** (k - j) for j in range(need, k + 1))
         if chance * len(side) < FALSE_ALARMS:
             return k
-    return 61
+    return k
 
 
 def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -242,7 +273,8 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if len(rows) < 60:
         return []
     z = p["distance"][rows] / p["sigma"][rows]
-    k = max(_neighbours(p, z > 3), _neighbours(p, z < -3))
+    alike = max(1, round(tube.surface.correlation))  # so many neighbours tell the same: as many more are asked
+    k = min(401, max(_neighbours(z > 3), _neighbours(z < -3)) * alike | 1)
     used = np.isfinite(p["s"]) | (p["piece"] < 0)
     radius, most = 0.5 * d, 1.0 * d
     spacing = math.sqrt(math.pi * d * tube.length * k / (math.pi * len(rows)))
@@ -261,8 +293,9 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for sign in (-1, 1):
         flagged = rows[sound & (sign * (value - centre) > limit)]
         for cluster in _clusters(p, flagged, radius, spacing):
-            if len(cluster) >= (k + 1) // 2:
-                event = _describe(tube, cluster, median, sign, scale, spacing / math.sqrt(k))
+            cluster = _grown(p, cluster, sign, radius, spacing)
+            if len(cluster) >= 4:
+                event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
                 ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
                 if not (sign > 0 and ringed and event["length"] < 0.3 * d):
                     out.append(event)
@@ -293,20 +326,32 @@ def _clusters(p: dict[str, np.ndarray], rows: np.ndarray, radius: float, link: f
     return sorted(out, key=lambda c: int(c[0]))
 
 
-def _describe(
-    tube: Tube, cluster: np.ndarray, median: np.ndarray, sign: int, scale: float, spacing: float
-) -> dict[str, Any]:
+def _grown(p: dict[str, np.ndarray], cluster: np.ndarray, sign: int, radius: float, link: float) -> np.ndarray:
+    """The cluster with the points around it that stand out to the same side."""
+    standing = np.flatnonzero((p["piece"] >= 0) & (sign * p["distance"] > 2.5 * p["sigma"]))
+    near = standing[
+        (p["s"][standing] > p["s"][cluster].min() - link) & (p["s"][standing] < p["s"][cluster].max() + link)
+    ]
+    s, clock = p["s"][cluster], p["clock"][cluster]
+    keep = []
+    for row in near.tolist():
+        around = (p["clock"][row] - clock + np.pi) % (2 * np.pi) - np.pi
+        if (np.hypot(p["s"][row] - s, around * radius) < link).any():
+            keep.append(row)
+    return np.array(keep, dtype=int)
+
+
+def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any]:
     p, d = tube.points, tube.summary["d_mean"]
-    s, value = p["s"][cluster], np.abs(median[cluster])
-    weight = value / value.sum()
-    mean = np.exp(1j * p["clock"][cluster]) @ weight
-    clock = float(np.angle(mean) % (2 * np.pi))
+    s, value = p["s"][cluster], np.abs(p["distance"][cluster])
+    weight = np.full(len(cluster), 1 / len(cluster))
+    clock = float(np.angle(np.exp(1j * p["clock"][cluster]).mean()) % (2 * np.pi))
     off = (p["clock"][cluster] - clock + np.pi) % (2 * np.pi) - np.pi
     n = len(cluster)
-    stretch = (n + 1) / max(1, n - 1) if n > 3 else 1.0
-    length = float(np.ptp(s)) * min(stretch, 1.3)
-    width = float(np.ptp(off)) * 0.5 * d * min(stretch, 1.3)
-    height = float(np.max(value))
+    # The outermost of n points miss the rim of a patch by about its size over n.
+    length = float(np.ptp(s)) * (n + 1) / (n - 1)
+    width = float(np.ptp(off)) * 0.5 * d * (n + 1) / (n - 1)
+    height = float(np.quantile(value, 0.9))
     kind = "deposit"
     if sign > 0:
         kind = "recess"
@@ -315,14 +360,14 @@ def _describe(
     return {
         "kind": kind,
         "s": float(s @ weight),
-        "s_sigma": float(max(spacing, length / math.sqrt(12 * n))),
+        "s_sigma": float(max(spacing, length / math.sqrt(12)) / math.sqrt(n)),
         "clock": clock,
-        "clock_sigma": float(max(spacing, width / math.sqrt(12 * n)) / (0.5 * d)),
+        "clock_sigma": float(max(spacing, width / math.sqrt(12)) / math.sqrt(n) / (0.5 * d)),
         "length": length,
         "width": width,
-        "size_sigma": float(spacing * math.sqrt(2)),
+        "size_sigma": float(max(length, width) * math.sqrt(2) / (n + 1) + spacing / 2),
         "height": height,
-        "height_sigma": float(math.hypot(scale, np.median(p["sigma"][cluster]) / math.sqrt(min(n, 9)))),
+        "height_sigma": float(np.median(p["sigma"][cluster]) / math.sqrt(max(1.0, 0.2 * n))),
         "area": length * width * math.pi / 4,
         "points": n,
     }

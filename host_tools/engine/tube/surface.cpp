@@ -425,11 +425,12 @@ namespace
 
 constexpr int TERMS = 2 * MAX_ORDER + 1;
 
-// Least squares of z on harmonics 0 to MAX_ORDER: how much each order takes from the sum of squares.
-std::array<double, MAX_ORDER + 1> take_harmonics(Stretch &stretch)
+// Least squares of z on harmonics 0 to MAX_ORDER: how much each order takes from the sum of squares. `basis` becomes
+// orthonormal.
+std::array<double, MAX_ORDER + 1> take_harmonics(Stretch &stretch, Eigen::MatrixXd &basis)
 {
     const auto n = static_cast<Eigen::Index>(stretch.z.size());
-    Eigen::MatrixXd basis(n, TERMS);
+    basis.resize(n, TERMS);
     for (Eigen::Index i = 0; i < n; i++) {
         basis(i, 0) = 1.0;
         for (int h = 1; h <= MAX_ORDER; h++) {
@@ -468,18 +469,21 @@ void Surface::measure_correlation()
 {
     constexpr int AROUND = 12, ALONG = 3;
     double sum = 0.0, cells = 0.0;
+    Eigen::MatrixXd basis;
     for (Stretch &stretch : stretches()) {
         if (stretch.z.size() < 5 * TERMS) {
             continue;
         }
-        take_harmonics(stretch);
+        take_harmonics(stretch, basis);
         std::array<double, AROUND * ALONG> total{}, count{};
+        Eigen::MatrixXd taken = Eigen::MatrixXd::Zero(AROUND * ALONG, TERMS);
         for (size_t i = 0; i < stretch.z.size(); i++) {
             const double turn = stretch.angle[i] / (2.0 * std::numbers::pi) + 0.5;
             const int cell = std::min(AROUND - 1, static_cast<int>(turn * AROUND)) * ALONG +
                              std::clamp(static_cast<int>(stretch.along[i] * ALONG), 0, ALONG - 1);
             total[static_cast<size_t>(cell)] += stretch.z[i];
             count[static_cast<size_t>(cell)] += 1.0;
+            taken.row(cell) += basis.row(static_cast<Eigen::Index>(i));
         }
         double variance = 0.0;
         for (const double z : stretch.z) {
@@ -487,11 +491,13 @@ void Surface::measure_correlation()
         }
         variance /= static_cast<double>(stretch.z.size() - TERMS);
         for (size_t c = 0; c < total.size(); c++) {
-            // The harmonics took a share of every cell's freedom.
-            const double share = 1.0 - TERMS * count[c] / (static_cast<double>(stretch.z.size()) * std::max(1.0, count[c]));
             if (count[c] >= 3.0) {
-                sum += total[c] * total[c] / (count[c] * variance);
-                cells += std::max(0.0, 1.0 - static_cast<double>(TERMS) / (AROUND * ALONG)) * share;
+                // Of independent residuals the cell's sum has its count as variance, less what the harmonics took.
+                const double left = count[c] - taken.row(static_cast<Eigen::Index>(c)).squaredNorm();
+                if (left > 0.3 * count[c]) {
+                    sum += total[c] * total[c] / (left * variance);
+                    cells += 1.0;
+                }
             }
         }
     }
@@ -535,12 +541,13 @@ std::vector<Stretch> Surface::stretches() const
 int Surface::choose_order() const
 {
     std::array<double, MAX_ORDER + 1> gain{};
+    Eigen::MatrixXd basis;
     for (Stretch &stretch : stretches()) {
         if (stretch.z.size() < 5 * TERMS) {
             continue;
         }
         const double price = 2.0 * std::log(static_cast<double>(stretch.z.size()) / correlation_);
-        const std::array<double, MAX_ORDER + 1> taken = take_harmonics(stretch);
+        const std::array<double, MAX_ORDER + 1> taken = take_harmonics(stretch, basis);
         double variance = 0.0;
         for (const double z : stretch.z) {
             variance += z * z;

@@ -152,6 +152,11 @@ Found look(const Cloud &cloud, const std::vector<int> &around, uint64_t stream)
     return best;
 }
 
+bool good(const Cylinder &c)
+{
+    return c.status == FitStatus::ok || c.status == FitStatus::circle_only;
+}
+
 std::vector<int> window(const Cloud &cloud, const std::vector<int> &near, const Vector3d &centre, const Vector3d &axis,
                         double rho, double half)
 {
@@ -211,7 +216,8 @@ Cylinder find_cylinder(const Cloud &cloud, int threads)
         std::vector<int> all(nearest.within(c.centre, 2.5 * c.rho));
         const std::vector<int> wall = thinned(window(cloud, all, c.centre, c.axis, c.rho, 1.5 * c.rho), 4000, i);
         const Cylinder fitted = fit_cylinder(cloud, wall, c, {.ellipse = false, .cone = 0.15, .min_inliers = 40});
-        if (fitted.status != FitStatus::ok && fitted.status != FitStatus::circle_only) {
+        if (!good(fitted)) {
+            chosen.status = i == 0 && fitted.status == FitStatus::one_sided ? fitted.status : chosen.status;
             continue;
         }
         Eigen::Matrix3Xd some(3, static_cast<Eigen::Index>(all.size()));
@@ -262,11 +268,6 @@ std::vector<Cylinder> follow(const Cloud &cloud, const Nearest<3> &nearest, cons
         bridged = 0.0;
     }
     return out;
-}
-
-bool good(const Cylinder &c)
-{
-    return c.status == FitStatus::ok || c.status == FitStatus::circle_only;
 }
 
 Cylinder reversed(Cylinder c)
