@@ -170,7 +170,7 @@ def event_text(e: dict[str, Any]) -> str:
         ("length", "length"),
         ("width", "width"),
     ):
-        if e.get(name) is not None and not (e["kind"] == "bend"):
+        if e.get(name) is not None and e["kind"] != "bend":
             parts.append(f"{what} {1000 * e[name]:.1f} mm")
     if e["kind"] == "joint" and e.get("angle") is not None:
         parts.append(f"angle {math.degrees(e['angle']):.2f} degrees")

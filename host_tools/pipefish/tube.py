@@ -5,6 +5,7 @@ o'clock; hours = clock * 6 / pi. Lengths are metres."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -38,7 +39,7 @@ class Tube:
       s, x, y, z, tx, ty, tz   chainage, point of the axis, unit tangent
       status                   "ok", "circle_only", "one_sided", "too_few_points"; values not measured are NaN
       d_mean, d_area, circumference, d_max, d_min   perimeter / pi; diameter of the circle of equal area; widest and
-                               narrowest caliper width. The ellipse's part of d_max and d_min is without the noise's bias
+                               narrowest caliper width. The ellipse's part is without the noise's bias
       clock_max                clock angle of d_max, radians, 0 to pi
       ovality                  (d_max - d_min) / d_mean;  ovality_nominal: the same over the nominal diameter
       ovality_astm             (d_mean - d_min) / d_mean (ASTM F1216);  ovality_astm_max: (d_max - d_mean) / d_mean
@@ -56,7 +57,9 @@ class Tube:
     summary: dict[str, Any] = field(default_factory=dict)
     nominal: float | None = None
     clock_zero: str = ""
-    points: dict[str, np.ndarray] = field(default_factory=dict)  # of each point: s, clock, r, distance, sigma, weight
+    points: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # of each point: s, clock, r, distance, sigma, weight, ..
     surface: Any = None
     _up: np.ndarray | None = None
 
@@ -325,7 +328,7 @@ def _reference(cloud: np.ndarray, sections: list[dict[str, Any]], path: Any) -> 
     for i in range(1, len(nodes)):
         if np.linalg.norm(nodes[i] - nodes[keep[-1]]) > 0.1 * typical:
             keep.append(i)
-    if sum(np.linalg.norm(nodes[b] - nodes[a]) for a, b in zip(keep, keep[1:], strict=False)) < 0.5 * typical:
+    if sum(np.linalg.norm(nodes[b] - nodes[a]) for a, b in itertools.pairwise(keep)) < 0.5 * typical:
         return np.empty((0, 3)), []
     return np.ascontiguousarray(np.array([nodes[i] for i in keep])), [rho[i] for i in keep]
 
@@ -561,6 +564,7 @@ def _all_points(places: dict[str, np.ndarray], used: np.ndarray) -> dict[str, np
         full = np.full(len(used), -1 if name == "piece" else 0.0 if name == "weight" else np.nan, dtype=values.dtype)
         full[used] = values
         out[name] = full
+    out["known"] = used
     return out
 
 

@@ -62,15 +62,19 @@ def _localised(placed: np.ndarray, at: float, diameter: float) -> float:
     rows = np.stack([c, n, one, c2, n2, t * c, t * n, t * t * c, t * t * n, t, t * c2, t * n2], 1)
     root = np.sqrt(weight[near]) / sigma[near]
     rows, values = rows * root[:, None], distance[near] * root
+    # Normal equations, summed from one try to the next; a hair of ridge for stretches that do not fix all terms.
     tries = np.arange(-0.6, 0.601, 0.02)
+    bins = np.searchsorted(tries, t, side="right")
+    parts = [bins == i for i in range(len(tries) + 1)]
+    normal = np.cumsum([rows[k].T @ rows[k] for k in parts], axis=0)
+    right = np.cumsum([rows[k].T @ values[k] for k in parts], axis=0)
+    count = np.cumsum([k.sum() for k in parts])
+    ridge = 1e-9 * np.trace(normal[-1]) * np.eye(rows.shape[1])
     cost = np.full(len(tries), np.inf)
-    for i, split in enumerate(tries):
-        sides = [t < split, t >= split]
-        if min(side.sum() for side in sides) >= 2 * rows.shape[1]:
-            fits = [np.linalg.lstsq(rows[side], values[side], rcond=None)[0] for side in sides]
-            cost[i] = sum(
-                float(((values[side] - rows[side] @ f) ** 2).sum()) for side, f in zip(sides, fits, strict=True)
-            )
+    for i in range(len(tries)):
+        if min(count[i], count[-1] - count[i]) >= 2 * rows.shape[1]:
+            sides = ((normal[i], right[i]), (normal[-1] - normal[i], right[-1] - right[i]))
+            cost[i] = -sum(float(r @ np.linalg.solve(n + ridge, r)) for n, r in sides)
     return at + float(tries[int(cost.argmin())]) * diameter if np.isfinite(cost).any() else at
 
 
@@ -255,45 +259,52 @@ def _bends(tube: Tube) -> list[dict[str, Any]]:
     return found
 
 
-def _neighbours(side: np.ndarray) -> int:
-    """How many neighbours a median needs so that scattered gross points seldom make its majority."""
-    share = max(1e-3, float(side.mean()))
-    for k in range(9, 62, 2):
-        need = (k + 1) // 2
-        chance = sum(math.comb(k, j) * share**j * (1 - share) ** (k - j) for j in range(need, k + 1))
-        if chance * len(side) < FALSE_ALARMS:
-            return k
-    return k
+def _majority(share: float, k: int) -> float:
+    """Chance that more than half of k points stand out, each with probability `share`."""
+    need = (k + 1) // 2
+    return sum(math.comb(k, j) * share**j * (1 - share) ** (k - j) for j in range(need, k + 1))
+
+
+def _limit(z: np.ndarray, k: int, tests: int) -> float:
+    """Standard deviations that a median of k reaches by chance in less than FALSE_ALARMS of fits, on this side: the
+    points' own distribution says how often one of them does."""
+    ordered = np.sort(z)
+    for limit in np.arange(0.5, 8.0, 0.1):
+        share = 1 - np.searchsorted(ordered, limit) / len(z)
+        if tests * _majority(share, k) < FALSE_ALARMS / 4:
+            return float(limit)
+    return 8.0
 
 
 def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Patches of wall whose points stand in or out together."""
     p, d = tube.points, tube.summary["d_mean"]
+    every = max(1, round(tube.surface.correlation))  # so many neighbours tell the same
     rows = np.flatnonzero(p["piece"] >= 0)
-    if len(rows) < 60:
+    tests = len(rows) // every
+    if tests < 60:
         return []
     z = p["distance"][rows] / p["sigma"][rows]
-    alike = max(1, round(tube.surface.correlation))  # so many neighbours tell the same: as many more are asked
-    k = min(401, max(_neighbours(z > 3), _neighbours(z < -3)) * alike | 1)
-    used = np.isfinite(p["s"]) | (p["piece"] < 0)
-    radius, most = 0.5 * d, 1.0 * d
-    spacing = math.sqrt(math.pi * d * tube.length * k / (math.pi * len(rows)))
+    radius = 0.5 * d
+    worst = max((z > 3).mean(), (z < -3).mean())
+    k = next((k for k in range(9, 62, 2) if tests * _majority(float(worst), k) < FALSE_ALARMS / 4), 61)
+    spacing = math.sqrt(d * tube.length * k / tests)
+    # `used` are the points that the surface knows: the finite ones.
     median = np.full(len(p["s"]), np.nan)
-    found = tube.surface.medians(radius, k, 2.5 * spacing, most)
-    median[np.flatnonzero(used)[: len(found)] if len(found) != len(median) else slice(None)] = found
-    value = median[rows]
-    sound = np.isfinite(value)
-    if sound.sum() < 60:
+    median[p["known"]] = tube.surface.medians(radius, k, every, 2.5 * spacing, 1.0 * d)
+    rows = rows[np.isfinite(median[rows])]
+    if len(rows) < 60:
         return []
-    centre = float(np.median(value[sound]))
-    scale = float(1.4826 * np.median(np.abs(value[sound] - centre)))
-    # Medians of neighbourhoods: about len / k of them are independent.
-    limit = -NormalDist().inv_cdf(FALSE_ALARMS / 2 / max(1.0, len(rows) / k)) * 1.15 * scale
+    value = median[rows]
+    centre = float(np.median(value))
+    scale = float(1.4826 * np.median(np.abs(value - centre)))
+    gauss = -NormalDist().inv_cdf(FALSE_ALARMS / 4 / max(1.0, tests / k)) * scale
     out = []
     for sign in (-1, 1):
-        flagged = rows[sound & (sign * (value - centre) > limit)]
-        for cluster in _clusters(p, flagged, radius, spacing):
-            cluster = _grown(p, cluster, sign, radius, spacing)
+        limit = np.maximum(gauss, _limit(sign * z, k, tests) * p["sigma"][rows])
+        flagged = rows[sign * (value - centre) > limit]
+        for seed in _clusters(p, flagged, radius, spacing):
+            cluster = _grown(p, seed, sign, radius, spacing, float(np.abs(median[seed]).max()))
             if len(cluster) >= 4:
                 event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
                 ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
@@ -326,9 +337,12 @@ def _clusters(p: dict[str, np.ndarray], rows: np.ndarray, radius: float, link: f
     return sorted(out, key=lambda c: int(c[0]))
 
 
-def _grown(p: dict[str, np.ndarray], cluster: np.ndarray, sign: int, radius: float, link: float) -> np.ndarray:
+def _grown(
+    p: dict[str, np.ndarray], cluster: np.ndarray, sign: int, radius: float, link: float, height: float
+) -> np.ndarray:
     """The cluster with the points around it that stand out to the same side."""
-    standing = np.flatnonzero((p["piece"] >= 0) & (sign * p["distance"] > 2.5 * p["sigma"]))
+    away = sign * p["distance"]
+    standing = np.flatnonzero((p["piece"] >= 0) & (away > 2.5 * p["sigma"]) & (away < 1.5 * height + 3 * p["sigma"]))
     near = standing[
         (p["s"][standing] > p["s"][cluster].min() - link) & (p["s"][standing] < p["s"][cluster].max() + link)
     ]

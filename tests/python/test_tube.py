@@ -53,9 +53,9 @@ def test_sizes_shapes_and_gross_points_are_within_their_intervals(pipe: Pipe, wi
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     inside, oval, z = [], [], []
-    for seed in range(30):
+    for seed in range(24):
         pipe = Pipe(ovality=0.01 * (seed % 3), outliers=0.1, seed=seed)
-        t = pf.fit_tube(pipe.points(1200), pipe.noise, pipe.cameras()).stations
+        t = pf.fit_tube(pipe.points(900), pipe.noise, pipe.cameras()).stations
         some = np.arange(2, len(t["s"]) - 2, 6)  # at 1.5 diameters
         z += ((t["d_mean"] - 0.3) / t["d_mean_sigma"])[some].tolist()
         inside += (np.abs(t["d_mean"] - 0.3) < 1.96 * t["d_mean_sigma"])[some].tolist()
@@ -228,7 +228,8 @@ def test_files_hold_the_same_points(tmp_path: Path) -> None:
         ("d.ply", b"ply\nformat middle_endian 1.0\nelement vertex 1\nend_header\n", "middle_endian"),
         (
             "e.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty char x\nproperty char y\nproperty char z\nend_header\n1 2",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty char x\nproperty char y\nproperty char z\n"
+            b"end_header\n1 2",
             "0 of 3",
         ),
         ("f.xyz", b"1 2 3\n4 five 6\n", "line 2"),

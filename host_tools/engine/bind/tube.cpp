@@ -150,7 +150,8 @@ std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &nois
     auto out = std::make_unique<Fitted>();
     out->cloud = cloud_of(points, noise);
     const Reference reference{
-        Eigen::Map<const Eigen::Matrix3Xd>(centres.data(), 3, static_cast<Eigen::Index>(centres.shape(0))), rho, breaks};
+        Eigen::Map<const Eigen::Matrix3Xd>(centres.data(), 3, static_cast<Eigen::Index>(centres.shape(0))), rho,
+        breaks};
     const nb::gil_scoped_release release;
     out->surface = std::make_unique<Surface>(
         out->cloud, reference,
@@ -202,9 +203,9 @@ Rows steps(const Fitted &fitted, double window, double every, double radius)
     return out;
 }
 
-Eigen::VectorXd medians(const Fitted &fitted, double radius, int k, double reach, double most)
+Eigen::VectorXd medians(const Fitted &fitted, double radius, int k, int every, double reach, double most)
 {
-    const std::vector<double> found = local_medians(all_placed(fitted), radius, k, reach, most);
+    const std::vector<double> found = local_medians(all_placed(fitted), radius, k, every, reach, most);
     return Eigen::Map<const Eigen::VectorXd>(found.data(), static_cast<Eigen::Index>(found.size()));
 }
 
@@ -212,7 +213,8 @@ Eigen::VectorXd medians(const Fitted &fitted, double radius, int k, double reach
 nb::dict stations(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece)
 {
     const Eigen::Index n = static_cast<Eigen::Index>(s.size()), shape = shape_parameters(fitted.surface->order());
-    Rows centre(n, 3), tangent(n, 3), first(n, 3), second(n, 3), sections(n, shape), covariance(n, (shape + 2) * (shape + 2));
+    Rows centre(n, 3), tangent(n, 3), first(n, 3), second(n, 3), sections(n, shape),
+        covariance(n, (shape + 2) * (shape + 2));
     Rows turn(n, 4), rest(n, 8);
     for (Eigen::Index i = 0; i < n; i++) {
         const Station a = fitted.surface->station(s[static_cast<size_t>(i)], piece[static_cast<size_t>(i)]);
@@ -263,12 +265,11 @@ void bind_tube(nb::module_ &m)
         .def_prop_ro("converged", [](const Fitted &f) { return f.surface->converged(); })
         .def_prop_ro("pieces", [](const Fitted &f) { return f.surface->pieces(); })
         .def("steps", &steps, nb::arg("window"), nb::arg("every"), nb::arg("radius"))
-        .def("medians", &medians, nb::arg("radius"), nb::arg("k"), nb::arg("reach"), nb::arg("most"))
+        .def("medians", &medians, nb::arg("radius"), nb::arg("k"), nb::arg("every"), nb::arg("reach"), nb::arg("most"))
         .def("placed", &placed)
         .def("project", &project, nb::arg("points"))
         .def("stations", &stations, nb::arg("s"), nb::arg("piece"));
     m.def("tube_surface", &fit_surface, nb::arg("points"), nb::arg("noise").none(), nb::arg("centres"), nb::arg("rho"),
           nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"));
-    m.def("tube_trace", &trace_all, nb::arg("points"), nb::arg("noise").none(), nb::arg("path"),
-          nb::arg("threads"));
+    m.def("tube_trace", &trace_all, nb::arg("points"), nb::arg("noise").none(), nb::arg("path"), nb::arg("threads"));
 }

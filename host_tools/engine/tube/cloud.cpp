@@ -9,7 +9,7 @@ namespace pipefish::tube
 namespace
 {
 
-constexpr double CUT = 2.5;              // standard deviations, beyond which residuals say nothing about the core
+constexpr double CUT = 2.5;                // standard deviations, beyond which residuals say nothing about the core
 constexpr double CUT_VARIANCE = 0.9112564; // of a standard Gaussian cut there
 
 // Sum over residuals within the cut of r^2 / variance, less what Gaussian ones would give.

@@ -10,8 +10,8 @@ namespace pipefish::tube
 {
 
 struct Cloud {
-    Eigen::Matrix3Xd points;                // metres
-    std::vector<double> sigma;              // isotropic, one a point; empty: unknown
+    Eigen::Matrix3Xd points;                 // metres
+    std::vector<double> sigma;               // isotropic, one a point; empty: unknown
     std::vector<Eigen::Matrix3d> covariance; // one a point; empty: isotropic or unknown
 
     int size() const { return static_cast<int>(points.cols()); }
@@ -28,7 +28,8 @@ struct Cloud {
 
 // Tukey's biweight at 4.685 standard deviations: 95 % efficient on Gaussian noise.
 constexpr double TUKEY = 4.685;
-// Variance of that estimate over the inverse of its weighted normal matrix, for Gaussian noise: E psi^2 E w / (E psi')^2.
+// Variance of that estimate over the inverse of its weighted normal matrix, for Gaussian noise: E psi^2 E w / (E
+// psi')^2.
 constexpr double TUKEY_VARIANCE = 0.9633;
 
 inline double tukey_weight(double squared_over_variance)

@@ -285,8 +285,10 @@ Candidate best_circle(const Eigen::Matrix3Xd &points, const Vector3d &axis, cons
         }
         // The same tolerance for every circle: a larger one must not gain by a wider band.
         const double limit = tolerance * start.rho;
-        const double cost =
-            (((flat.colwise() - circle.centre).colwise().norm().array() - circle.radius) / limit).square().min(1.0).sum();
+        const double cost = (((flat.colwise() - circle.centre).colwise().norm().array() - circle.radius) / limit)
+                                .square()
+                                .min(1.0)
+                                .sum();
         if (cost < best.cost) {
             best.cost = cost;
             cylinder.centre = start.centre + cylinder.basis * circle.centre;
@@ -319,7 +321,8 @@ double truncated_cost(const Cloud &cloud, std::span<const int> index, const Cyli
     const double shape[3] = {c.rho, c.ec, c.es};
     for (const int i : index) {
         const double d =
-            section_distance(2, shape, c.basis.transpose() * (cloud.points.col(i) - c.centre), nullptr).distance / limit;
+            section_distance(2, shape, c.basis.transpose() * (cloud.points.col(i) - c.centre), nullptr).distance /
+            limit;
         sum += std::min(1.0, d * d);
     }
     return sum;
@@ -339,7 +342,8 @@ Cylinder searched(const Cloud &cloud, std::span<const int> index, const Cylinder
     for (const Vector3d &axis : directions(start, options.cone)) {
         found.push_back(best_circle(some, axis, start, options.tolerance, stream++));
     }
-    std::stable_sort(found.begin(), found.end(), [](const Candidate &a, const Candidate &b) { return a.cost < b.cost; });
+    std::stable_sort(found.begin(), found.end(),
+                     [](const Candidate &a, const Candidate &b) { return a.cost < b.cost; });
     found.resize(std::min<size_t>(3, found.size()));
     Candidate best{std::numeric_limits<double>::infinity(), start};
     for (const Candidate &c : found) {

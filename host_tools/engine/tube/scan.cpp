@@ -37,7 +37,8 @@ struct Side {
 
 } // namespace
 
-std::vector<Step> scan_steps(std::span<const OnSurface> points, double length, double window, double every, double radius)
+std::vector<Step> scan_steps(std::span<const OnSurface> points, double length, double window, double every,
+                             double radius)
 {
     constexpr int LEAST = 4 * TERMS;
     std::vector<OnSurface> sorted;
@@ -96,12 +97,13 @@ std::vector<Step> scan_steps(std::span<const OnSurface> points, double length, d
     return out;
 }
 
-std::vector<double> local_medians(std::span<const OnSurface> points, double radius, int k, double reach, double most)
+std::vector<double> local_medians(std::span<const OnSurface> points, double radius, int k, int every, double reach,
+                                  double most)
 {
     std::vector<double> out(points.size(), std::numeric_limits<double>::quiet_NaN());
     std::vector<size_t> of;
-    for (size_t i = 0; i < points.size(); i++) {
-        if (points[i].piece >= 0 && std::abs(points[i].distance) < most) {
+    for (size_t i = 0, seen = 0; i < points.size(); i++) {
+        if (points[i].piece >= 0 && std::abs(points[i].distance) < most && seen++ % static_cast<size_t>(every) == 0) {
             of.push_back(i);
         }
     }

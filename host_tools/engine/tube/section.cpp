@@ -30,7 +30,8 @@ std::pair<double, double> first_quadrant(double a, double b, double p0, double p
         const double c = r * z0 / (s + r), d = z1 / (s + 1.0);
         const double value = (c - 1.0) * (c + 1.0) + d * d;
         (value >= 0.0 ? low : high) = s;
-        // Convex and falling: Newton from the left never overshoots; it is slow only near the pole, where halving helps.
+        // Convex and falling: Newton from the left never overshoots; it is slow only near the pole, where halving
+        // helps.
         const double slope = -2.0 * (c * c / (s + r) + d * d / (s + 1.0));
         double next = value >= 0.0 ? s - value / slope : 0.5 * (low + high);
         if (!(next > low && next < high) || (i % 8) == 7) {

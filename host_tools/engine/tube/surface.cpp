@@ -20,11 +20,11 @@ using Eigen::Vector3d;
 namespace
 {
 
-constexpr int ARC = 16;             // steps of the table of chainages, a knot interval
-constexpr int BINS = 60;            // of azimuth
-constexpr double FAR = 3.0;         // radii: points beyond say nothing of this pipe
-constexpr double GATE = 0.5;        // radii: distances beyond are gross whatever the scale
-constexpr int ENOUGH_A_DIAMETER = 4000; // points; more than that only cost time
+constexpr int ARC = 16;                 // steps of the table of chainages, a knot interval
+constexpr int BINS = 60;                // of azimuth
+constexpr double FAR = 3.0;             // radii: points beyond say nothing of this pipe
+constexpr double GATE = 0.5;            // radii: distances beyond are gross whatever the scale
+constexpr int ENOUGH_A_DIAMETER = 1500; // points: 2.6 % of their noise is left in a radius; more only cost time
 constexpr double ELLIPSE_GAP = 150.0 * std::numbers::pi / 180.0;
 
 double median(std::vector<double> v)
@@ -82,13 +82,18 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
     measure_correlation();
     converged_ = solve(options.smooth_only ? 3 : options.rounds, !options.smooth_only);
     if (!options.smooth_only) {
-        const int order = options.order == 0 ? choose_order() : options.order;
-        find_gaps();
-        measure_correlation();
-        if (order != order_) {
-            widen(order);
+        // Twice: what the first harmonics leave may want more.
+        for (int pass = 0; pass < 2; pass++) {
+            const int order = options.order == 0 ? choose_order() : options.order;
+            find_gaps();
+            if (order > order_) {
+                widen(order);
+            } else if (pass > 0) {
+                break;
+            }
+            measure_correlation();
+            converged_ = solve(options.rounds / 2, true);
         }
-        converged_ = solve(options.rounds / 2, true);
     }
     tabulate();
     reweigh(true);
@@ -277,8 +282,8 @@ void Surface::reweigh(bool all)
             continue;
         }
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
-        const auto c = static_cast<size_t>(
-            piece.first + 1 + std::clamp(static_cast<int>(std::lround(u_[i])), 0, piece.intervals));
+        const auto c =
+            static_cast<size_t>(piece.first + 1 + std::clamp(static_cast<int>(std::lround(u_[i])), 0, piece.intervals));
         const double variance = noise_[i] + tau_[c] * tau_[c] + floor * floor;
         robust_[i] = tukey_weight(distance_[i] * distance_[i] / variance);
         weight_[i] = robust_[i] * information / variance;
@@ -349,7 +354,7 @@ bool Surface::solve(int rounds, bool adapt)
         reweigh(false);
         const std::vector<double> before = shape_;
         const std::vector<Vector3d> where = control_;
-        solver.minimize(problem, {.max_iterations = 3});
+        solver.minimize(problem, {.max_iterations = round == 0 ? 3 : 1}); // the loop around goes on
         const auto known = solver.covariance(problem);
         const auto between = [&](size_t a, size_t b) { return a >= b ? known.f[a][a - b][0] : known.f[b][b - a][0]; };
         covariance_.assign(control_.size(), {});
@@ -516,7 +521,8 @@ std::vector<Stretch> Surface::stretches() const
     std::vector<size_t> start;
     for (const Piece &piece : piece_) {
         start.push_back(out.size());
-        out.resize(out.size() + static_cast<size_t>(std::max(1.0, std::round(piece.intervals * piece.step / diameter_))));
+        out.resize(out.size() +
+                   static_cast<size_t>(std::max(1.0, std::round(piece.intervals * piece.step / diameter_))));
     }
     start.push_back(out.size());
     const double information = 1.0 / (TUKEY_VARIANCE * correlation_);
@@ -526,7 +532,8 @@ std::vector<Stretch> Surface::stretches() const
         }
         const size_t k = static_cast<size_t>(of_piece_[i]);
         const Piece &piece = piece_[k];
-        const double place = std::clamp(u_[i] / piece.intervals, 0.0, 1.0) * static_cast<double>(start[k + 1] - start[k]);
+        const double place =
+            std::clamp(u_[i] / piece.intervals, 0.0, 1.0) * static_cast<double>(start[k + 1] - start[k]);
         const size_t at = std::min(start[k + 1] - 1, start[k] + static_cast<size_t>(place));
         const Frame f = frame(piece, u_[i]);
         const Vector3d d = cloud_.points.col(static_cast<Eigen::Index>(i)) - f.centre;
@@ -537,7 +544,8 @@ std::vector<Stretch> Surface::stretches() const
     return out;
 }
 
-// The order with the least BIC: what harmonics 3, 4 and 5-6 take from the residuals of each stretch, against their cost.
+// The order with the least BIC: what harmonics beyond the present take from the residuals of each stretch, against
+// their cost.
 int Surface::choose_order() const
 {
     std::array<double, MAX_ORDER + 1> gain{};
@@ -557,9 +565,9 @@ int Surface::choose_order() const
             gain[h] += taken[h] / (variance * correlation_) - price;
         }
     }
-    int best = 2;
+    int best = order_;
     double sum = 0.0, most = 0.0;
-    for (int h = 3; h <= MAX_ORDER; h++) {
+    for (int h = order_ + 1; h <= MAX_ORDER; h++) {
         sum += gain[static_cast<size_t>(h)];
         if (h != 5 && sum > most) { // orders 5 and 6 come together
             most = sum;
@@ -614,8 +622,8 @@ void Surface::describe()
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
         const Frame f = frame(piece, u_[i]);
         const Vector3d d = cloud_.points.col(static_cast<Eigen::Index>(i)) - f.centre;
-        const auto c = static_cast<size_t>(
-            piece.first + 1 + std::clamp(static_cast<int>(std::lround(u_[i])), 0, piece.intervals));
+        const auto c =
+            static_cast<size_t>(piece.first + 1 + std::clamp(static_cast<int>(std::lround(u_[i])), 0, piece.intervals));
         p.s = chainage(piece, u_[i]);
         p.angle = std::atan2(d.dot(f.second), d.dot(f.first));
         p.r = d.norm();
@@ -654,8 +662,13 @@ OnSurface Surface::project(const Vector3d &x) const
             nearest = d.norm();
             shape_at(piece, u, section.data());
             const Vector2d y(d.dot(f.first), d.dot(f.second));
-            best = {chainage(piece, u), std::atan2(y[1], y[0]), d.norm(),
-                    section_distance(order_, section.data(), y, nullptr).distance, 0.0, 0.0, static_cast<int>(k)};
+            best = {chainage(piece, u),
+                    std::atan2(y[1], y[0]),
+                    d.norm(),
+                    section_distance(order_, section.data(), y, nullptr).distance,
+                    0.0,
+                    0.0,
+                    static_cast<int>(k)};
         }
     }
     return best;
@@ -707,7 +720,8 @@ Station Surface::station(double s, int which) const
     const Vector3d turn = f.second_derivative - f.second_derivative.dot(f.tangent) * f.tangent;
     out.curvature = turn.norm() / (f.speed * f.speed);
     out.curvature_sigma = std::sqrt(std::max(0.0, bend)) / (f.speed * f.speed);
-    const auto c = static_cast<size_t>(piece.first + 1 + std::clamp(static_cast<int>(std::lround(u)), 0, piece.intervals));
+    const auto c =
+        static_cast<size_t>(piece.first + 1 + std::clamp(static_cast<int>(std::lround(u)), 0, piece.intervals));
     out.roughness = tau_[c];
     out.ellipse = !pinned_[c];
     count_around(out);

@@ -23,32 +23,32 @@ struct Reference {
 };
 
 struct SurfaceOptions {
-    double knot = 0.5;   // spacing of the knots, in diameters
-    int order = 2;       // of the section's harmonics, 2 to 6; 0: by BIC
-    int rounds = 12;     // of reweighting and smoothing
+    double knot = 0.5;        // spacing of the knots, in diameters
+    int order = 2;            // of the section's harmonics, 2 to 6; 0: by BIC
+    int rounds = 12;          // of reweighting and smoothing
     bool smooth_only = false; // keep the smoothness as it starts: stiff, for looking for joints
 };
 
 // Axis, frame and section at one place, with what is known of them.
 struct Station {
-    double s = 0.0;                                  // chainage, metres along the axis
+    double s = 0.0; // chainage, metres along the axis
     int piece = 0;
-    Eigen::Vector3d centre, tangent, first, second;  // right-handed: first x second = tangent
-    double curvature = 0.0, curvature_sigma = 0.0;   // 1 / m
-    Eigen::Matrix2d tangent_covariance;              // along first, second; radians
+    Eigen::Vector3d centre, tangent, first, second; // right-handed: first x second = tangent
+    double curvature = 0.0, curvature_sigma = 0.0;  // 1 / m
+    Eigen::Matrix2d tangent_covariance;             // along first, second; radians
     Eigen::VectorXd shape;
-    Eigen::MatrixXd covariance;                      // of the centre along first and second, then the shape
-    int inliers = 0;                                 // within half a window
-    double gap = 0.0, rms = 0.0, roughness = 0.0;    // radians, metres, metres
-    bool ellipse = true;                             // false: pinned to a circle for want of points around
+    Eigen::MatrixXd covariance;                   // of the centre along first and second, then the shape
+    int inliers = 0;                              // within half a window
+    double gap = 0.0, rms = 0.0, roughness = 0.0; // radians, metres, metres
+    bool ellipse = true;                          // false: pinned to a circle for want of points around
 };
 
-struct OnSurface {       // a point's place
-    double s, angle, r;  // chainage; angle from `first` to `second`, radians; distance from the axis
-    double distance;     // from the wall, positive outside
-    double sigma;        // of the distance: noise and roughness
-    double weight;       // 0 to 1
-    int piece;           // -1: off the tube's length
+struct OnSurface {      // a point's place
+    double s, angle, r; // chainage; angle from `first` to `second`, radians; distance from the axis
+    double distance;    // from the wall, positive outside
+    double sigma;       // of the distance: noise and roughness
+    double weight;      // 0 to 1
+    int piece;          // -1: off the tube's length
 };
 
 struct Stretch;
@@ -76,7 +76,7 @@ private:
         int first = 0, intervals = 0; // controls first .. first + intervals + 2
         double step = 0.0;            // metres of reference a knot
         double start_s = 0.0, end_s = 0.0;
-        std::vector<double> arc;      // chainage at each 1/16 of an interval
+        std::vector<double> arc; // chainage at each 1/16 of an interval
     };
     struct Frame {
         Eigen::Vector3d centre, tangent, first, second;
@@ -109,18 +109,18 @@ private:
     int order_ = 2, floats_ = 3;
     std::vector<Piece> piece_;
     std::vector<Eigen::Vector3d> control_, first_, second_;
-    std::vector<double> shape_;               // floats_ a control
-    std::vector<char> pinned_;                // a control: no ellipse
+    std::vector<double> shape_;                            // floats_ a control
+    std::vector<char> pinned_;                             // a control: no ellipse
     std::vector<std::vector<Eigen::MatrixXd>> covariance_; // [control][back]
-    std::array<double, 4> stiffness_{};       // 1 / variance of second differences: axis, rho, ellipse, harmonics
-    std::vector<int> of_piece_;               // a point: piece or -1
+    std::array<double, 4> stiffness_{}; // 1 / variance of second differences: axis, rho, ellipse, harmonics
+    std::vector<int> of_piece_;         // a point: piece or -1
     std::vector<double> u_, distance_, noise_, weight_, robust_;
-    std::vector<char> used_;                  // a point: takes part in the fit
-    std::vector<double> tau_;                 // a control
+    std::vector<char> used_;  // a point: takes part in the fit
+    std::vector<double> tau_; // a control
     std::vector<OnSurface> placed_;
     std::vector<std::pair<double, int>> by_s_; // inliers by chainage
     double correlation_ = 1.0;
-    double freedom_ = 0.0;                    // degrees of freedom that the fit takes
+    double freedom_ = 0.0; // degrees of freedom that the fit takes
     bool converged_ = false;
 };
 

@@ -21,12 +21,12 @@ using Eigen::Vector3d;
 namespace
 {
 
-constexpr int LOOK_AT = 1200;  // points of a neighbourhood
-constexpr int SEEDS = 10;      // places
+constexpr int LOOK_AT = 1200; // points of a neighbourhood
+constexpr int SEEDS = 10;     // places
 constexpr int HYPOTHESES = 250;
 constexpr double HALF = 0.75; // of a section, radii
 constexpr double OFF = 0.3;   // radii: a section whose points lie further to one side hangs over the wall's end
-constexpr double BAND = 0.05;  // of the radius: what counts as on the wall
+constexpr double BAND = 0.05; // of the radius: what counts as on the wall
 
 std::vector<int> thinned(const std::vector<int> &all, int count, uint64_t stream)
 {
@@ -102,12 +102,13 @@ bool cylinder_through(const Vector3d &p1, const Vector3d &n1, const Vector3d &p2
     }
     out.axis = cross.normalized();
     out.basis = basis_across(out.axis, n1);
-    const Vector2d d = out.basis.transpose() * (p2 - p1), m = out.basis.transpose() * n1, k = out.basis.transpose() * n2;
+    const Vector2d d = out.basis.transpose() * (p2 - p1), m = out.basis.transpose() * n1,
+                   k = out.basis.transpose() * n2;
     const double det = m[0] * -k[1] + k[0] * m[1];
     if (std::abs(det) < 1e-6) {
         return false;
     }
-    const double t1 = (d[0] * -k[1] + k[0] * d[1]) / det;          // p1 + t1 n1 = p2 + t2 n2 in the plane
+    const double t1 = (d[0] * -k[1] + k[0] * d[1]) / det; // p1 + t1 n1 = p2 + t2 n2 in the plane
     const Vector2d q = t1 * m;
     const double t2 = (q - d).dot(k);
     const double r1 = std::abs(t1), r2 = std::abs(t2);
@@ -201,8 +202,8 @@ Cylinder find_cylinder(const Cloud &cloud, int threads)
                 around[static_cast<size_t>(i)] = i;
             }
         } else {
-            const auto at = static_cast<Eigen::Index>(sim::hash64(4, static_cast<uint64_t>(place), 0) %
-                                                      static_cast<uint64_t>(n));
+            const auto at =
+                static_cast<Eigen::Index>(sim::hash64(4, static_cast<uint64_t>(place), 0) % static_cast<uint64_t>(n));
             around = nearest.nearest(cloud.points.col(at), size);
             std::sort(around.begin(), around.end());
         }
@@ -255,10 +256,10 @@ std::vector<Cylinder> follow(const Cloud &cloud, const Nearest<3> &nearest, cons
             thinned(window(cloud, near, guess.centre, guess.axis, guess.rho, HALF * radius), 1500, out.size());
         Cylinder next = fit_cylinder(cloud, wall, guess, {.ellipse = false, .cone = 0.15, .min_inliers = 24});
         const bool likely = (next.status == FitStatus::ok || next.status == FitStatus::circle_only) &&
-                          std::abs(next.rho - last.rho) < 0.1 * radius && next.axis.dot(last.axis) > 0.96 &&
-                          next.roughness < 0.06 * radius && std::abs(next.rho - radius) < 0.3 * radius &&
-                          next.inliers > 0.5 * static_cast<double>(wall.size()) &&
-                          std::abs((next.centre - guess.centre).dot(next.axis)) < OFF * radius;
+                            std::abs(next.rho - last.rho) < 0.1 * radius && next.axis.dot(last.axis) > 0.96 &&
+                            next.roughness < 0.06 * radius && std::abs(next.rho - radius) < 0.3 * radius &&
+                            next.inliers > 0.5 * static_cast<double>(wall.size()) &&
+                            std::abs((next.centre - guess.centre).dot(next.axis)) < OFF * radius;
         if (!likely) {
             continue;
         }

@@ -16,8 +16,8 @@ Cylinder find_cylinder(const Cloud &cloud, int threads);
 // bridged. Ordered along the pipe, first section first.
 std::vector<Cylinder> trace(const Cloud &cloud, const Cylinder &seed);
 
-// Sections along a path inside the pipe (camera centres, in order, each a step on), and on beyond its ends as far as the
-// wall goes. Only the good ones; empty where there are none.
+// Sections along a path inside the pipe (camera centres, in order, each a step on), and on beyond its ends as far as
+// the wall goes. Only the good ones; empty where there are none.
 std::vector<Cylinder> along(const Cloud &cloud, const Eigen::Matrix3Xd &path, int threads);
 
 } // namespace pipefish::tube
