@@ -23,6 +23,8 @@ _LAZY = {
     "simulate_two_views": "pipefish.studio_pairs",
     "simulate_objects": "pipefish.studio_objects",
     "Survey": "pipefish.survey",
+    "Tube": "pipefish.tube",
+    "fit_tube": "pipefish.tube",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
     "PARAMETERS": "pipefish.camera",

@@ -9,6 +9,7 @@ void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
+void bind_tube(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
@@ -19,4 +20,5 @@ NB_MODULE(_engine, m)
     bind_link(m);
     bind_sim(m);
     bind_sim_studio(m);
+    bind_tube(m);
 }
