@@ -22,6 +22,8 @@ _LAZY = {
     "Calibration": "pipefish.calibrate",
     "CalibrationError": "pipefish.calibrate",
     "View": "pipefish.calibrate",
+    "calibrate": "pipefish.calibrate",
+    "find_image_circle": "pipefish.calib_circle",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
     "PARAMETERS": "pipefish.camera",
