@@ -39,8 +39,11 @@ def find_image_circle(images: Sequence[npt.NDArray[np.generic]]) -> tuple[float,
         centre = fitted[:2]
     off = np.abs(np.hypot(*(rim - fitted[:2]).T) - fitted[2])
     inside = (off < 0.02 * fitted[2]).sum()
-    # A dark wall has no circular edge.
-    return (float(fitted[0]), float(fitted[1]), float(fitted[2])) if inside >= 0.7 * len(rim) else None
+    # A dark wall has no circular edge, a dark corner none about the image's middle.
+    apart = np.abs(fitted[:2] - [(width - 1) / 2, (height - 1) / 2]).max() > 0.25 * min(width, height)
+    if inside < 0.7 * len(rim) or apart or fitted[2] > 0.7 * np.hypot(width, height):
+        return None
+    return float(fitted[0]), float(fitted[1]), float(fitted[2])
 
 
 def _rim(mask: npt.NDArray[np.bool_], centre: Array) -> Array:
