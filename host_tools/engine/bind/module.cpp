@@ -3,6 +3,7 @@
 
 namespace nb = nanobind;
 
+void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
 void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
@@ -14,6 +15,7 @@ void bind_tube(nb::module_ &m);
 NB_MODULE(_engine, m)
 {
     m.doc() = "Compiled part of pipefish: one door for each room of the engine.";
+    bind_calib(m);
     bind_camera(m);
     bind_conics(m);
     bind_detect(m);
