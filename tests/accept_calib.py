@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT / "tests" / "python"))
 
 from calib_data_sets import jy_stereo, ov_plane  # noqa: E402
 from calib_scenes import Lens, bearing_error, random_lens, views_of  # noqa: E402
-from pipefish.calibrate import CalibrationError, calibrate  # noqa: E402
+from pipefish.calibration import CalibrationError, calibrate  # noqa: E402
 
 Array = np.ndarray
 KEEP = ROOT / "build" / "accept_calib"

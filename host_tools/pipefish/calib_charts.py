@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .calibrate import Board
+from .calibration import Board
 from .camera import Camera
 from .lensreport import curve
 from .page import Chart, rounded

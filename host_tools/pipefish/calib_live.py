@@ -23,7 +23,7 @@ from .calib_data import CalibrationError, View
 from .calib_input import Target3D
 from .calib_run import one_radius
 from .calib_verdict import verdict
-from .calibrate import calibrate
+from .calibration import calibrate
 from .client import STORED
 from .detect import detect_target
 from .errors import PipefishError

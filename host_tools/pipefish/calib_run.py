@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .calib_circle import Brightest, image_circle
+from .calib_circle import find_image_circle
 from .calib_data import CalibrationError, View
 from .calib_input import Given, Picture, Target3D
-from .calibrate import Calibration, calibrate
+from .calibration import Calibration, calibrate
 from .detect import Detection, detect_target
 
 Tell = Callable[[str, float], None]
@@ -84,12 +84,12 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
     }
     views = given.views
     if not views:
-        brightest = [Brightest() for _ in given.cameras]
+        brightest: dict[int, npt.NDArray[np.uint8]] = {}
         sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
         views = views_of(given, sightings)
         refuse_too_few(given, sightings)
-        if len(given.cameras) == 1 and brightest[0].picture is not None:
-            options["image_circle"] = image_circle(brightest[0].picture, [v.pixels for v in views])
+        if len(given.cameras) == 1:
+            options["image_circle"] = circle_around(brightest[0], views)
         for turn in range(_ROUNDS):
             tell("first model", 0.5 + 0.1 * turn)
             first = calibrate(views, model="p9", **options)
@@ -110,8 +110,8 @@ def one_radius(targets: Sequence[Target3D]) -> float:
     return radii[0]
 
 
-def search(given: Given, brightest: list[Brightest], share: Callable[[float], None]) -> list[Sighting]:
-    """Every target in every picture; `brightest`, of each camera, takes the pictures in.
+def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Callable[[float], None]) -> list[Sighting]:
+    """Every target in every picture; `brightest` gets the largest value of each pixel, by camera.
 
     Raises CalibrationError where pictures of two cameras are mixed."""
     if not all(t.target for t in given.targets) or not given.targets:
@@ -127,7 +127,7 @@ def search(given: Given, brightest: list[Brightest], share: Callable[[float], No
         if size != given.sizes[picture.camera]:
             wrong.append((picture, size))
             continue
-        brightest[picture.camera].add(image)
+        brightest[picture.camera] = np.maximum(brightest.get(picture.camera, image), image)
         for board, target in enumerate(given.targets):
             assert target.target is not None
             sightings.append(_sighting(picture, board, detect_target(image, target.target)))
@@ -140,6 +140,16 @@ def search(given: Given, brightest: list[Brightest], share: Callable[[float], No
             "cameras, or of two settings of one, are mixed"
         )
     return sightings
+
+
+def circle_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> tuple[float, float, float] | None:
+    """The image circle (u, v, radius), px, with all points of the views inside; None where the sensor is lit wholly."""
+    circle = find_image_circle([brightest])
+    if circle is None:
+        return None
+    u, v, radius = circle
+    farthest = max(float(np.linalg.norm(view.pixels - [u, v], axis=1).max()) for view in views)
+    return u, v, max(radius, farthest + 2.0)
 
 
 def _sighting(picture: Picture, board: int, found: Detection) -> Sighting:

@@ -530,6 +530,10 @@ def build_parser() -> argparse.ArgumentParser:
     add_calibrate(commands)
     add_homography(commands)
 
+    from pipefish.cli_tube import add_tube
+
+    add_tube(commands)
+
     p = add_command(
         commands,
         "flash",

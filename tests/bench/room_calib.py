@@ -10,7 +10,7 @@ from peers import PEERS
 
 def measure() -> list[dict]:
     """One figure a model and rival; the rivals fit one model, which is that of p9."""
-    from pipefish.calibrate import View, calibrate
+    from pipefish.calibration import View, calibrate
 
     given = [View(board(), pixels) for pixels in views()]
     ours: dict[str, float] = {}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipefish.calibrate import View
+from pipefish.calibration import View
 
 
 def ov_plane(data: Path, part: str) -> tuple[list[View], tuple[int, int]]:

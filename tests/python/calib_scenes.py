@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 import pipefish as pf
-from pipefish.calibrate import View
+from pipefish.calibration import View
 
 Array = np.ndarray
 

@@ -11,7 +11,7 @@ import pytest
 import pipefish as pf
 from calib_scenes import RADII, Lens, bearing_error, board, turn, views_of
 from pipefish import _engine
-from pipefish.calibrate import Calibration, CalibrationError, View, calibrate
+from pipefish.calibration import Calibration, CalibrationError, View, calibrate
 
 LENS = Lens("equidistant", 1280, 800, 330.0, (645.0, 395.0), 1.001, (-0.02, 0.002), math.radians(93))
 SIZE = (1280, 800)
@@ -437,3 +437,23 @@ def test_views_check_themselves() -> None:
             View(xyz, pixels)
     with pytest.raises(pf.ArgumentError, match="finite"):
         View(board(), np.full((88, 2), np.nan))
+
+
+def test_the_image_circle_is_found_where_there_is_one() -> None:
+    v, u = np.mgrid[:480, :752]
+    random = np.random.default_rng(22)
+    scene_light = 90 + 60 * np.sin(u / 40.0) * np.cos(v / 31.0)
+    inside = np.hypot(u - 380.3, v - 236.8) < 260.5  # the sensor cuts it above and below
+    images = [np.where(inside, scene_light * light, 4) + random.normal(0, 2, u.shape) for light in (1, 0.5, 0.8)]
+    found = pf.find_image_circle(images)
+    assert found == pytest.approx((380.3, 236.8, 260.5), abs=0.7)
+    assert pf.find_image_circle([scene_light]) is None
+    assert pf.find_image_circle([np.where(u + 2 * v < 900, scene_light, 3)]) is None  # a dark corner is no circle
+    views, _ = scene(21, 8)
+    camera = calibrate(views, SIZE, "p9", "flat", image_circle=(645.0, 395.0, 560.0)).camera
+    assert (camera.circle_u, camera.circle_v, camera.circle_radius) == (645.0, 395.0, 560.0)
+
+
+def test_the_call_from_the_package() -> None:
+    views, _ = scene(23, 6)
+    assert pf.calibrate([pf.View(v.board_xyz, v.pixels) for v in views], SIZE, "p6", "flat").model == "p6"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib_data_sets import jy_stereo, ov_plane
-from pipefish.calibrate import calibrate
+from pipefish.calibration import calibrate
 
 
 def test_the_same_minimum_as_opencv(real_data: Callable[[str], Path]) -> None:

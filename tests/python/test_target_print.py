@@ -72,8 +72,10 @@ def test_what_is_black_on_paper_is_what_the_simulator_has_black(target: pf.Targe
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     x, y = (u + 0.5) / 10 - middle[0], (v + 0.5) / 10 - middle[1]
     for round_, fx, fy, a, b, value in target.figures():
-        off_x, off_y = np.abs(x / 1000 - fx) / a, np.abs(y / 1000 - fy) / b
-        albedo[np.hypot(off_x, off_y) < 1 if round_ else np.maximum(off_x, off_y) < 1] = value
+        row, col = (slice(*(round(10 * (1000 * f + m + s * 1000 * h)) + s for s in (-1, 1)))
+                    for f, m, h in ((fy, middle[1], b), (fx, middle[0], a)))  # fmt: skip
+        off_x, off_y = np.abs(x[row, col] / 1000 - fx) / a, np.abs(y[row, col] / 1000 - fy) / b
+        albedo[row, col][np.hypot(off_x, off_y) < 1 if round_ else np.maximum(off_x, off_y) < 1] = value
     width, height = target.size_m
     on = (np.abs(x) < 500 * width - 1) & (np.abs(y) < 500 * height - 4)  # not the cut lines and their letters
     black = albedo < 0.5

@@ -1,4 +1,4 @@
-// Calibration for Python: _engine.Bundle is one adjustment with its data; pipefish/calibration decides what is free,
+// Calibration for Python: _engine.Bundle is one adjustment with its data; pipefish/calibration.py decides what is free,
 // what is rejected and in which order. Poses are (3, 4) arrays [R | t].
 #include "calib/bundle.hpp"
 #include "calib/centroid.hpp"

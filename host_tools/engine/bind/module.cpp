@@ -10,10 +10,11 @@ void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
+void bind_tube(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, calibration, conics, target detector, link and simulator.";
+    m.doc() = "Compiled part of pipefish: one door for each room of the engine.";
     bind_calib(m);
     bind_camera(m);
     bind_conics(m);
@@ -21,4 +22,5 @@ NB_MODULE(_engine, m)
     bind_link(m);
     bind_sim(m);
     bind_sim_studio(m);
+    bind_tube(m);
 }

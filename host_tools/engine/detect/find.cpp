@@ -283,6 +283,21 @@ double seen_radius(const Board &board, const Grid &grid, const std::vector<Blob>
     return ratios[ratios.size() / 2] * std::sqrt(std::abs(steps.determinant()));
 }
 
+// Whether the blob at a place is lighter in the middle than in the ring around it.
+bool has_hole(const cv::Mat &image, const std::vector<Blob> &blobs, const Eigen::Vector2d &at)
+{
+    const Blob &b = *std::min_element(blobs.begin(), blobs.end(), [&](const Blob &one, const Blob &two) {
+        return (one.at - at).squaredNorm() < (two.at - at).squaredNorm();
+    });
+    double ring = 0.0;
+    for (int k = 0; k < 16; k++) {
+        const double angle = 2 * M_PI * k / 16;
+        const Eigen::Vector2d p = b.at + 0.75 * b.half_axes * Eigen::Vector2d(std::cos(angle), std::sin(angle));
+        ring += grey_at(image, p.x(), p.y()) / 16;
+    }
+    return grey_at(image, b.at.x(), b.at.y()) - ring > 0.4 * b.contrast;
+}
+
 Detection find_discs(const cv::Mat &image, const Board &board)
 {
     std::vector<Blob> blobs = find_blobs(image);
@@ -306,24 +321,8 @@ Detection find_discs(const cv::Mat &image, const Board &board)
         }
     }
     if (board.kind == Kind::sleeve)
-        for (auto &[site, point] : grid) {
-            const int k = [&] {
-                size_t best = 0;
-                for (size_t b = 1; b < blobs.size(); b++)
-                    if ((blobs[b].at - point.at).norm() < (blobs[best].at - point.at).norm())
-                        best = b;
-                return static_cast<int>(best);
-            }();
-            // A hole is lighter than the ring around it.
-            const Blob &b = blobs[size_t(k)];
-            double ring = 0.0;
-            for (int a = 0; a < 16; a++) {
-                const double angle = 2 * M_PI * a / 16;
-                const Eigen::Vector2d p = b.at + 0.75 * b.half_axes * Eigen::Vector2d(std::cos(angle), std::sin(angle));
-                ring += grey_at(image, p.x(), p.y()) / 16;
-            }
-            point.code = grey_at(image, b.at.x(), b.at.y()) - ring > 0.4 * b.contrast;
-        }
+        for (auto &[site, point] : grid)
+            point.code = has_hole(image, blobs, point.at);
     // Printed with another radius than the target says, or described with a guessed one: measure what is there, and
     // tell.
     Board real = board;
