@@ -117,28 +117,19 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
     if not all(t.target for t in given.targets) or not given.targets:
         raise CalibrationError("pictures need a --target that can be found in them: a JSON file of `pipefish target`")
     sightings = []
-    sizes: dict[int, Counter[tuple[int, int]]] = {}
-    wrong: list[tuple[Picture, tuple[int, int]]] = []
     for done, picture in enumerate(given.pictures):
         share(done / len(given.pictures))
         image = picture.image()
-        size = (image.shape[1], image.shape[0])
-        sizes.setdefault(picture.camera, Counter())[size] += 1
-        if size != given.sizes[picture.camera]:
-            wrong.append((picture, size))
-            continue
+        size, first = (image.shape[1], image.shape[0]), given.sizes[picture.camera]
+        if size != first:
+            raise CalibrationError(
+                f"{picture.place}: {size[0]} x {size[1]} pixels, the first picture has {first[0]} x {first[1]}: images of "
+                "two cameras, or of two settings of one, are mixed"
+            )
         brightest[picture.camera] = np.maximum(brightest.get(picture.camera, image), image)
         for board, target in enumerate(given.targets):
             assert target.target is not None
             sightings.append(_sighting(picture, board, detect_target(image, target.target)))
-    if wrong:
-        picture, size = wrong[0]
-        other = given.sizes[picture.camera]
-        raise CalibrationError(
-            f"{picture.place}: {size[0]} x {size[1]} pixels, the first picture has {other[0]} x {other[1]}: images "
-            f"of two "
-            "cameras, or of two settings of one, are mixed"
-        )
     return sightings
 
 

@@ -211,8 +211,12 @@ def _text(
     result, report = session.result, session.result.report
     many = len(files) > 1
     rows: list[tuple[str, object]] = []
+
+    def who_of(number: int) -> str:
+        return f"{session.given.cameras[number]}: " if many else ""
+
     for number, v in verdicts.items():
-        who = f"{session.given.cameras[number]}: " if many else ""
+        who = who_of(number)
         rows.append(("verdict" if number == min(verdicts) else "", who + v["text"]))
         rows += [("", f"{who}{text}") for text in v["cautions"]]
     used = sum(v["used"] for v in report["views"])
@@ -239,7 +243,7 @@ def _text(
     rows += [
         ("target", f"bends by {max(b.warp_mm for b in shapes):.2f} mm; taken out" if shapes else "taken as flat"),
         *(("note", note) for note in report["notes"]),
-        *(("then", entry["coverage"]["advice"]) for entry in report["cameras"]),
+        *(("then", who_of(entry["camera"]) + entry["coverage"]["advice"]) for entry in report["cameras"]),
         *(("written", path) for path in files.values()),
         ("written", rig),
         ("report", args.report),
