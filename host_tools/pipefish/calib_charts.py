@@ -308,7 +308,8 @@ def board_shape(board: Board, name: str, key: str) -> Chart | None:
     flat = np.column_stack([drawn[:, :2], np.ones(len(drawn))]) @ plane_through[0]
     height = (_height(real, plane) - flat).reshape(33, 33) * 1e3
     limit = float(np.abs(height).max()) or 1e-3
-    stretch = f"; it is {100 * board.aspect:+.3f} % wider against its height than drawn" if board.aspect else ""
+    wider = "wider" if board.aspect > 0 else "narrower"
+    stretch = f"; it is {100 * abs(board.aspect):.3f} % {wider} against its height than drawn" if board.aspect else ""
     return {
         "id": f"board{key}",
         "title": f"Shape of the target {name}".strip(),

@@ -130,13 +130,14 @@ def _verdict(v: dict[str, Any], name: str) -> str:
     badge = "good" if v["usable"] and not v["cautions"] else "fair" if v["usable"] else "bad"
     word = {"good": "usable", "fair": "usable, with care", "bad": "not usable"}[badge]
     return (
+        "<div class='grid tables below'>"
         f"<section class='card'><h3><span class='badge {badge}'>{word}</span> {html.escape(name)}</h3>"
         f"<p>{html.escape(v['text'])}</p>"
         f"<ul class='why'>{points(v['cautions'], 'caution')}{points(v['reasons'], 'plus')}</ul></section>"
         f"<section class='card'><h3>What the calibration alone puts a diameter off by</h3>{table}"
         "<p class='note'>Mean diameter from wall points seen near 30 and near 80 degrees off the axis, or as far as "
         f"the target was seen; {100 * v['allowed_share']:g} % is allowed. Tracking and the crawler's motion come on "
-        "top.</p></section>"
+        "top.</p></section></div>"
     )
 
 

@@ -123,8 +123,8 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
         size, first = (image.shape[1], image.shape[0]), given.sizes[picture.camera]
         if size != first:
             raise CalibrationError(
-                f"{picture.place}: {size[0]} x {size[1]} pixels, the first picture has {first[0]} x {first[1]}: images of "
-                "two cameras, or of two settings of one, are mixed"
+                f"{picture.place}: {size[0]} x {size[1]} pixels, the first picture has {first[0]} x {first[1]}: "
+                "images of two cameras, or of two settings of one, are mixed"
             )
         brightest[picture.camera] = np.maximum(brightest.get(picture.camera, image), image)
         for board, target in enumerate(given.targets):

@@ -83,7 +83,8 @@ def _text(out: dict[str, Any]) -> str:
 def _reasons(report: dict[str, Any], camera: dict[str, Any], held_out: float | None, halves: float | None) -> list[str]:
     """What speaks for it."""
     used = [v for v in report["views"] if v["used"] and v["camera"] == camera["camera"]]
-    out = [f"{report['points_used']} points of {len(used)} views fit within {report['rms_px']:.3f} px rms"]
+    points = sum(v["points"] for v in used)
+    out = [f"{points} points of {len(used)} views fit within {report['rms_px']:.3f} px rms"]
     if held_out is not None and held_out <= _OVERFIT * report["rms_px"]:
         out.append(f"views that it was not made from fit as well: {held_out:.3f} px rms")
     if halves is not None and halves <= 1.5:

@@ -194,8 +194,8 @@ def test_the_verdict_follows_the_bounds_and_says_why():
         "uncertainty": {"distance_m": 1.0},
         "halves": {"ratio": 1.5},
     }
-    views = [{"used": True, "camera": 0}, {"used": False, "camera": 0}]
-    report = {"cameras": [camera], "views": views, "rms_px": 0.2, "points_used": 100, "points": 100}
+    views = [{"used": True, "camera": 0, "points": 100}, {"used": False, "camera": 0, "points": 0}]
+    report = {"cameras": [camera], "views": views, "rms_px": 0.2}
     found = verdict(report, 0.3, math.radians(50))
     assert found["usable"] and (found["dn_from"], found["dn_to"]) == (300, 300)
     assert found["systematic_mm"] == pytest.approx(1.96 * 0.4 * 1.5)
