@@ -16,7 +16,7 @@ from .fit import _asymmetric_start
 
 Mask = npt.NDArray[np.bool_]
 
-_THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
+THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median of the distance in units of sigma per axis
 _HUBER = 5.0  # sigma: the mild bend; real corners have tails that Gaussian noise has not
 _GROSS = 10.0  # sigma: a point beyond is no measurement of this corner
@@ -55,12 +55,18 @@ def flipped(pose: Array, centre: Array) -> Array:
 
 
 class Single:
-    """One camera from nothing: every view with a pose of its own, p6 and then p9, on flat boards."""
+    """One camera from nothing, of all its views or `views`: a pose for each, p6 and then p9, on flat boards."""
 
-    def __init__(self, data: Data, camera: int, circle: tuple[float, float, float] | None) -> None:
+    def __init__(
+        self,
+        data: Data,
+        camera: int,
+        circle: tuple[float, float, float] | None = None,
+        views: list[int] | None = None,
+    ) -> None:
         self.data = data
         self.index = camera
-        self.views = [v for v in range(len(data.views)) if data.camera_of[v] == camera]
+        self.views = views or [v for v in range(len(data.views)) if data.camera_of[v] == camera]
         self.bundle = data.bundle(self.views, own_frames=True)
         points = np.concatenate([np.arange(data.first[v], data.first[v + 1]) for v in self.views])
         self.pixels = data.pixels[points]
@@ -91,7 +97,7 @@ class Single:
 
     def _try(self, profile: Any) -> tuple[float, Any, Mask] | None:
         bundle = self.bundle.copy()
-        profile.theta_max = _engine.rising_end(profile, _THETA_END)
+        profile.theta_max = _engine.rising_end(profile, THETA_END)
         bundle.set_camera(self.index, profile)
         lost = np.zeros(len(self.views), dtype=bool)
         for v in range(len(self.views)):
@@ -99,7 +105,7 @@ class Single:
             lost[v] = pose is None
             if pose is not None:
                 bundle.set_frame(v, pose)
-        profile.theta_max = _THETA_END
+        profile.theta_max = THETA_END
         bundle.set_camera(self.index, profile)
         bundle.huber = 1.5
         for radial, rounds in ((1, 12), (1, 12), (4, 25)):
@@ -130,10 +136,10 @@ class Single:
         if len(bad) == 0:
             return
         camera = self.bundle.camera(self.index)
-        camera.theta_max = _engine.rising_end(camera, _THETA_END)
+        camera.theta_max = _engine.rising_end(camera, THETA_END)
         self.bundle.set_camera(self.index, camera)
         fresh = {int(v): self.bundle.view_pose(int(v)) for v in bad}
-        camera.theta_max = _THETA_END
+        camera.theta_max = THETA_END
         self.bundle.set_camera(self.index, camera)
         best = {int(v): (errors[v], self.bundle.frame(int(v))) for v in bad}
         for attempt in range(3):

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ._engine import rising_end
 from .calib_data import Array, CalibrationError
-from .calib_fit import Fit, angles, errors_of, smooth_error, view_pose
+from .calib_fit import THETA_END, Fit, Single, angles, errors_of, smooth_error, view_pose
 from .calib_model import Model
 
 _SUSPECT = 1.3  # times what a smooth map leaves: below, one lens explains the views
@@ -17,6 +18,9 @@ _SUSPECT = 1.3  # times what a smooth map leaves: below, one lens explains the v
 _APART, _APART_FEW = 0.8, 0.75
 _FLOOR = 2.7  # times what a smooth map leaves: two lenses must come down to it; one strange lens stays at 4
 _ROUNDS = 6
+_TRIPLES = 12  # views of one camera drawn three at a time: of an even mixture one draw in four is pure, 97 % find one
+
+Split = tuple[Array, npt.NDArray[np.bool_]]  # error of each view by its lens, which views belong to the first
 
 
 def refuse_two_cameras(fit: Fit) -> None:
@@ -36,22 +40,79 @@ def refuse_two_cameras(fit: Fit) -> None:
         shaped.fit(Model(shape="z4", pupil="e1"), iterations=15, tolerance=1e-5)
         if np.median(shaped.view_medians()[views] / floor) < _SUSPECT:
             continue
-        for state in (shaped, fit):
-            lenses = _Lenses(state, c, views)
-            splits = [split for seed in range(3) if (split := lenses.split(seed)) is not None]
-            if not splits:
+        lenses = [_Lenses(state, c, views) for state in (shaped, fit)]
+        one = [float(of.one().mean()) for of in lenses]
+        limit = _APART if len(views) >= 12 else _APART_FEW
+        _refuse_split(fit, views, floor, _from_triples(fit, c, views, floor), min(one), _APART_FEW)
+        for of, error in zip(lenses, one, strict=True):
+            splits = [split for seed in range(3) if (split := of.split(seed)) is not None]
+            if not _refuse_split(fit, views, floor, splits, error, limit):
                 break
-            two, parts = min(splits, key=lambda split: split[0].mean())
-            gain = float(two.mean() / lenses.one().mean())
-            if gain > (_APART if len(views) >= 12 else _APART_FEW):
-                break
-            few = min((np.array(views)[parts], np.array(views)[~parts]), key=len)
-            if len(few) >= 2 and np.median(two / floor) <= _FLOOR:
-                listed = ", ".join(fit.data.label(int(v)) for v in few[:6]) + (", ..." if len(few) > 6 else "")
-                raise CalibrationError(
-                    f"two lenses explain the views {1 / gain:.1f} times better than one: images of two cameras, or of "
-                    f"boards of two sizes, are mixed: {listed} against the others"
-                )
+
+
+def _refuse_split(fit: Fit, views: list[int], floor: Array, splits: list[Split], one: float, limit: float) -> bool:
+    """Raises CalibrationError where the best split leaves less than limit of what one lens leaves and comes down to
+    what a smooth map does; -> whether it left that little."""
+    if not splits:
+        return False
+    two, parts = min(splits, key=lambda split: split[0].mean())
+    gain = float(two.mean()) / one
+    few = min((np.array(views)[parts], np.array(views)[~parts]), key=len)
+    if gain <= limit and len(few) >= 2 and np.median(two / floor) <= _FLOOR:
+        listed = ", ".join(fit.data.label(int(v)) for v in few[:6]) + (", ..." if len(few) > 6 else "")
+        raise CalibrationError(
+            f"two lenses explain the views {1 / gain:.1f} times better than one: images of two cameras, or of boards "
+            f"of two sizes, are mixed: {listed} against the others"
+        )
+    return gain <= limit
+
+
+def _from_triples(fit: Fit, camera: int, views: list[int], floor: Array) -> list[Split]:
+    """Splits from nothing, where the common lens is too far from either: a lens from three views, the views that it
+    explains, and a lens from the others."""
+    splits = []
+    random = np.random.default_rng(0)
+    for _ in range(_TRIPLES):
+        three = np.sort(random.choice(len(views), 3, replace=False))
+        try:
+            seed = Single(fit.data, camera, views=[views[i] for i in three])
+            if seed.median > _FLOOR * float(np.median(floor[three])):
+                continue
+            inside = _explained(fit, camera, views, seed.bundle.camera(camera)) < _FLOOR * floor
+            if min(inside.sum(), (~inside).sum()) < 2:
+                continue
+            two = np.empty(len(views))
+            for side in (inside, ~inside):
+                single = Single(fit.data, camera, views=[v for v, of in zip(views, side, strict=True) if of])
+                two[side] = single.view_errors(single.bundle)
+        except CalibrationError:  # no lens for these: not a split
+            continue
+        splits.append((two, inside))
+    return splits
+
+
+def _explained(fit: Fit, camera: int, views: list[int], profile: Any) -> Array:
+    """Median distance of each view by a given lens, its pose fitted; infinite where it has none."""
+    data = fit.data
+    bundle = data.bundle(views, own_frames=True)
+    profile.theta_max = rising_end(profile, THETA_END)
+    bundle.set_camera(camera, profile)
+    placed = np.zeros(len(views), dtype=bool)
+    for i in range(len(views)):
+        pose = bundle.view_pose(i)
+        placed[i] = pose is not None
+        if pose is not None:
+            bundle.set_frame(i, pose)
+    profile.theta_max = THETA_END  # the edge of the model must not stop a step
+    bundle.set_camera(camera, profile)
+    bundle.free_camera(camera, [], False)
+    bundle.huber = 2.0
+    points = np.concatenate([np.arange(data.first[v], data.first[v + 1]) for v in views])
+    part = np.repeat(np.arange(len(views)), [int(data.first[v + 1] - data.first[v]) for v in views])
+    bundle.set_used(placed[part])
+    bundle.adjust(8, 1e-3)
+    error = errors_of(bundle, data.pixels[points])
+    return np.array([np.median(error[part == i]) if placed[i] else np.inf for i in range(len(views))])
 
 
 class _Lenses:
@@ -89,7 +150,7 @@ class _Lenses:
         """Error of each view by one lens for all."""
         return self.fit(self.start.copy(), np.ones(self.count, dtype=bool))
 
-    def split(self, seed: int) -> tuple[Array, npt.NDArray[np.bool_]] | None:
+    def split(self, seed: int) -> Split | None:
         """Two lenses, each view to the one that fits it: -> error of each view, which belong to the first."""
         bundles = [self.start.copy() for _ in range(2)]
         first = np.random.default_rng(seed).permutation(self.count) < self.count // 2

@@ -141,6 +141,7 @@ def test_refusals_say_what_is_wrong_with_the_views(tmp_path, target, capsys):
     assert "lie outside the image" in refused([pf.View(v.board_xyz, v.pixels + np.array([900, 0])) for v in views])
     narrow = scenes.Lens("perspective", 1280, 960, 900.0, (640.0, 480.0), 1.0, (0.0, 0.0), math.radians(35))
     assert "two cameras" in refused([*simulated(12), *simulated(12, lens=narrow, seed=2)])
+    assert "two cameras" in refused([*simulated(8), *simulated(8, lens=narrow, seed=9)])  # the common lens fits neither
     assert not (tmp_path / "c.json").exists()
 
 
