@@ -225,17 +225,18 @@ def run_status(args: argparse.Namespace) -> Result:
 
 
 def run_evaluate(args: argparse.Namespace) -> Result:
-    from pipefish.evaluate import compare_with_opencv, evaluate, verdict
+    from pipefish.evaluate import compare_with_opencv, evaluate, frames_of, verdict
     from pipefish.simulate import Scene
     from pipefish.survey import Survey
 
     stem = Path(args.recording)
     truth = Scene.from_truth(stem.with_name(stem.name + ".truth.json"))
     survey = Survey.open(args.survey)
-    ours = evaluate(survey, truth)
+    frames = frames_of(survey, stem.with_name(stem.name + ".y4m"))
+    ours = evaluate(survey, truth, frames)
     if ours is None:
         raise PipefishError(f"{survey.path}: no track was seen in two keyframes")
-    peer = compare_with_opencv(survey, truth, stem.with_name(stem.name + ".y4m")) if args.opencv else None
+    peer = compare_with_opencv(survey, truth, frames) if args.opencv else None
     bars = verdict(ours, peer, smooth=args.smooth)
     rows: list[tuple[str, object]] = [("", "device" + (", OpenCV's recipe" if peer else ""))]
     for name, what in (

@@ -20,9 +20,11 @@
 /* The warp is expected to be that at which a fit begins, but for 2 % each (0.02 of slope): (2 sigma^2 / 0.02^2) in the
  * unit of the normal matrix, Q6, with noise of sigma 2 in both patches. Texture that determines the warp has a hundred
  * times that; where there is little of it, an arbitrary warp would move the point by tenths of a pixel a frame. */
-#define PRIOR       1280000
-#define EXCESS_MOST (16 << 8)
-#define COV_MOST    ((int64_t)1 << 40)
+#define PRIOR        1280000
+#define SEARCH_REACH 2 /* steps */
+#define SEARCH_STEP  (2 << 16)
+#define EXCESS_MOST  (16 << 8)
+#define COV_MOST     ((int64_t)1 << 40)
 
 static int32_t magnitude(int32_t v)
 {
@@ -259,15 +261,6 @@ static pf_point_q16 warped_offset(const pf_anchor *anchor)
                           (int32_t)((anchor->a[2] * x + anchor->a[3] * y) >> 16)};
 }
 
-/* Similarity with the template, less what noise takes from it: noise adds to both variances, and a small mark on a bare
- * wall is found as surely as brick though most of its window is noise. At least an eighth of each must be more. */
-static int32_t likeness(const pf_klt *klt, const pf_rhs *rhs, int64_t var_t)
-{
-    const int64_t noise = (int64_t)klt->window * klt->window * klt->noise_var_q8;
-    const int64_t t = var_t - noise, c = rhs->var - noise;
-    return pf_zncc(rhs->cov, t > var_t / 8 ? t : var_t / 8, c > rhs->var / 8 ? c : rhs->var / 8);
-}
-
 /* How much more is left than the noise of both patches would leave, Q8, at least 1: relief in another light, an edge in
  * front of something. */
 static int32_t excess(const pf_klt *klt, const pf_rhs *rhs)
@@ -318,12 +311,36 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = likeness(klt, &rhs, reference.var);
+    fit.zncc_q15 = pf_likeness(klt, rhs.cov, reference.var, rhs.var, (int64_t)klt->window * klt->window);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
     anchor->excess_q8 = excess(klt, &rhs);
     if (moved > NOT_SETTLED)
         fit.reason = PF_TRACK_DIVERGED;
     return fit;
+}
+
+pf_point_q16 pf_anchor_search(pf_klt *klt, const pf_image *image, const pf_anchor *anchor, const uint8_t *pixels,
+                              pf_point_q16 at)
+{
+    const pf_point_q16 offset = warped_offset(anchor), centre = {at.x - offset.x, at.y - offset.y};
+    pf_point_q16 best = at;
+    int32_t most = -32768;
+    pf_reference reference;
+    take_reference(klt, anchor, pixels, centre, &reference);
+    for (int32_t y = -SEARCH_REACH; y <= SEARCH_REACH; y++)
+        for (int32_t x = -SEARCH_REACH; x <= SEARCH_REACH; x++) {
+            const pf_point_q16 moved = {centre.x + x * SEARCH_STEP, centre.y + y * SEARCH_STEP};
+            pf_rhs rhs;
+            if (!sample_warped(klt, image, moved, anchor->a))
+                continue;
+            right_hand_side(klt, anchor, &reference, &rhs);
+            const int32_t like = pf_zncc(rhs.cov, reference.var, rhs.var);
+            if (like > most) {
+                most = like;
+                best = (pf_point_q16){at.x + x * SEARCH_STEP, at.y + y * SEARCH_STEP};
+            }
+        }
+    return best;
 }
 
 /* Entry (i, j) of the template's covariance times `factor_q8` (below 2^15), Q20 px^2, to nearest. */

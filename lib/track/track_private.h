@@ -71,6 +71,11 @@ static inline int32_t pf_clamp_i64(int64_t v, int32_t limit)
 /* Q0.15 correlation of two patches from their sums of centred products (Q8, below 2^37). */
 int32_t pf_zncc(int64_t cov, int64_t var_a, int64_t var_b);
 
+/* The same less what noise takes from it: noise adds to the variances of both patches (of `count` pixels), and a small
+ * mark on a bare wall is found as surely as brick though most of its window is noise. At least an eighth of each must
+ * be more. */
+int32_t pf_likeness(const pf_klt *klt, int64_t cov, int64_t var_a, int64_t var_b, int64_t count);
+
 /* Sets the parameters but the circle, which is the caller's. `noise_q8`: sigma. */
 void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen, uint32_t noise_q8);
 
@@ -95,6 +100,10 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
 /* Aligns the template with `image` by an affine warp, gain and bias, starting at *at and the anchor's last warp;
  * updates both. */
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at);
+
+/* Where around `at`, within 4 px, the template, warped as the anchor says, looks most like the image. */
+pf_point_q16 pf_anchor_search(pf_klt *klt, const pf_image *image, const pf_anchor *anchor, const uint8_t *pixels,
+                              pf_point_q16 at);
 
 /* What a template taken where this one was last fitted carries: what this one does and the noise of its own picture.
  * That of the picture in which they meet is in the new one's; it would count twice. */
