@@ -66,7 +66,10 @@ def check_track() -> list[dict]:
 
 def check_pipes() -> list[dict]:
     """The whole chain in 24 simulated pipes: material, diameter, speed; the truth and OpenCV beside it."""
-    done = run(sys.executable, "tests/accept_pipes.py")
+    peers = next((BUILD / "venv-peers/lib").glob("python3*/site-packages"), None)  # OpenCV beside this environment
+    if peers is None:
+        raise SystemExit("build/venv-peers is missing: `make accept` installs it")
+    done = run(sys.executable, "tests/accept_pipes.py", PYTHONPATH=str(peers))
     print(done.stderr, file=sys.stderr)
     if done.returncode != 0:
         raise SystemExit(f"accept_pipes.py failed: {done.stderr.strip()}")

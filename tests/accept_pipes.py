@@ -74,10 +74,12 @@ def drive(material: str, diameter_mm: int, speed_cm_s: int, frames: int) -> list
     rows = []
     for figure, row in bars.items():
         sign = "<=" if figure == "median_px" else ">="
-        value = float("nan") if row["value"] is None else row["value"]
         bound = f"{sign} {row['bound']}"
-        rows.append({"name": f"pipes.{name}.{figure}", "value": value, "bound": bound, "holds": row["holds"]})
-    print(f"  {name}: " + ", ".join(f"{r['name'].split('.')[-1]} {r['value']:.4g}" for r in rows), file=sys.stderr)
+        rows.append({"name": f"pipes.{name}.{figure}", "value": row["value"], "bound": bound, "holds": row["holds"]})
+    values = ", ".join(
+        f"{figure} {row['value'] if row['value'] is None else round(row['value'], 4)}" for figure, row in bars.items()
+    )
+    print(f"  {name}: {values}", file=sys.stderr)
     return rows
 
 

@@ -292,7 +292,7 @@ LENGTH_RATIO = 1.5  # median length against the peer's
 
 
 def verdict(ours: dict[str, Any], peer: dict[str, Any] | None, smooth: bool = False) -> dict[str, Any]:
-    """Whether the bars hold: {figure: {value, bound, holds}}, with length_ratio if there is a peer."""
+    """Whether the bars hold: {figure: {value, bound, holds}}, with length_median if there is a peer."""
     rows: dict[str, Any] = {}
     for name, side, bound in BARS:
         bound = 0.96 if smooth and name == "within_1px" else bound
@@ -300,6 +300,10 @@ def verdict(ours: dict[str, Any], peer: dict[str, Any] | None, smooth: bool = Fa
         holds = value is not None and side(value, bound) == bound
         rows[name] = {"value": value, "bound": bound, "holds": bool(holds)}
     if peer is not None:
-        ratio = ours["length_median"] / peer["length_median"] if peer["length_median"] else float("inf")
-        rows["length_ratio"] = {"value": ratio, "bound": LENGTH_RATIO, "holds": ratio >= LENGTH_RATIO}
+        bound = LENGTH_RATIO * peer["length_median"]
+        rows["length_median"] = {
+            "value": ours["length_median"],
+            "bound": bound,
+            "holds": ours["length_median"] >= bound,
+        }
     return rows

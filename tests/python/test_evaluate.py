@@ -106,13 +106,13 @@ FIGURES = {"within_1px": 0.98, "survival": 0.95, "median_px": 0.1, "length_media
         ({"survival": 0.89}, ["survival"]),
         ({"survival": None}, ["survival"]),
         ({"median_px": 0.21}, ["median_px"]),
-        ({"length_median": 29.0}, ["length_ratio"]),
+        ({"length_median": 29.0}, ["length_median"]),
     ],
 )
 def test_each_bar_is_enforced(change, failed):
     rows = verdict(FIGURES | change, {"length_median": 20.0})
     assert [name for name, row in rows.items() if not row["holds"]] == failed
-    assert "length_ratio" not in verdict(FIGURES, None)
+    assert "length_median" not in verdict(FIGURES, None)
     assert verdict(FIGURES | {"within_1px": 0.965}, None, smooth=True)["within_1px"]["holds"]
 
 
