@@ -18,6 +18,8 @@ _LAZY = {
     "simulate_target_views": "pipefish.studio_targets",
     "simulate_two_views": "pipefish.studio_pairs",
     "simulate_objects": "pipefish.studio_objects",
+    "two_view": "pipefish.twoview",
+    "TwoView": "pipefish.twoview",
     "Survey": "pipefish.survey",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
