@@ -1,6 +1,6 @@
 // Sheets before the simulator's camera, for Python: _engine.Texture, _engine.Picture, _engine.Studio.
 #include "bind/sim_camera.hpp"
-#include "sim/parallel.hpp"
+#include "parallel.hpp"
 #include "sim/studio.hpp"
 
 #include <nanobind/ndarray.h>

@@ -1,9 +1,9 @@
 // Drawing a frame, in passes over its rows: cast rays; light what they met and read the surface through each pixel's
 // footprint (needs the neighbours' rays); both again for every moment of the exposure; then the sensor (sensor.cpp).
+#include "parallel.hpp"
 #include "sim/scene.hpp"
 
 #include "sim/buffers.hpp"
-#include "sim/parallel.hpp"
 
 #include <algorithm>
 #include <cmath>

@@ -1,7 +1,7 @@
 // The sensor: what becomes of the light that the optics lay on it.
 #include "sim/sensor.hpp"
+#include "parallel.hpp"
 
-#include "sim/parallel.hpp"
 #include "sim/random.hpp"
 
 #include <algorithm>

@@ -1,9 +1,9 @@
 // Shading: the light on the wall points that the rays of a frame met, and what the surface makes of it.
 #include "sim/shade.hpp"
+#include "parallel.hpp"
 
 #include "sim/brdf.hpp"
 #include "sim/buffers.hpp"
-#include "sim/parallel.hpp"
 #include "sim/scene.hpp"
 #include "sim/wide.hpp"
 

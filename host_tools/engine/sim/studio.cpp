@@ -1,8 +1,8 @@
 // Drawing sheets: what each pixel's centre sees; from the neighbours, what lies within the pixel; where edges run
 // through it, many rays.
 #include "sim/studio.hpp"
+#include "parallel.hpp"
 
-#include "sim/parallel.hpp"
 #include "sim/random.hpp"
 
 #include <algorithm>

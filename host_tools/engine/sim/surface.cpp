@@ -1,8 +1,7 @@
 #include "sim/surface.hpp"
+#include "parallel.hpp"
 
 #include "sim/wide.hpp"
-
-#include "sim/parallel.hpp"
 
 #include <array>
 #include <bit>

@@ -8,7 +8,7 @@
 #include <thread>
 #include <vector>
 
-namespace pipefish::sim
+namespace pipefish
 {
 
 // Calls body(i) for 0 <= i < items, on the calling thread and threads - 1 others. The first exception is passed on.
@@ -39,4 +39,4 @@ template <typename Body> void parallel_for(int items, int threads, const Body &b
     }
 }
 
-} // namespace pipefish::sim
+} // namespace pipefish

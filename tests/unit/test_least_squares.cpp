@@ -1,0 +1,322 @@
+// The optimiser against dense linear algebra on the same problem: steps, covariances, thread independence, and what it
+// says when something is not determined.
+#include "optim/least_squares.hpp"
+
+#include "unity.h"
+
+#include <Eigen/Dense>
+
+#include <cstring>
+#include <random>
+
+extern "C" void setUp() {}
+extern "C" void tearDown() {}
+
+namespace
+{
+
+using namespace pipefish::optim;
+
+constexpr int E = 3, F = 6, G = 4, POINTS = 60, CHAIN = 14;
+
+// Residuals A x - y + curvature (a . x)^2 over random sparse rows: with curvature 0 the solution is that of dense least
+// squares. Each point is seen from three to five neighbours in the chain; neighbours are tied; the border is seen by
+// all.
+struct Toy {
+    struct Row {
+        int e;
+        std::vector<int> f;
+        Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> a; // columns: E, F for each of f, G
+        Eigen::Vector2d y;
+    };
+    std::vector<std::vector<Row>> rows; // by e; the last: without e
+    std::vector<std::vector<int>> seen;
+    double curvature = 0.0;
+    RobustLoss loss;
+    bool border_seen = true;
+    Eigen::VectorXd x = Eigen::VectorXd::Zero(POINTS * E + CHAIN * F + G), saved = x;
+
+    explicit Toy(unsigned seed)
+    {
+        std::mt19937_64 random(seed);
+        std::normal_distribution<double> normal;
+        const auto row = [&](int e, std::vector<int> f) {
+            Row r{e, std::move(f), {}, {normal(random), normal(random)}};
+            r.a.resize(2, (e >= 0 ? E : 0) + F * static_cast<int>(r.f.size()) + G);
+            for (Eigen::Index i = 0; i < r.a.size(); i++) {
+                r.a.data()[i] = normal(random);
+            }
+            return r;
+        };
+        rows.resize(POINTS + 1);
+        for (int e = 0; e < POINTS; e++) {
+            const int first = static_cast<int>(random() % (CHAIN - 4)), count = 3 + static_cast<int>(random() % 3);
+            std::vector<int> f;
+            for (int k = 0; k < count && first + k < CHAIN; k++) {
+                if (k != 1) {
+                    f.push_back(first + k);
+                }
+            }
+            for (const int i : f) {
+                rows[static_cast<size_t>(e)].push_back(row(e, {i}));
+            }
+            seen.push_back(f);
+        }
+        for (int i = 0; i + 1 < CHAIN; i++) {
+            rows.back().push_back(row(-1, {i + 1, i}));
+        }
+        for (int i = 0; i < 3 * CHAIN; i++) { // determines every f block, seen by points or not
+            rows.back().push_back(row(-1, {i % CHAIN}));
+        }
+    }
+
+    int eliminated() const { return POINTS; }
+    int banded() const { return CHAIN; }
+    int border() const { return G; }
+    int reach() const { return 1; }
+    std::span<const int> couplings(int e) const { return seen[static_cast<size_t>(e)]; }
+    const std::vector<Row> &of(int e) const { return rows[e < 0 ? rows.size() - 1 : static_cast<size_t>(e)]; }
+
+    Eigen::VectorXd local(const Row &row, const Eigen::VectorXd &from) const
+    {
+        Eigen::VectorXd v(row.a.cols());
+        Eigen::Index at = 0;
+        if (row.e >= 0) {
+            v.head(E) = from.segment(row.e * E, E);
+            at = E;
+        }
+        for (const int f : row.f) {
+            v.segment(at, F) = from.segment(POINTS * E + f * F, F);
+            at += F;
+        }
+        v.tail(G) = from.tail(G);
+        return v;
+    }
+
+    Eigen::Vector2d residual(const Row &row, Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> *jacobian) const
+    {
+        const Eigen::Vector2d linear = row.a * local(row, x);
+        if (jacobian) {
+            *jacobian = row.a;
+            for (int i = 0; i < 2; i++) {
+                jacobian->row(i) *= 1.0 + 2.0 * curvature * linear[i];
+            }
+            if (!border_seen) {
+                jacobian->rightCols(1).setZero();
+            }
+        }
+        return linear - row.y + curvature * linear.cwiseProduct(linear);
+    }
+
+    template <class Sink> void linearize(int e, Sink &sink) const
+    {
+        for (const Row &row : of(e)) {
+            Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> j;
+            const Eigen::Vector2d r = residual(row, &j);
+            const Eigen::Matrix<double, 2, E, Eigen::RowMajor> j_e = j.leftCols(E); // of no meaning where e < 0
+            std::vector<Eigen::Matrix<double, 2, F, Eigen::RowMajor>> j_f;
+            std::vector<const double *> j_f_at;
+            for (size_t k = 0; k < row.f.size(); k++) {
+                j_f.push_back(j.middleCols((row.e >= 0 ? E : 0) + static_cast<Eigen::Index>(k) * F, F));
+            }
+            for (const auto &block : j_f) {
+                j_f_at.push_back(block.data());
+            }
+            const Eigen::Matrix<double, 2, G, Eigen::RowMajor> j_g = j.rightCols(G);
+            sink.add(2, r.data(), loss, row.e >= 0 ? j_e.data() : nullptr, row.f, j_f_at, j_g.data());
+        }
+    }
+
+    double cost(int e) const
+    {
+        double sum = 0.0;
+        for (const Row &row : of(e)) {
+            sum += 0.5 * loss(residual(row, nullptr).squaredNorm()).rho;
+        }
+        return sum;
+    }
+
+    void apply(const Step<E, F> &step)
+    {
+        x = saved;
+        for (int e = 0; e < POINTS; e++) {
+            x.segment(e * E, E) += step.e[static_cast<size_t>(e)];
+        }
+        for (int f = 0; f < CHAIN; f++) {
+            x.segment(POINTS * E + f * F, F) += step.f[static_cast<size_t>(f)];
+        }
+        x.tail(G) += step.g;
+    }
+    void save() { saved = x; }
+
+    // All rows as one dense matrix and right-hand side, at the current state, with robust weights.
+    void dense(Eigen::MatrixXd &a, Eigen::VectorXd &r) const
+    {
+        std::vector<Eigen::VectorXd> all;
+        std::vector<double> right;
+        for (const auto &group : rows) {
+            for (const Row &row : group) {
+                Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> j;
+                const Eigen::Vector2d value = residual(row, &j);
+                const double root = std::sqrt(loss(value.squaredNorm()).weight);
+                for (int i = 0; i < 2; i++) {
+                    Eigen::VectorXd full = Eigen::VectorXd::Zero(x.size());
+                    Eigen::Index at = 0;
+                    if (row.e >= 0) {
+                        full.segment(row.e * E, E) = root * j.row(i).head(E).transpose();
+                        at = E;
+                    }
+                    for (const int f : row.f) {
+                        full.segment(POINTS * E + f * F, F) += root * j.row(i).segment(at, F).transpose();
+                        at += F;
+                    }
+                    full.tail(G) = root * j.row(i).tail(G).transpose();
+                    all.push_back(full);
+                    right.push_back(root * value[i]);
+                }
+            }
+        }
+        a.resize(static_cast<Eigen::Index>(all.size()), x.size());
+        r.resize(a.rows());
+        for (Eigen::Index i = 0; i < a.rows(); i++) {
+            a.row(i) = all[static_cast<size_t>(i)].transpose();
+            r[i] = right[static_cast<size_t>(i)];
+        }
+    }
+};
+
+// Proves: on a linear problem of arrow shape the optimum is that of a dense QR, whatever the pattern.
+void test_linear_problem_equals_dense_least_squares()
+{
+    for (unsigned seed = 1; seed <= 20; seed++) {
+        Toy toy(seed);
+        Eigen::MatrixXd a;
+        Eigen::VectorXd r;
+        toy.dense(a, r);
+        const Eigen::VectorXd expected = a.colPivHouseholderQr().solve(-r);
+        LeastSquares<E, F> solver;
+        Options options;
+        options.cost_tolerance = options.gradient_tolerance = 0.0; // to the end
+        const Summary summary = solver.minimize(toy, options);
+        TEST_ASSERT_TRUE(summary.status == Status::converged);
+        TEST_ASSERT_TRUE((toy.x - expected).cwiseAbs().maxCoeff() < 1e-10);
+    }
+}
+
+// Proves: every covariance block it gives (e, f within the band, f with border, border) is that of the dense inverse.
+void test_covariance_equals_dense_inverse()
+{
+    for (unsigned seed = 1; seed <= 10; seed++) {
+        Toy toy(seed);
+        LeastSquares<E, F> solver;
+        solver.minimize(toy);
+        const auto covariance = solver.covariance(toy, 2);
+        Eigen::MatrixXd a;
+        Eigen::VectorXd r;
+        toy.dense(a, r);
+        const Eigen::MatrixXd expected = (a.transpose() * a).inverse();
+        const double tolerance = 1e-9 * expected.cwiseAbs().maxCoeff();
+        for (int e = 0; e < POINTS; e++) {
+            const auto block = expected.block(e * E, e * E, E, E);
+            TEST_ASSERT_TRUE((covariance.e[static_cast<size_t>(e)] - block).cwiseAbs().maxCoeff() < tolerance);
+        }
+        for (int i = 0; i < CHAIN; i++) {
+            const size_t at = static_cast<size_t>(i);
+            for (size_t d = 0; d < covariance.f[at].size(); d++) {
+                const auto block = expected.block(POINTS * E + i * F, POINTS * E + (i - static_cast<int>(d)) * F, F, F);
+                TEST_ASSERT_TRUE((covariance.f[at][d] - block).cwiseAbs().maxCoeff() < tolerance);
+            }
+            const auto border = expected.block(POINTS * E + i * F, POINTS * E + CHAIN * F, F, G);
+            TEST_ASSERT_TRUE((covariance.fg[at] - border).cwiseAbs().maxCoeff() < tolerance);
+        }
+        TEST_ASSERT_TRUE((covariance.g - expected.bottomRightCorner(G, G)).cwiseAbs().maxCoeff() < tolerance);
+    }
+}
+
+// Proves: a curved, robust problem ends where the dense gradient vanishes, and never above where it began.
+void test_curved_robust_problem_ends_at_a_stationary_point()
+{
+    for (const RobustLoss::Kind kind : {RobustLoss::Kind::squared, RobustLoss::Kind::huber, RobustLoss::Kind::cauchy}) {
+        for (unsigned seed = 1; seed <= 10; seed++) {
+            Toy toy(seed);
+            toy.curvature = 0.05;
+            toy.loss = {kind, 1.0};
+            LeastSquares<E, F> solver;
+            Options options;
+            options.max_iterations = 500;
+            options.cost_tolerance = 1e-15;
+            const Summary summary = solver.minimize(toy, options);
+            TEST_ASSERT_TRUE(summary.status == Status::converged);
+            TEST_ASSERT_TRUE(summary.final_cost < summary.initial_cost);
+            Eigen::MatrixXd a;
+            Eigen::VectorXd r;
+            toy.dense(a, r);
+            TEST_ASSERT_TRUE((a.transpose() * r).cwiseAbs().maxCoeff() < 1e-4);
+        }
+    }
+}
+
+// Proves: the same bits for 1, 2 and 5 threads.
+void test_threads_do_not_change_a_bit()
+{
+    Eigen::VectorXd first;
+    for (const int threads : {1, 2, 5}) {
+        Toy toy(7);
+        toy.curvature = 0.05;
+        toy.loss = {RobustLoss::Kind::cauchy, 2.0};
+        LeastSquares<E, F> solver;
+        Options options;
+        options.threads = threads;
+        solver.minimize(toy, options);
+        if (threads == 1) {
+            first = toy.x;
+        }
+        TEST_ASSERT_EQUAL_MEMORY(first.data(), toy.x.data(), sizeof(double) * static_cast<size_t>(first.size()));
+    }
+}
+
+// Proves: a parameter that nothing determines has no covariance (an error, not a number), and does no harm to the rest.
+void test_undetermined_parameter_is_refused_a_covariance()
+{
+    Toy toy(3);
+    toy.border_seen = false;
+    LeastSquares<E, F> solver;
+    const Summary summary = solver.minimize(toy);
+    TEST_ASSERT_TRUE(summary.final_cost < summary.initial_cost);
+    bool thrown = false;
+    try {
+        (void)solver.covariance(toy);
+    } catch (const std::domain_error &) {
+        thrown = true;
+    }
+    TEST_ASSERT_TRUE(thrown);
+}
+
+// Proves: a start without a finite cost is an error of the call.
+void test_start_outside_the_domain_throws()
+{
+    Toy toy(3);
+    toy.x[0] = std::numeric_limits<double>::quiet_NaN();
+    LeastSquares<E, F> solver;
+    bool thrown = false;
+    try {
+        (void)solver.minimize(toy);
+    } catch (const std::invalid_argument &) {
+        thrown = true;
+    }
+    TEST_ASSERT_TRUE(thrown);
+}
+
+} // namespace
+
+int main()
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_linear_problem_equals_dense_least_squares);
+    RUN_TEST(test_covariance_equals_dense_inverse);
+    RUN_TEST(test_curved_robust_problem_ends_at_a_stationary_point);
+    RUN_TEST(test_threads_do_not_change_a_bit);
+    RUN_TEST(test_undetermined_parameter_is_refused_a_covariance);
+    RUN_TEST(test_start_outside_the_domain_throws);
+    return UNITY_END();
+}
