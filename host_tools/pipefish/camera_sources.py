@@ -31,9 +31,12 @@ class Sources:
         k, d = np.asarray(source, dtype=float), np.asarray(distortion, dtype=float).ravel()
         if k.shape != (3, 3) or d.shape != (4,) or "size" not in options:
             raise ArgumentError("from_opencv_fisheye: K must be (3, 3), D have 4 numbers, and size=(w, h) be given")
+        if k[1, 0] != 0 or tuple(k[2]) != (0, 0, 1):
+            raise ArgumentError(f"from_opencv_fisheye: K is [fx, s, cx], [0, fy, cy], [0, 0, 1], not {k.tolist()}")
         width, height = options.pop("size")
         core = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "skew": k[0, 1]}
-        lens = lenses.KannalaBrandt(width=width, height=height, k=tuple(d), **{n: float(v) for n, v in core.items()})
+        core = {name: float(value) for name, value in core.items()}
+        lens = _lens(lenses.KannalaBrandt, {"width": width, "height": height, "k": tuple(d.tolist()), **core})
         return formats.from_lens(lens, **options).camera
 
     @classmethod

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from pipefish import __version__
 from pipefish.errors import PipefishError
@@ -186,7 +186,7 @@ def run_status(args: argparse.Namespace) -> Result:
     from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
-    client = Client(open_transport(args.device, args.baud), Handlers(), wants_objects=False)
+    client = Client(open_transport(args.device, args.baud), Handlers())
     try:
         client.open()
         info = client.answer_to(args.timeout, get_info=pb.Nothing()).info
@@ -294,14 +294,16 @@ def run_flash(args: argparse.Namespace) -> Result:
     from pipefish.flash import Flasher
     from pipefish.transport import open_transport
 
-    if sum(map(bool, (args.profile, args.confirm, args.revert))) != 1:
-        raise UsageError("flash: give either a profile, or --confirm, or --revert")
+    if sum(map(bool, (args.profile, args.confirm, args.revert))) > 1:
+        raise UsageError("flash: a profile, --confirm and --revert exclude each other")
     data = load_profile(args).camera.to_binary() if args.profile else None
     with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
         if args.revert:
             state = device.revert()
         elif data:
             state = device.send(data)
+        elif not args.confirm:
+            state = device.state()
         else:
             state = device.state()
             if not state.HasField("stored"):
@@ -314,20 +316,32 @@ def run_flash(args: argparse.Namespace) -> Result:
         else None
         for name, profile in (("in_use", state.in_use), ("stored", state.stored))
     }
+    document["problem"] = state.problem or None
     document["slot_erases"] = [state.slot_erases_a, state.slot_erases_b]
     stored = stored_text(state.stored) if state.HasField("stored") else "none"
     in_use = stored_text(state.in_use) if state.HasField("in_use") else "none"
     rows = [
         ("in use", in_use),
         ("stored", stored + ("" if in_use == stored else "; the next start of the device takes it")),
+        ("problem", state.problem),
         ("written", f"{state.slot_erases_a + state.slot_erases_b} times"),
     ]
-    if data and state.stored.trial:
+    if state.stored.trial and state.in_use.sha256 == state.stored.sha256:
+        rows.append(("then", f"if it is good: pipefish flash {args.device} --confirm"))
+    elif state.stored.trial:
         rows.append(("then", f"restart the device, then: pipefish flash {args.device} --confirm"))
     return document, table(rows)
 
 
 # ---- the parser
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse's, with wrong usage as an exception: main tells it in the form that was asked for."""
+
+    def error(self, message: str) -> NoReturn:
+        self.print_usage(sys.stderr)
+        raise UsageError(f"{self.prog.removeprefix('pipefish').strip()}: {message}".removeprefix(": "))
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -370,7 +384,11 @@ def add_command(
         epilog=f"example:\n  {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout, nothing else there")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help='one JSON document on stdout, nothing else there: the result, or {"error": ...}',
+    )
     parser.add_argument("--debug", action="store_true", help="show a traceback on errors")
     parser.set_defaults(run=run, check=lambda _: None)
     return parser
@@ -383,7 +401,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line of `pipefish`."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="pipefish",
         description="Measure pipes with one fisheye camera.",
         epilog="example:\n  pipefish receive /dev/ttyUSB0 --baud 3000000 -o survey.mcap\n\n"
@@ -508,7 +526,8 @@ def build_parser() -> argparse.ArgumentParser:
         "flash",
         run_flash,
         "Put a camera profile on a device. It is tested, stored on trial and read back; the device's next start takes "
-        "it. Then --confirm it, or the device goes back to the one before.",
+        "it. Then --confirm it, or the device goes back to the one before. Without a profile: tell what is in use, "
+        "stored and on trial.",
         "pipefish flash tcp://127.0.0.1:7447 camera.json",
     )
     add_device(p)
@@ -523,25 +542,45 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command. Returns the exit code: 0 done, 1 failed, 2 wrong usage."""
-    parser = build_parser()
+    """Runs one command. Returns the exit code: 0 done, 1 failed, 2 wrong usage. A failure is one line on stderr, and
+    with --json also the document {"error": {...}} on stdout (error_document)."""
+    argv = sys.argv[1:] if argv is None else argv
     try:
-        args = parser.parse_args(argv)
+        args = build_parser().parse_args(argv)
         args.check(args)
-    except SystemExit as exit_:  # argparse has printed the reason
-        return int(exit_.code or 0)
-    try:
         document, text = args.run(args)
         print(json.dumps(document, indent=2) if args.json else text, flush=True)
         return DONE
+    except SystemExit as exit_:  # --help and --version
+        return int(exit_.code or 0)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone; nothing to say to anybody
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        if args.debug:
+        code = USAGE if isinstance(error, UsageError) else FAILED
+        if "--json" in argv:
+            print(json.dumps(error_document(error, code), indent=2), flush=True)
+        if "--debug" in argv:
             raise
         print(f"pipefish: {message_of(error)}", file=sys.stderr)
-        return USAGE if isinstance(error, UsageError) else FAILED
+        return code
+
+
+def error_document(error: BaseException, code: int) -> dict[str, Any]:
+    """What --json prints where a command fails: exit_code 1 (failed) or 2 (wrong usage), kind: the exception's name,
+    message: the line for people; file and position (line, key, ...; null where there is none) of a bad file."""
+    file, position = getattr(error, "path", None), getattr(error, "position", None)
+    if isinstance(error, OSError):
+        file = error.filename
+    return {
+        "error": {
+            "exit_code": code,
+            "kind": type(error).__name__,
+            "message": message_of(error),
+            "file": None if file is None else str(file),
+            "position": position,
+        }
+    }
 
 
 def message_of(error: BaseException) -> str:

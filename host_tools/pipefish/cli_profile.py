@@ -20,6 +20,8 @@ READ = (
 )
 WRITTEN = ("json", "binary", "opencv-fisheye", "ros", "kalibr", "colmap", "basalt", "orbslam3", "mrcal", "toolbox")
 
+OWN_SUFFIXES = {".json": "json", ".profile": "binary", ".bin": "binary"}  # names that need no --to
+
 
 def load_profile(args: argparse.Namespace) -> Any:
     """A formats.Conversion of args.profile: a profile or another program's calibration, with the options that
@@ -132,9 +134,14 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
     out = Path(args.out)
     if out.exists() and Path(args.profile).exists() and out.samefile(args.profile):
         raise UsageError(f"profile convert: {out} would be written over what it is made from")
+    form = args.to or OWN_SUFFIXES.get(out.suffix.lower())
+    if form is None:
+        raise UsageError(
+            f"profile convert: {out}: the name does not say what to write (only {', '.join(OWN_SUFFIXES)} do): "
+            f"give --to {', '.join(WRITTEN)}"
+        )
     loaded = load_profile(args)
     camera, fit, notes = loaded.camera, loaded.fit, list(loaded.notes)
-    form = args.to or ("json" if out.suffix.lower() == ".json" else "binary")
     if form in ("json", "binary"):
         write_atomically(out, camera.to_json().encode() if form == "json" else camera.to_binary())
         written_fit, reach = None, camera.theta_max
@@ -193,11 +200,17 @@ def run_undistort(args: argparse.Namespace) -> Result:
     rows = [
         ("written", f"{document['file']}" + (f", {document['pictures']} pictures" if document["pictures"] > 1 else "")),
         ("mask", document["mask"]),
-        ("view", f"{document['view']}, {document['fov_deg']:g} deg, {document['width']} x {document['height']} pixels"),
+        ("view", f"{document['view']}, {fov_text(document)}, {document['width']} x {document['height']} pixels"),
         ("seen", f"{100 * document['valid']:.1f} % of it"),
         ("exact", exact if camera.pupil_e1 else None),
     ]
     return document, table(rows)
+
+
+def fov_text(document: dict[str, Any]) -> str:
+    """The angles that a view covers."""
+    down = document["vertical_fov_deg"]
+    return f"{document['fov_deg']:g} x {down:.4g} deg" if down is not None else "faces of 90 deg"
 
 
 def size_of(text: str) -> tuple[int, int]:
@@ -272,8 +285,10 @@ def add_profile(commands: Any) -> None:
         "  pipefish profile convert camera.json camera.yaml --to opencv-fisheye",
     )
     p.add_argument("profile", metavar="PROFILE", help=which)
-    p.add_argument("out", metavar="OUT", help="file to write; without --to: .json is JSON, anything else binary")
-    p.add_argument("--to", choices=WRITTEN, help="format to write, whatever the name")
+    p.add_argument("out", metavar="OUT", help="file to write; without --to: .json is JSON, .profile and .bin binary")
+    p.add_argument(
+        "--to", choices=WRITTEN, help="format to write, whatever the name is; needed for all but .json, .profile, .bin"
+    )
     add_profile_input(p)
     p = add_command(
         commands,
@@ -288,7 +303,12 @@ def add_profile(commands: Any) -> None:
     p.add_argument(
         "--view", choices=("perspective", "cube", "cylinder", "equirect"), default="perspective", help="[perspective]"
     )
-    p.add_argument("--fov", type=float, metavar="DEG", help="across the view's width [90; cylinder, equirect: 180]")
+    p.add_argument(
+        "--fov",
+        type=float,
+        metavar="DEG",
+        help="across the view's width [90; cylinder, equirect: 180]; up and down follow from --size: pixels are square",
+    )
     p.add_argument(
         "--size", type=size_of, metavar="WxH", help="of the view [the picture's]; cube: edge of a face [half of it]"
     )

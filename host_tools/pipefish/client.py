@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import math
 import secrets
 import select
@@ -36,21 +37,13 @@ class NoDevice(PipefishError):
 
 
 class Handlers:
-    """What a client does with what arrives; override what matters."""
+    """What a client that only asks does with what arrives; override what matters. The device keeps its objects."""
 
     def on_up(self, event: Any) -> None:
         """The device answers; event.peer_boot_id is its boot id."""
 
     def on_down(self) -> None:
         """The device has gone silent."""
-
-    def on_offer(self, name: bytes, kind: int, size: int) -> int:
-        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused."""
-        raise NotImplementedError
-
-    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
-        """Answer (STORED, AGAIN, REFUSE) to an object that is all here; None: not yet, ask again on the next turn."""
-        raise NotImplementedError
 
     def on_sent(self, name: bytes) -> None:
         """The device has this object durably."""
@@ -65,17 +58,29 @@ class Handlers:
         """Newest small picture of the device."""
 
 
+class ObjectHandlers(Handlers, abc.ABC):
+    """What a client does that takes the device's objects too."""
+
+    @abc.abstractmethod
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused."""
+
+    @abc.abstractmethod
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        """Answer (STORED, AGAIN, REFUSE) to an object that is all here; None: not yet, ask again on the next turn."""
+
+
 class Client:
     """Keeps the link to one device up: opens the transport again when it breaks, and asks and answers.
 
     statistics and state: `link.stats` (a dict, see pf_link_stats), `up`, `boot` (id of the device, 0 = unknown)
     """
 
-    def __init__(self, transport: Transport, handlers: Handlers, wants_objects: bool, link: Any = None) -> None:
-        """`wants_objects`: False for a client that only asks; the device then keeps its objects.
-        `link`: for tests."""
+    def __init__(self, transport: Transport, handlers: Handlers, link: Any = None) -> None:
+        """`handlers`: ObjectHandlers to be sent objects. `link`: for tests."""
         self.transport = transport
         self.handlers = handlers
+        self._takes_objects = handlers if isinstance(handlers, ObjectHandlers) else None
         if link is None:
             from pipefish._engine import Link
 
@@ -83,8 +88,8 @@ class Client:
                 role=ROLE_HOST,
                 nonce=secrets.randbits(32) | 1,
                 schema=SCHEMA_VERSION,
-                max_object=MAX_OBJECT if wants_objects else 0,
-                receive_slots=RECEIVE_SLOTS if wants_objects else 0,
+                max_object=MAX_OBJECT if self._takes_objects else 0,
+                receive_slots=RECEIVE_SLOTS if self._takes_objects else 0,
                 max_latest=65536,
                 max_control=1000,
             )
@@ -195,8 +200,8 @@ class Client:
                 self._reply(event.data)
             case x if x == LATEST:
                 self._latest(event.topic, event.data)
-            case x if x == OFFER:
-                self.link.answer_object(event.slot, self.handlers.on_offer(event.name, event.kind, event.size))
+            case x if x == OFFER and self._takes_objects:
+                self.link.answer_object(event.slot, self._takes_objects.on_offer(event.name, event.kind, event.size))
             case x if x == SENT:
                 self.handlers.on_sent(event.name)
             case x if x == REFUSED:
@@ -205,9 +210,9 @@ class Client:
                 self._pending.append((event.slot, event.name, event.kind, event.data))
 
     def _answer_pending(self) -> None:
-        while self._pending:
+        while self._pending and self._takes_objects:
             slot, name, kind, data = self._pending[0]
-            answer = self.handlers.on_object(name, kind, data)
+            answer = self._takes_objects.on_object(name, kind, data)
             if answer is None:
                 return
             self._pending.pop(0)

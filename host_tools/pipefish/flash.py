@@ -32,7 +32,7 @@ class Flasher:
     def __init__(self, transport: object, timeout_s: float) -> None:
         """`timeout_s`: how long a silent device is waited for; 0 = for ever."""
         self._delivery = _Delivery()
-        self._client = Client(transport, self._delivery, wants_objects=False)
+        self._client = Client(transport, self._delivery)
         self._timeout_s = timeout_s
 
     def __enter__(self) -> Flasher:

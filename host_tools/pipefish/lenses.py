@@ -6,6 +6,7 @@ All in the frame of DESIGN: x right, y down, z forward; pixel centres at integer
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import math
 from typing import Any
@@ -24,7 +25,7 @@ _PHIS = 360
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Lens:
+class Lens(abc.ABC):
     """A model with its image size. Subclasses say how points become pixels."""
 
     width: int
@@ -41,9 +42,9 @@ class Lens:
                 return name, f"{value:g} is outside the definition of the model {type(self).__name__}"
         return None
 
+    @abc.abstractmethod
     def project(self, points: Array) -> tuple[Array, Mask]:
         """(N, 3) -> (N, 2) pixels, (N,) whether the model holds there."""
-        raise NotImplementedError
 
     def exact(self) -> dict[str, Any] | None:
         """Arguments of the pipefish.Camera that is this lens to the last digit, or None where there is none."""
@@ -63,9 +64,9 @@ class CentredLens(Lens):
     def ranges(self) -> dict[str, tuple[float, bool]]:
         return {"fx": (self.fx, self.fx > 0), "fy": (self.fy, self.fy > 0)}
 
+    @abc.abstractmethod
     def normalised(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Mask]:
         """The image point before focal length and principal point, and where it is valid."""
-        raise NotImplementedError
 
     def project(self, points: Array) -> tuple[Array, Mask]:
         with np.errstate(all="ignore"):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.client import ACCEPT, AGAIN, STORED, Client, Handlers, NoDevice
+from pipefish.client import ACCEPT, AGAIN, STORED, Client, NoDevice, ObjectHandlers
 from pipefish.errors import PipefishError
 from pipefish.progress import Progress
 from pipefish.surveystore import SurveyStore
@@ -38,12 +38,12 @@ class Interrupted(PipefishError):
     """Stopped before the survey was complete; what has arrived is safe in the partial file."""
 
 
-class Receiver(Handlers):
+class Receiver(ObjectHandlers):
     """Stores what one device sends. Use `receive`."""
 
     def __init__(self, transport: Transport, store: SurveyStore, link: Any = None, quiet: bool = False) -> None:
         self.store = store
-        self.client = Client(transport, self, wants_objects=True, link=link)
+        self.client = Client(transport, self, link=link)
         self.status: pb.Status | None = None
         self.again = 0
         self.received = 0

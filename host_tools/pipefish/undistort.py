@@ -18,7 +18,7 @@ from .camera import Camera
 from .errors import ArgumentError, FormatError, PipefishError, file_error
 from .files import write_atomically
 from .progress import Progress, track
-from .views import FAR, Remap, remap, rotation, view_rays
+from .views import FAR, Remap, remap, rotation, vertical_fov, view_rays
 
 Picture = npt.NDArray[np.uint8]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -77,6 +77,7 @@ def undistort(
         "pictures": count,
         "view": view,
         "fov_deg": fov if view != "cube" else 90.0,
+        "vertical_fov_deg": vertical_fov(view, width, height, fov),
         "width": columns,
         "height": rows,
         "valid": float(table.valid.mean()),

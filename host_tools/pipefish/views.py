@@ -56,7 +56,8 @@ def perspective_rays(width: int, height: int, fov: float) -> Array:
 
 
 def cylinder_rays(width: int, height: int, fov: float) -> Array:
-    """Rays to a cylinder about the view's y axis: columns are equal angles, rows equal heights, square pixels."""
+    """Rays to a cylinder about the view's y axis: columns are equal angles, rows equal heights, square pixels. So the
+    height says how far it reaches up and down (vertical_fov); along the axis itself no row ever looks."""
     if not 0 < fov <= 360:
         raise ArgumentError(f"a cylinder covers up to 360 degrees, not {fov:g}")
     x, y = _grid(width, height)
@@ -88,6 +89,19 @@ def cube_rays(edge: int) -> tuple[Array, dict[str, tuple[int, int]]]:
         part = rays[row * edge : (row + 1) * edge, column * edge : (column + 1) * edge]
         part[:] = front @ rotation(yaw, pitch, 0).T
     return rays, corners
+
+
+def vertical_fov(kind: str, width: int, height: int, fov: float) -> float | None:
+    """Degrees from the top to the bottom edge of a view, in its middle column; None for the cube's cross."""
+    half = math.radians(fov) / 2
+    match kind:
+        case "perspective":
+            return math.degrees(2 * math.atan(math.tan(half) * height / width))
+        case "cylinder":
+            return math.degrees(2 * math.atan(half * height / width))
+        case "equirect":
+            return fov * height / width
+    return None
 
 
 def view_rays(kind: str, width: int, height: int, fov: float) -> Array:

@@ -10,7 +10,7 @@
 #define PIXEL_TOLERANCE 1e-9 /* pixels */
 #define RAY_TOLERANCE   1e-12
 
-/* Of a vector's pixel from its place: the search for the rim hangs on last bits. */
+/* Of a vector's pixel from its place: the search for the rim ends before the last bits. */
 #define PLACE_TOLERANCE 1e-3 /* pixels */
 
 /* Where the vectors lie: a direction in the image (Pythagorean, for this room has no cosine) and the share of the way
@@ -38,11 +38,12 @@ static bool reaches(const pf_camera *camera, const double step[2], double length
     return pf_camera_unproject(camera, uv, ray, origin, NULL) == PF_OK;
 }
 
-/* Length of the way from the centre to the rim in steps of `step` pixels. Fifty halvings reach the last bit. */
+/* Length of the way from the centre to the rim in steps of `step` pixels, to 2^-31 of the rim's: 2e-7 px at 500 px, and
+ * below PLACE_TOLERANCE at the largest focal length. */
 static double rim(const pf_camera *camera, const double step[2])
 {
     double inside = 0, outside = 2 * pf_camera_radius(camera, camera->theta_max, NULL), ray[3], origin[3];
-    for (int i = 0; i < 50; i++) {
+    for (int i = 0; i < 32; i++) {
         double middle = 0.5 * (inside + outside);
         if (reaches(camera, step, middle, ray, origin))
             inside = middle;

@@ -157,7 +157,7 @@ static pf_camera moved_camera(const uint8_t *data, size_t size)
     return camera;
 }
 
-/* `whole`: with its profile and self-tests, whose search for the rim takes most of the time. */
+/* `whole`: with its profile and self-tests, three of them and as many proofs. */
 static void try_camera(const pf_camera *camera, bool whole)
 {
     static _Alignas(16) uint8_t workspace[PF_CAMERA_FIXED_WORKSPACE_MAX];

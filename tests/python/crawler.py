@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.client import ACCEPT, STORED, Client, Handlers
+from pipefish.client import ACCEPT, STORED, Client, ObjectHandlers
 from pipefish.transport import TcpTransport, TransportClosed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -126,7 +126,7 @@ class Crawler:
         return self.log.read_text()
 
 
-class Store(Handlers):
+class Store(ObjectHandlers):
     """A host's durable store: what it holds outlives its clients."""
 
     def __init__(self, port: int) -> None:
@@ -154,7 +154,7 @@ class Store(Handlers):
     @contextlib.contextmanager
     def client(self) -> Iterator[Client]:
         """A fresh client, as after the host's own restart; waits for the daemon's port."""
-        client = Client(TcpTransport("127.0.0.1", self.port), self, wants_objects=True)
+        client = Client(TcpTransport("127.0.0.1", self.port), self)
         end = time.monotonic() + 10
         while True:
             try:

@@ -296,7 +296,7 @@ def test_missing_keys_are_named(tmp_path, key):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "line 1 column 1"),
+        (b"", "the file is empty"),
         (b'{"format":\n oops}', "line 2 column 2"),
         (b"[]", "not a JSON object"),
         (b"\xff\xfe", "byte 0: not UTF-8"),

@@ -47,6 +47,10 @@ def test_every_command_has_help_with_an_example(command, capsys):
 def test_wrong_usage_is_2(arguments, capsys):
     assert cli.main(arguments) == 2
     assert capsys.readouterr().out == ""
+    assert cli.main([*arguments, "--json"]) == 2
+    captured = capsys.readouterr()
+    error = json.loads(captured.out)["error"]
+    assert (error["exit_code"], error["kind"]) == (2, "UsageError") and error["message"] in captured.err
 
 
 def test_info_tells_the_survey(survey, capsys):
@@ -78,6 +82,11 @@ def test_show_writes_what_it_says(survey, tmp_path, capsys):
         (["receive", "tcp://127.0.0.1:1", "-o", "b.mcap", "--timeout", "0.1", "--json"], "(waited 0.1 s): Connection"),
         (["status", "tcp://127.0.0.1:1"], "Connection refused"),
         (["profile", "check", "junk.mcap"], "junk.mcap"),
+        (["profile", "check", "junk.mcap", "--json"], "junk.mcap"),
+        (["info", "junk.mcap", "--json"], "offset 0"),
+        (["undistort", "junk.mcap", "--profile", "none.json", "-o", "o.png", "--json"], "none.json: No such file"),
+        (["status", "tcp://127.0.0.1:1", "--json"], "Connection refused"),
+        (["flash", "tcp://127.0.0.1:1", "--json"], "Connection refused"),
     ],
 )
 def test_failure_is_1_with_one_clear_line(survey, tmp_path, monkeypatch, capsys, arguments, words):
@@ -86,9 +95,32 @@ def test_failure_is_1_with_one_clear_line(survey, tmp_path, monkeypatch, capsys,
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
     assert cli.main(arguments) == 1
     captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.startswith("pipefish: ") and captured.err.count("\n") == 1
+    assert captured.err.startswith("pipefish: ") and captured.err.count("\n") == 1
     assert words in captured.err
+    if "--json" in arguments:
+        error = json.loads(captured.out)["error"]
+        assert error["exit_code"] == 1 and f"pipefish: {error['message']}\n" == captured.err
+    else:
+        assert captured.out == ""
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before, "nothing half-written"
+
+
+def test_a_failure_in_json_names_file_and_place(tmp_path, capsys):
+    (tmp_path / "c.json").write_text('{"format": "pipefish-profile", "version": 2, "widht": 3}')
+    assert cli.main(["profile", "show", str(tmp_path / "c.json"), "--json"]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (error["kind"], error["file"], error["position"]) == ("ProfileError", str(tmp_path / "c.json"), "widht")
+
+
+def test_convert_writes_binary_only_where_the_name_says_so(tmp_path, capsys):
+    camera = Camera(width=640, height=480, f_u=200.5, f_v=201.0, c_u=319.0, c_v=241.0, theta_max=1.2)
+    camera.save(tmp_path / "c.json")
+    for name in ("c.yaml", "c", "c.txt"):
+        assert cli.main(["profile", "convert", str(tmp_path / "c.json"), str(tmp_path / name)]) == 2
+        assert "give --to" in capsys.readouterr().err and not (tmp_path / name).exists()
+    assert cli.main(["profile", "convert", str(tmp_path / "c.json"), str(tmp_path / "c.bin")]) == 0
+    assert (tmp_path / "c.bin").read_bytes() == camera.to_binary()
+    assert cli.main(["profile", "convert", str(tmp_path / "c.json"), str(tmp_path / "c.y"), "--to", "ros"]) == 0
 
 
 def test_debug_shows_where(tmp_path):

@@ -255,7 +255,7 @@ def test_an_acknowledgement_at_the_last_moment_still_empties_the_spool(crawler: 
 
 def test_a_shutdown_waits_for_a_host_that_takes_nothing_only_as_long_as_a_signal_does(crawler: Crawler):
     crawler.start("--set", "daemon.drain_s=1", "--set", "daemon.exit_when_done=false")
-    with contextlib.closing(Client(TcpTransport("127.0.0.1", crawler.port), Handlers(), wants_objects=False)) as client:
+    with contextlib.closing(Client(TcpTransport("127.0.0.1", crawler.port), Handlers())) as client:
         wait_for_log(crawler, "survey ends")
         client.open()
         serve(crawler, client, lambda: client.up)

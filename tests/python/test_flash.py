@@ -118,6 +118,10 @@ def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawl
     assert document["stored"]["trial"] and document["stored"]["starts_left"] == 1
     state = restart(crawler)  # one start on trial: camera.trial_starts
     assert state.in_use.name == "new" and state.in_use.trial and state.in_use.starts_left == 0
+    address = f"tcp://127.0.0.1:{crawler.port}"
+    assert cli.main(["flash", address]) == 0  # tells, changes nothing
+    text = capsys.readouterr().out
+    assert text.count("on trial, 0 more starts") == 2 and f"if it is good: pipefish flash {address} --confirm" in text
     assert restart(crawler).in_use.name == "old"
 
     flash(crawler, capsys, tmp_path / "new.json")
@@ -229,7 +233,7 @@ def test_a_device_without_a_store_says_so(tmp_path: Path, crawler: Crawler, caps
 
 
 def test_flash_arguments_that_do_not_go_together_are_wrong_usage(capsys):
-    for arguments in ([], ["a.json", "--confirm"], ["a.json", "--revert"], ["--confirm", "--revert"]):
+    for arguments in (["a.json", "--confirm"], ["a.json", "--revert"], ["--confirm", "--revert"]):
         assert cli.main(["flash", "tcp://127.0.0.1:1", *arguments]) == 2
         assert "flash: " in capsys.readouterr().err
 

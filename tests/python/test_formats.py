@@ -17,7 +17,7 @@ import pytest
 import lens_formulas as lf
 import pipefish as pf
 from pipefish import formats
-from pipefish.errors import PipefishError, ProfileError
+from pipefish.errors import ArgumentError, PipefishError, ProfileError
 from pipefish.lenses import SplinedStereographic
 
 DATA = Path(__file__).with_name("data") / "formats"
@@ -162,12 +162,32 @@ def test_the_same_camera_in_three_scaramuzza_dialects_is_one_camera():
     np.testing.assert_array_equal(svo.unproject(pixels)[0], toolbox.unproject(pixels)[0])
 
 
+def test_opencv_xml_and_yaml_are_one_camera(tmp_path):
+    """FileStorage as OpenCV 4 and 5 write it, and as OpenCV 3 wrote matrices."""
+    text = (DATA / "opencv_fisheye.yaml").read_text()
+    from_yaml = formats.load(DATA / "opencv_fisheye.yaml")
+    (tmp_path / "nd.yml").write_text(text.replace("!!opencv-matrix", "!!opencv-nd-matrix"))
+    k = " ".join(map(str, (301.5, 1.25, 410.25, 0.0, 299.75, 290.5, 0.0, 0.0, 1.0)))
+    matrix = '<{0} type_id="opencv-{1}matrix"><rows>3</rows><cols>3</cols><dt>d</dt><data>\n  {2}</data></{0}>'
+    (tmp_path / "cal.xml").write_text(
+        '<?xml version="1.0"?>\n<opencv_storage>\n<calibration_time>"Sun 22"</calibration_time>\n'
+        "<!-- a remark --><image_width>800</image_width>\n<image_height>600</image_height>\n"
+        + matrix.format("camera_matrix", "", k)
+        + matrix.format("distortion_coefficients", "nd-", " ".join(map(str, KB_K)))
+        + "<files><_>a.png</_><_>b.png</_></files><fisheye_model>1</fisheye_model></opencv_storage>\n"
+    )
+    for name in ("nd.yml", "cal.xml"):
+        loaded = formats.load(tmp_path / name)
+        assert loaded.form == "opencv-fisheye" and loaded.fit.exact
+        assert dataclasses.replace(loaded.camera, name="") == dataclasses.replace(from_yaml.camera, name="")
+
+
 def test_ros_messages_as_printed_are_read_like_ros_files(tmp_path):
     text = (
         "width: 640\nheight: 480\ndistortion_model: plumb_bob\nd: [-0.11, 0.02, 0.0003, -0.0002]\n"
         "k: [610.0, 0.0, 322.5, 0.0, 611.0, 238.25, 0.0, 0.0, 1.0]\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nbinning_x: 0\n"
     )
-    (tmp_path / "info").write_text(text)
+    (tmp_path / "info").write_text(text + "---\n")  # rostopic echo ends each message so
     loaded = formats.load(tmp_path / "info")
     oracle = lf.pinhole((610, 611), (322.5, 238.25), (-0.11, 0.02), (3e-4, -2e-4))
     pixel, _ = loaded.camera.project([[0.3, -0.2, 1.0]])
@@ -305,6 +325,7 @@ ROS = (
 )
 BAD = [
     ("a: [1, 2", "line"),
+    ("", "the file is empty"),
     ("nothing: here", "not a camera calibration"),
     ("when: 2026-02-31\nwhat: !!timestamp never", "not a camera calibration"),
     ("1 OPENCV_FISHEYE 800 600 1 2 3", "8 belong"),
@@ -341,6 +362,19 @@ BAD = [
     (WOODSCAPE.format("0"), "intrinsic.poly_order: 0 is not"),
     (WOODSCAPE.format("1.5"), "intrinsic.poly_order: 1.5 is not"),
     (WOODSCAPE.format("1"), "camera.k1: -3 is outside"),
+    (ROS + "---\n" + ROS, "2 documents, divided by ---"),
+    ("<opencv_storage><K>1 2</opencv_storage>", "line 1 column 25: not XML: mismatched tag"),
+    ("<?xml version='1.0'?><!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage>&b;</opencv_storage>", "DOCTYPE"),
+    ("<opencv_storage>&b;</opencv_storage>", "not XML: undefined entity"),
+    ("<opencv_storage><a>1</a><a>2</a></opencv_storage>", "twice"),
+    ("<opencv_storage>" + "<a>" * 5000 + "</a>" * 5000 + "</opencv_storage>", "too deep"),
+    ("<html><body/></html>", "XML of <html>, not OpenCV's"),
+    (
+        "<opencv_storage><K type_id='opencv-matrix'><data>1 0 0 0 1 0 0 0 x</data></K><D>1 2 3 4</D>"
+        "<fisheye_model>1</fisheye_model></opencv_storage>",
+        "K[8]: not a number",
+    ),
+    ("K: {data: [1,0,0,0,1,0,0,1,1]}\nD: [0,0,0,0,0]", "its last row is not 0 0 1"),
     (ROS + "binning_x: 2", "binning_x: binned pictures"),
     (ROS + "roi: {x_offset: 8, y_offset: 0, width: 100, height: 90}", "roi: cropped pictures"),
 ]
@@ -495,6 +529,13 @@ def test_parameter_constructors_say_what_is_missing():
     with pytest.raises(PipefishError, match="alpha"):
         pf.Camera.from_double_sphere(width=512, height=512, fx=1, fy=1, cx=2, cy=3, xi=0.1)
     k = np.array([[301.5, 1.25, 410.25], [0, 299.75, 290.5], [0, 0, 1]])
+    for row, column, value in ((2, 2, 2.0), (2, 0, 0.1), (1, 0, 0.1)):
+        wrong = k.copy()
+        wrong[row, column] = value
+        with pytest.raises(ArgumentError, match=r"\[0, 0, 1\]"):
+            pf.Camera.from_opencv_fisheye(wrong, KB_K, size=(800, 600))
+    with pytest.raises(ProfileError, match="fx: -300 is outside"):
+        pf.Camera.from_opencv_fisheye(np.diag([-300.0, 300, 1]), KB_K, size=(800, 600))
     a = pf.Camera.from_opencv_fisheye(k, KB_K, size=(800, 600))
     b = pf.Camera.from_opencv_fisheye(DATA / "opencv_fisheye.yaml")
     assert [a.f_u, a.skew, a.k2, a.theta_max] == [b.f_u, b.skew, b.k2, b.theta_max]

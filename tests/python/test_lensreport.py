@@ -135,7 +135,7 @@ def test_refusals_leave_no_file_and_say_why(tmp_path, capsys):
     assert run("convert", FORMATS / "kalibr.yaml", out, "--to", "opencv-fisheye") == 1
     told = capsys.readouterr().err
     assert "ends at 90 degrees" in told and "7 cameras in the file: cam0 taken" in told and not out.exists()
-    assert run("convert", FORMATS / "kalibr.yaml", out, "--camera", "cam9") == 1
+    assert run("convert", FORMATS / "kalibr.yaml", out, "--to", "json", "--camera", "cam9") == 1
     assert "there are cam0, cam1" in capsys.readouterr().err
     assert run("check", FORMATS / "pyocamcalib.json") == 1
     assert "--camera-size" in capsys.readouterr().err

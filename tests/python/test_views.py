@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,6 +109,34 @@ def test_every_view_shows_the_world_where_its_rays_point(camera, world, kind, fo
     expected = shade(unit @ turn.T)
     inner = np.abs(got - expected) < 3
     assert table.valid.sum() > 5000 and inner.mean() > 0.97  # the rest touches the black rim
+
+
+@pytest.mark.parametrize(("kind", "fov"), [("perspective", 100), ("cylinder", 300), ("equirect", 170)])
+def test_the_vertical_field_of_view_is_that_of_the_rays(kind, fov):
+    """Between the outer edges of the first and the last row: half a row beyond their centres."""
+    rays = views.view_rays(kind, 301, 201, fov)[:, 150]
+    angle = np.arctan2(rays[:, 1], rays[:, 2])
+    if kind == "equirect":
+        expected = (angle[-1] - angle[0]) * 201 / 200
+    else:
+        expected = 2 * np.arctan(np.tan(angle[-1]) * 201 / 200)
+    assert views.vertical_fov(kind, 301, 201, fov) == pytest.approx(np.degrees(expected), rel=1e-12)
+
+
+def test_the_python_page_is_true(tmp_path, monkeypatch):
+    """Its examples run, and the names in its tables exist."""
+    root = Path(__file__).resolve().parents[2]
+    page = (root / "docs" / "python.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(re.sub(r'"(calib_profiles|tests)/', rf'"{root}/\1/', code), names)
+    assert names["ok"].tolist() == [True, True, False] and np.isnan(names["pixels"][2]).all()
+    assert names["loaded"].form == "kalibr" and (tmp_path / "cameras.txt").exists()
+    assert names["flat"].shape == (480, 640) and names["table"].valid.any()
+    fields = {field.name for field in dataclasses.fields(pf.Camera)}
+    for name in re.findall(r"(?:amera|, `|`)\.(\w+)", "".join(re.findall(r"^\| `.*$", page, re.MULTILINE))):
+        assert hasattr(pf.Camera, name) or name in fields, name
 
 
 def test_turns_are_right_up_and_clockwise():

@@ -275,17 +275,19 @@ static void test_round_trip_where_the_plane_is_huge(void)
     }
 }
 
-/* Proves: a pixel outside the image of the domain is refused, just inside accepted, whatever the asymmetry: the rim is
- * moved by 1e-6 rad. */
+/* Proves: a pixel outside the image of the domain is refused, one inside accepted, whatever the asymmetry: by a proof
+ * where it is far, by the search where it is near, and on both sides of where the two meet. */
 static void test_unproject_refuses_beyond_the_rim(void)
 {
+    const double distance[] = {1e-8, 1e-6, 3e-5, 1e-3, 0.02}; /* radians: 3e-6 to 6 px */
     for (int l = 0; l < LENSES; l++)
         for (int p = 0; p < 720; p++) {
             pf_camera camera = lens(l);
+            const double phi = p * 0.5 * DEGREES, by = distance[p % 5];
             double uv[2], ray[3];
-            pixel_truth(&camera, camera.theta_max + 1e-6, p * 0.5 * DEGREES, uv);
+            pixel_truth(&camera, camera.theta_max + by, phi, uv);
             TEST_ASSERT_EQUAL_INT(PF_ERR_DOMAIN, pf_camera_unproject(&camera, uv, ray, NULL, NULL));
-            pixel_truth(&camera, camera.theta_max - 1e-6, p * 0.5 * DEGREES, uv);
+            pixel_truth(&camera, camera.theta_max - by, phi, uv);
             TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_unproject(&camera, uv, ray, NULL, NULL));
         }
 }

@@ -183,7 +183,7 @@ nb::tuple look(const Studio &studio, const Picture &picture, const Array &px, in
     {
         nb::gil_scoped_release release;
         constexpr size_t BLOCK = 1024;
-        parallel_for(static_cast<int>((n + BLOCK - 1) / BLOCK), threads, [&](int block) {
+        pipefish::parallel_for(static_cast<int>((n + BLOCK - 1) / BLOCK), threads, [&](int block) {
             const size_t first = static_cast<size_t>(block) * BLOCK;
             for (size_t i = first; i < std::min(n, first + BLOCK); i++) {
                 Sighting seen;

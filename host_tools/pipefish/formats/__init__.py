@@ -20,7 +20,7 @@ from ..fit import MODELS, Fit
 from ..lenses import KannalaBrandt, Lens, Unified
 from . import readers, texts
 from .convert import MAX_ERROR, camera_of, lens_field
-from .parse import BYTES_MAX, Found, decode, parse_json, parse_yaml
+from .parse import BYTES_MAX, Found, decode, parse_json, parse_xml, parse_yaml
 from .writers import WRITERS, Wanted, Written
 
 __all__ = ["MAX_ERROR", "READERS", "WRITERS", "Conversion", "Wanted", "Written", "from_lens", "load", "write"]
@@ -105,7 +105,8 @@ def _read(data: bytes, form: str | None, size: tuple[int, int] | None) -> tuple[
     form = form or _guess_text(text)
     if form in _TEXTS:
         return form, _TEXTS[form](text, size)
-    document = parse_json(text) if _like_json(data) else parse_yaml(text)
+    parse = parse_json if _like_json(data) else parse_xml if text.lstrip().startswith("<") else parse_yaml
+    document = parse(text)
     form = form or _guess_mapping(document)
     if form is None or form == "json":
         raise ProfileError(None, None, "not a camera calibration in a format that is known (docs/formats.md)")
@@ -152,6 +153,8 @@ def load(
             data = stream.read(BYTES_MAX + 1)
     except OSError as error:
         raise ProfileError(path, None, error.strerror or str(error)) from None
+    if not data.strip():
+        raise ProfileError(path, None, "the file is empty")
     try:
         if form in (None, "binary") and (data[:4] == b"PFPR" or form == "binary"):
             return _own("binary", Camera.from_binary(data), camera, size, model, max_error, max_theta)

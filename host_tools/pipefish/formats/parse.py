@@ -8,6 +8,7 @@ import re
 import reprlib
 from collections.abc import Sequence
 from typing import Any
+from xml.etree import ElementTree
 
 import yaml
 
@@ -139,6 +140,7 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> dict[Any, Any]:
 
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _opencv_matrix)
+_Loader.add_constructor("tag:yaml.org,2002:opencv-nd-matrix", _opencv_matrix)
 # Dates stay texts: no calibration needs one, and PyYAML stumbles over impossible ones.
 _Loader.add_constructor("tag:yaml.org,2002:timestamp", yaml.SafeLoader.construct_yaml_str)
 
@@ -154,12 +156,13 @@ def decode(data: bytes) -> str:
 
 
 def parse_yaml(text: str) -> Any:
-    """A YAML document; OpenCV's first line `%YAML:1.0` is no YAML and is left out."""
+    """A YAML document; OpenCV's first line `%YAML:1.0` is no YAML and is left out, and so is what is empty before and
+    after a `---`: ROS prints one behind each message."""
     if len(text) > YAML_MAX:
         raise ProfileError(None, None, f"YAML longer than {YAML_MAX} bytes: this is not a calibration")
     text = re.sub(r"\A%YAML:[^\n]*\n", "\n", text)
     try:
-        return yaml.load(text.replace("\t", "  "), Loader=_Loader)
+        documents = [d for d in yaml.load_all(text.replace("\t", "  "), Loader=_Loader) if d is not None]
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "cannot be read"
@@ -167,6 +170,51 @@ def parse_yaml(text: str) -> Any:
         raise ProfileError(None, place, f"not YAML: {problem}") from None
     except (ValueError, RecursionError, TypeError) as error:
         raise ProfileError(None, None, f"not YAML: {error}") from None
+    if len(documents) > 1:
+        raise ProfileError(None, None, f"{len(documents)} documents, divided by ---, where one belongs")
+    return documents[0] if documents else None
+
+
+def parse_xml(text: str) -> Any:
+    """The XML of OpenCV's FileStorage, as the mapping that its YAML would be. Entities are not read: OpenCV writes none
+    but XML's own, and a few lines of them stand for terabytes."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ProfileError(None, None, "XML with a DOCTYPE or ENTITY is not read")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        line, column = getattr(error, "position", (1, 0))
+        place = f"line {line} column {column + 1}"
+        raise ProfileError(None, place, f"not XML: {str(error).partition(':')[0]}") from None
+    if root.tag != "opencv_storage":
+        raise ProfileError(None, None, f"XML of <{root.tag:.40}>, not OpenCV's <opencv_storage>")
+    return _xml_value(root, "", 0)
+
+
+def _xml_value(element: ElementTree.Element, where: str, depth: int) -> Any:
+    """A mapping, a list (of elements named _, or of words), or a single number or text."""
+    if depth > 20:
+        raise ProfileError(None, where[:80], "too deep for a calibration")
+    inner = [(child.tag, _xml_value(child, f"{where}.{child.tag}".strip("."), depth + 1)) for child in element]
+    if inner and all(tag == "_" for tag, _ in inner):
+        return [value for _, value in inner]
+    if inner:
+        mapping = dict(inner)
+        if len(mapping) < len(inner):
+            raise ProfileError(None, where or None, "a name appears twice")
+        return mapping
+    text = (element.text or "").strip()
+    if text.startswith('"'):
+        return text.strip('"')
+    words = [_xml_word(word) for word in text.split()]
+    return words if len(words) > 1 or element.tag == "data" else words[0] if words else None
+
+
+def _xml_word(word: str) -> Any:
+    try:
+        return float(word)
+    except ValueError:
+        return word
 
 
 def parse_json(text: str) -> Any:

@@ -34,8 +34,12 @@ pf_ray_q30 pf_camera_rays_at(const pf_camera_rays *rays, pf_point_q16 pixel)
 void pf_camera_rays_lookup(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out)
 {
     size_t i = 0;
+#ifdef PF_AVX2
+    if (__builtin_cpu_supports("avx2"))
+        i = pf_fixed_lookup_eights(rays, n, pixels, out);
+#endif
 #ifdef PF_SIMD
-    i = pf_fixed_lookup_fours(rays, n, pixels, out);
+    i += pf_fixed_lookup_fours(rays, n - i, pixels + i, out + i);
 #endif
     for (; i < n; i++)
         out[i] = pf_camera_rays_at(rays, pixels[i]);

@@ -39,4 +39,9 @@ pf_ray_q30 pf_fixed_cell_ray(const ray_cell *cell, int32_t s, int32_t t);
 size_t pf_fixed_lookup_fours(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out);
 #endif
 
+#ifdef PF_AVX2
+/* Eight at a time, on processors with AVX2; returns how many it did, all but up to eight. */
+size_t pf_fixed_lookup_eights(const pf_camera_rays *rays, size_t n, const pf_point_q16 *pixels, pf_ray_q30 *out);
+#endif
+
 #endif

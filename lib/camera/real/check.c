@@ -63,7 +63,7 @@ static const range RANGES[] = {
     FIELD(k5, -1e6, 1e6, "k5: not within -1e6..1e6"),
     FIELD(mirror, 0, 1e3, "mirror: not within 0..1000"),
     FIELD(pupil_e1, -1, 1, "pupil_e1: not within -1..1 metres"),
-    FIELD(theta_max, 1e-6, PF_CAMERA_THETA_MAX, "theta_max: not within 1e-6..pi, pi excluded"),
+    FIELD(theta_max, 1e-6, PF_CAMERA_THETA_MAX, "theta_max: not within 1e-6..pi radians, pi excluded"),
     FIELD(circle_u, -1e5, 1e5, "circle_u: not within -1e5..1e5 pixels"),
     FIELD(circle_v, -1e5, 1e5, "circle_v: not within -1e5..1e5 pixels"),
     FIELD(circle_radius, 0.0, 1e5, "circle_radius: not within 0..1e5 pixels"),

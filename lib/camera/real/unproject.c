@@ -61,6 +61,28 @@ static plane_angle moved(const pf_camera *camera, plane_angle at, double radial,
     return next;
 }
 
+/* Whether no direction of the domain has the plane point (x, y), far outside its image. The check has proved the map F
+ * monotone in the chart: (F(a) - F(b)).(a - b) > 0. With e = F(z) - (x, y) at a point z of the rim, a solution w in the
+ * disc would have e.(z - w) > 0; where e points inwards, e_r < 0, the disc's curve leaves w only within
+ * 2 theta_max |e_t / e_r| sqrt(1 + (e_t / e_r)^2) of z. So slide along the rim to where e_t vanishes; when what is left
+ * of that distance, magnified ten times more than the map does at z, cannot make up e, there is none. Rounding is far
+ * below what is asked: a millionth of theta_max, and e far above the slack of the rim. */
+static bool is_outside(const pf_camera *camera, camera_kind kind, plane_angle z, double x, double y, double slack)
+{
+    for (int i = 0; i < 8; i++) {
+        lens_point lens = pf_camera_lens(camera, kind, z.theta, z.c, z.s);
+        double e[2], size = sqrt(residual(&lens, z, x, y, e));
+        if (!(e[0] < 0 && size > 1e3 * slack))
+            return false;
+        double ratio = fabs(e[1] / e[0]), distance = 2 * camera->theta_max * ratio * sqrt(1 + ratio * ratio);
+        double stretch = fabs(lens.r_t) + fabs(lens.r_p) + fabs(lens.t_t) + fabs(lens.t_p);
+        if (ratio < 1e-6)
+            return 10 * stretch * distance < size && size > 1e3 * stretch * THETA_SLACK;
+        z = moved(camera, z, 0, -e[1] * z.theta / (z.theta * lens.t_p - e[0]));
+    }
+    return false;
+}
+
 /* Newton on the whole map in the chart (X, Y), where the axis is an ordinary point; a step that does not come closer is
  * halved. pf_camera_check has proved the map one-to-one on the disc, so what stops with a residual lies outside, unless
  * the next step is less than a ray can tell: where r' is huge, the last bit of theta is more than the slack. */
@@ -77,6 +99,8 @@ static bool asymmetric_inverse(const pf_camera *camera, camera_kind kind, double
         step = sqrt(radial * radial + tangential * tangential);
         if (step <= DBL_EPSILON * at.theta)
             break;
+        if (at.theta == camera->theta_max && radial > 0 && is_outside(camera, kind, at, x, y, slack))
+            return false;
         /* A step of this size that does not come closer is rounding, not the wrong way. */
         int halvings = step <= 1e-12 * at.theta ? 1 : 40;
         plane_angle next = at;

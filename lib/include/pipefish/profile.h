@@ -69,7 +69,8 @@ pf_status pf_profile_encode(const pf_profile *profile, uint8_t *out, size_t capa
  *      PF_ERR_DOMAIN, PF_ERR_UNSUPPORTED (the camera; see pf_camera_check),
  *      PF_ERR_SELF_TEST (this device computes something else than the profile says)
  * `why` (may be NULL) gets a static text, "field: reason" ("ok" for PF_OK).
- * Cost: a projection and a back-projection a vector beside the proof of pf_camera_check. */
+ * Cost: for each vector some 35 back-projections (the rim is searched) beside the proof of pf_camera_check.
+ * Stack: 8.5 kB, of which 7.5 kB are the factor of a covariance of 40 parameters. */
 pf_status pf_profile_decode(const uint8_t *bytes, size_t n, pf_profile *profile, const char **why);
 
 #ifdef __cplusplus
