@@ -94,3 +94,102 @@ def pair_bound(pair: Pair, sigma: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
     normal = np.einsum("nij,nik,nkl->jl", by_pose, across, by_pose)
     covariance = np.linalg.inv(normal)
     return covariance[:3, :3], basis @ covariance[3:, 3:] @ basis.T
+
+
+@dataclass
+class Drive:
+    """A drive through a tube: true poses (K,3,4), points (N,3), tracks with noise, true path length at each frame."""
+
+    camera: pf.Camera
+    poses: np.ndarray
+    points: np.ndarray
+    tracks: pf.Tracks
+    driven: np.ndarray
+    right: np.ndarray  #: (observations,) in the order of the tracks: not a wrong match
+
+    @property
+    def centres(self) -> np.ndarray:
+        return -np.einsum("nij,ni->nj", self.poses[:, :, :3], self.poses[:, :, 3])
+
+
+def tube_drive(
+    seed: int,
+    length: float = 3.0,
+    step: float = 0.05,
+    diameter: float = 0.3,
+    ovality: float = 0.03,
+    density: float = 800.0,
+    sigma: float = 0.3,
+    limits: tuple[float, float] = (35.0, 89.0),
+    wrong: float = 0.0,
+    camera: pf.Camera | None = None,
+    wobble: float = 1.0,
+    bend: float = 0.0,
+) -> Drive:
+    """Frames every `step` metres; `density` points a metre of wall, seen between two angles from the axis (degrees).
+
+    ovality: (max - min) / diameter, the long axis upright. wrong: share of observations at a random place nearby.
+    bend: the tube's curvature, 1/m, to the side.
+    """
+    random = np.random.default_rng(seed)
+    camera = camera or fisheye(95)
+    s = np.arange(0.0, length + step / 2, step)
+    phase = random.uniform(0, 2 * np.pi, 6)
+    sway = wobble * np.column_stack([0.012 * np.sin(6 * s + phase[0]), 0.008 * np.cos(4.6 * s + phase[1]), 0.0 * s])
+    angles = wobble * np.column_stack(
+        [0.03 * np.sin(5 * s + phase[2]), 0.04 * np.sin(3.1 * s + phase[3]), 0.05 * np.sin(1.3 * s + phase[4])]
+    )
+    angles[:, 1] += bend * s
+    heading = np.cumsum(np.append(0.0, np.full(len(s) - 1, bend * step)))
+
+    def along(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Axis point (n,3) and turn about y (n,) at arc length z of the tube."""
+        if bend == 0.0:
+            return np.column_stack([0 * z, 0 * z, z]), 0 * z
+        return np.column_stack([(1 - np.cos(bend * z)) / bend, 0 * z, np.sin(bend * z) / bend]), bend * z
+
+    def turned(offset: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        return np.column_stack([offset[:, 0] * np.cos(turn), offset[:, 1], -offset[:, 0] * np.sin(turn)])
+
+    axis, turn = along(s)
+    centres = axis + turned(sway, turn)
+    poses = np.zeros((len(s), 3, 4))
+    for i in range(len(s)):
+        about_y = rotation(np.array([0.0, -heading[i], 0.0]))
+        r = rotation(angles[i] * [1, 0, 1] + [0, wobble * 0.04 * np.sin(3.1 * s[i] + phase[3]), 0]) @ about_y
+        poses[i] = np.column_stack([r, -r @ centres[i]])
+    count = int(density * (length + 0.8))
+    z, phi = np.sort(random.uniform(-0.1, length + 0.7, count)), random.uniform(0, 2 * np.pi, count)
+    a, b = diameter / 2 * (1 - ovality / 2), diameter / 2 * (1 + ovality / 2)
+    axis, turn = along(z)
+    points = axis + turned(np.column_stack([a * np.cos(phi), b * np.sin(phi)]), turn)
+    low, high = np.radians(limits)
+    reach = diameter / 2 / np.tan(low) + 0.1
+    frame, track, pixels = [], [], []
+    for i in range(len(s)):
+        near = np.arange(np.searchsorted(z, s[i] - 0.1), np.searchsorted(z, s[i] + reach))
+        seen = points[near] @ poses[i, :, :3].T + poses[i, :, 3]
+        theta = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
+        uv, ok = camera.project(seen)
+        keep = ok & (low < theta) & (theta < high)
+        frame.append(np.full(keep.sum(), i))
+        track.append(near[keep])
+        pixels.append(uv[keep])
+    frame, track, pixels = np.concatenate(frame), np.concatenate(track), np.concatenate(pixels)
+    pixels = pixels + random.normal(0, sigma, pixels.shape) if sigma else pixels
+    order = np.lexsort((frame, track))
+    frame, track, pixels = frame[order], track[order], pixels[order]
+    right = random.uniform(size=len(frame)) >= wrong
+    pixels[~right] += random.normal(0, 15.0, ((~right).sum(), 2))
+    driven = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+    return Drive(camera, poses, points, pf.Tracks(frame, track, pixels), driven, right)
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation, translation that take `source` (n,3) nearest to `target` (Umeyama 1991)."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, d, v = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    turn = u @ sign @ v
+    scale = float(np.trace(np.diag(d) @ sign) / (a**2).sum())
+    return scale, turn, target.mean(0) - scale * turn @ source.mean(0)
