@@ -5,14 +5,16 @@ namespace nb = nanobind;
 
 void bind_camera(nb::module_ &m);
 void bind_link(nb::module_ &m);
+void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link and simulator.";
+    m.doc() = "Compiled part of pipefish: camera model, link, simulator and reconstruction.";
     bind_camera(m);
     bind_link(m);
+    bind_sfm(m);
     bind_sim(m);
     bind_sim_studio(m);
 }
