@@ -24,6 +24,8 @@ _LAZY = {
     "two_view": "pipefish.twoview",
     "TwoView": "pipefish.twoview",
     "Survey": "pipefish.survey",
+    "Tube": "pipefish.tube",
+    "fit_tube": "pipefish.tube",
     "Keyframe": "pipefish.survey",
     "Tracks": "pipefish.survey",
     "PARAMETERS": "pipefish.camera",

@@ -524,6 +524,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     add_profile(commands)
 
+    from pipefish.cli_tube import add_tube
+
+    add_tube(commands)
+
     p = add_command(
         commands,
         "flash",

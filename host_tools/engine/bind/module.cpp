@@ -8,13 +8,15 @@ void bind_link(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
+void bind_tube(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: camera model, link, simulator and reconstruction.";
+    m.doc() = "Compiled part of pipefish: one class or function for each door of the engine's rooms.";
     bind_camera(m);
     bind_link(m);
     bind_sfm(m);
     bind_sim(m);
     bind_sim_studio(m);
+    bind_tube(m);
 }
