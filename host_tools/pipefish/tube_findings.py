@@ -124,13 +124,18 @@ def events(tube: Tube) -> list[dict[str, Any]]:
     return sorted(found, key=lambda e: e["s"])
 
 
+def _alike(tube: Tube) -> int:
+    """So many neighbouring points tell the same."""
+    return max(1, round(tube.surface.correlation * tube.surface.thinning))
+
+
 def _rings(tube: Tube) -> list[dict[str, Any]]:
     """Narrow rings of points outside the wall, all around: the gap of a joint, seen from inside."""
     p, d = tube.points, tube.summary["d_mean"]
     out = (p["piece"] >= 0) & (p["distance"] > np.maximum(GROSS * p["sigma"], 0.005 * d)) & (p["distance"] < 0.25 * d)
     s, sextant = p["s"][out], (p["clock"][out] / (np.pi / 3)).astype(int) % 6
     # Where neighbours tell the same, only one of so many counts.
-    order = np.argsort(s)[:: max(1, round(tube.surface.correlation))]
+    order = np.argsort(s)[:: _alike(tube)]
     s, sextant = s[order], sextant[order]
     if len(s) < 4:
         return []
@@ -279,7 +284,7 @@ def _limit(z: np.ndarray, k: int, tests: int) -> float:
 def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Patches of wall whose points stand in or out together."""
     p, d = tube.points, tube.summary["d_mean"]
-    every = max(1, round(tube.surface.correlation))  # so many neighbours tell the same
+    every = _alike(tube)
     rows = np.flatnonzero(p["piece"] >= 0)
     tests = len(rows) // every
     if tests < 60:

@@ -2,6 +2,7 @@
 
 #include <Eigen/Cholesky>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
@@ -65,6 +66,7 @@ public:
         set_border();
         start_length_ = (state_.centre.back() - state_.centre.front()).norm();
         saved_ = state_;
+        project_all();
     }
 
     int eliminated() const { return static_cast<int>(state_.point.size()); }
@@ -126,14 +128,12 @@ public:
         const size_t point = static_cast<size_t>(e);
         double sum = 0.0;
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
-            const Observation &o = table_[place_[k]];
-            const size_t f = static_cast<size_t>(frame_[k]);
-            const Vector3d x = state_.rotation[f] * (state_.point[point] - state_.centre[f]);
-            Vector2d uv;
-            if (pf_camera_project(&camera_, x.data(), uv.data(), nullptr, nullptr) != PF_OK) {
+            if (!seen_[k]) {
                 return std::numeric_limits<double>::infinity();
             }
-            sum += 0.5 * options_.loss((o.whiten * (uv - o.sight.uv)).squaredNorm()).rho;
+            const Observation &o = table_[place_[k]];
+            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) - o.sight.uv;
+            sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
         }
         return sum;
     }
@@ -158,6 +158,7 @@ public:
             state_.camera = saved_.camera + step.g.tail(camera_columns_);
             camera_ = changed_camera(original_, *options_.camera_prior, state_.camera);
         }
+        project_all();
     }
 
     void save() { saved_ = state_; }
@@ -186,6 +187,23 @@ public:
     }
 
 private:
+    // All pixels in one batch, which takes a tenth of the time of one by one.
+    void project_all()
+    {
+        const size_t n = place_.size();
+        in_camera_.resize(3 * n);
+        pixel_.resize(2 * n);
+        seen_.resize(n);
+        for (size_t p = 0; p < state_.point.size(); p++) {
+            for (size_t k = offset_[p]; k < offset_[p + 1]; k++) {
+                const size_t f = static_cast<size_t>(frame_[k]);
+                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) =
+                    state_.rotation[f] * (state_.point[p] - state_.centre[f]);
+            }
+        }
+        pf_camera_project_n(&camera_, n, in_camera_.data(), pixel_.data(), seen_.data());
+    }
+
     bool is_held(int f) const { return f < options_.held_front || f >= banded() - options_.held_back; }
 
     void set_border()
@@ -378,6 +396,8 @@ private:
     State state_, saved_;
     std::vector<size_t> offset_; // of each point in place_ and frame_
     std::vector<int> place_, frame_, track_;
+    std::vector<double> in_camera_, pixel_; // of all observations, at the state
+    std::vector<uint8_t> seen_;
     int border_ = 0, down_at_ = 0, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
     Eigen::MatrixXd camera_root_;
     double start_length_ = 1.0;

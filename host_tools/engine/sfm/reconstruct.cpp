@@ -32,8 +32,8 @@ BundleOptions building(int min_views)
 {
     BundleOptions options;
     options.loss = {optim::RobustLoss::Kind::cauchy, 2.0};
-    options.max_iterations = 6;
-    options.cost_tolerance = 1e-3;
+    options.max_iterations = 4;
+    options.cost_tolerance = 1e-2;
     options.gate = 30.0;
     options.min_views = min_views;
     return options;

@@ -674,6 +674,16 @@ OnSurface Surface::project(const Vector3d &x) const
     return best;
 }
 
+double Surface::thinning() const
+{
+    double on = 0.0, used = 0.0;
+    for (size_t i = 0; i < used_.size(); i++) {
+        on += of_piece_[i] >= 0;
+        used += used_[i];
+    }
+    return used > 0.0 ? on / used : 1.0;
+}
+
 std::vector<std::pair<double, double>> Surface::pieces() const
 {
     std::vector<std::pair<double, double>> out;

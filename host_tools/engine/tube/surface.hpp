@@ -62,6 +62,8 @@ public:
     double length() const { return piece_.back().end_s; }
     int order() const { return order_; }
     double correlation() const { return correlation_; } // factor by which neighbours' likeness widens variances
+    // Points on the tube for each that took part in the fit.
+    double thinning() const;
     bool converged() const { return converged_; }
     std::vector<std::pair<double, double>> pieces() const; // chainages
 
