@@ -73,6 +73,15 @@ def check_pipes() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_calib() -> list[dict]:
+    """Calibration over random set-ups, against theory, and on real data where they are; resumes by itself."""
+    done = run(sys.executable, "tests/accept_calib.py")
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_calib.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -147,6 +156,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "link_goodput": check_link_goodput,
     "track": check_track,
     "pipes": check_pipes,
+    "calib": check_calib,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,

@@ -520,9 +520,13 @@ def build_parser() -> argparse.ArgumentParser:
         "--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]; 0: wait for ever"
     )
 
-    from pipefish.cli_profile import add_profile, add_profile_input  # they need what stands above
+    from pipefish.cli_homography import add_homography  # they need what stands above
+    from pipefish.cli_profile import add_profile, add_profile_input
+    from pipefish.cli_target import add_target
 
     add_profile(commands)
+    add_target(commands)
+    add_homography(commands)
 
     from pipefish.cli_tube import add_tube
 

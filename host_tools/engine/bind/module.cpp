@@ -3,7 +3,10 @@
 
 namespace nb = nanobind;
 
+void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
+void bind_conics(nb::module_ &m);
+void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
@@ -12,8 +15,11 @@ void bind_tube(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
-    m.doc() = "Compiled part of pipefish: one class or function for each door of the engine's rooms.";
+    m.doc() = "Compiled part of pipefish: one door for each room of the engine.";
+    bind_calib(m);
     bind_camera(m);
+    bind_conics(m);
+    bind_detect(m);
     bind_link(m);
     bind_sfm(m);
     bind_sim(m);

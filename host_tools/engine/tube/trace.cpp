@@ -158,6 +158,22 @@ bool good(const Cylinder &c)
     return c.status == FitStatus::ok || c.status == FitStatus::circle_only;
 }
 
+// The `count` points nearest to x, ascending: a tree's list of the nearest is slow when it is long.
+std::vector<int> nearest_many(const Eigen::Matrix3Xd &points, const Vector3d &x, int count)
+{
+    std::vector<std::pair<double, int>> all;
+    for (Eigen::Index i = 0; i < points.cols(); i++) {
+        all.emplace_back((points.col(i) - x).squaredNorm(), static_cast<int>(i));
+    }
+    std::nth_element(all.begin(), all.begin() + count, all.end());
+    std::vector<int> out;
+    for (int i = 0; i < count; i++) {
+        out.push_back(all[static_cast<size_t>(i)].second);
+    }
+    std::sort(out.begin(), out.end());
+    return out;
+}
+
 std::vector<int> window(const Cloud &cloud, const std::vector<int> &near, const Vector3d &centre, const Vector3d &axis,
                         double rho, double half)
 {
@@ -204,8 +220,7 @@ Cylinder find_cylinder(const Cloud &cloud, int threads)
         } else {
             const auto at =
                 static_cast<Eigen::Index>(hash64(4, static_cast<uint64_t>(place), 0) % static_cast<uint64_t>(n));
-            around = nearest.nearest(cloud.points.col(at), size);
-            std::sort(around.begin(), around.end());
+            around = nearest_many(cloud.points, cloud.points.col(at), size);
         }
         found[static_cast<size_t>(job)] = look(cloud, around, static_cast<uint64_t>(job));
     });

@@ -1,0 +1,35 @@
+"""Real corner sets for the tests of calibration; they are not part of the project."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from pipefish.calibration import View
+
+
+def ov_plane(data: Path, part: str) -> tuple[list[View], tuple[int, int]]:
+    """BabelCalib's ov_plane, "train" or "test": .orpc rows are board, point, 1, x, y; .dsc has the points in
+    centimetres."""
+    rows = [line.strip().split(",") for line in (data / "ov_plane/ov_plane.dsc").read_text().splitlines()]
+    points = np.array([[float(x) / 100 for x in row[3:6]] for row in rows if len(row) == 6])
+    views = []
+    for path in sorted((data / "ov_plane/corners" / part).glob("*.orpc")):
+        lines = [line.split(",") for line in path.read_text().splitlines() if line[:1].isdigit()]
+        found = np.array([[float(x) for x in line] for line in lines if len(line) == 5])
+        views.append(View(points[found[:, 1].astype(int)], found[:, 3:5], name=path.stem))
+    return views, (1280, 800)
+
+
+def jy_stereo(data: Path, camera: int) -> tuple[list[View], tuple[int, int]]:
+    """The first 20 pairs of jy_stereo; camera 1 is the left one, 2 the right one."""
+    root = ElementTree.parse(data / "jy_stereo/omni_stereocalib_data_fisheye.xml").getroot()
+    y, x = np.mgrid[:6, :8].reshape(2, -1)
+    board = np.stack([x * 0.0244, y * 0.0244, 0 * x], axis=1)
+    views = []
+    for i, node in enumerate(root.find(f"imagePoints{camera}")):
+        pixels = np.array(node.find("data").text.split(), dtype=float).reshape(-1, 2)
+        views.append(View(board, pixels, camera=camera - 1, name=f"{i}"))
+    return views, (1280, 800)
