@@ -116,11 +116,38 @@ class Reconstruction:
     camera_parameters: tuple[str, ...]
     cost: float
     iterations: list[int] = field(default_factory=list)
+    parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
+    turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
 
     @property
     def centres(self) -> Floats:
         """(K,3) where the camera was."""
         return -np.einsum("nij,ni->nj", self.poses[:, :, :3], self.poses[:, :, 3])
+
+    def functions_covariance(
+        self, points: npt.ArrayLike, jacobian: npt.ArrayLike, *, systematic: bool = False
+    ) -> Floats:
+        """(m,m) covariance of m linear functions of points, with all that they share through the poses.
+
+        points (n,) places in `points`, all of one segment; jacobian (m,n,3). systematic: with the camera's uncertainty.
+        Variances of the points alone, added up, are several times too small for what is averaged over many points.
+        Raises ArgumentError for points of several segments, or where the camera's uncertainty is not known."""
+        places, rows = np.asarray(points, dtype=np.int64), np.asarray(jacobian, dtype=np.float64)
+        if places.ndim != 1 or rows.ndim != 3 or rows.shape[1:] != (len(places), 3):
+            raise ArgumentError(f"jacobian: expected shape (m, {len(places)}, 3), got {rows.shape}")
+        if not len(places):
+            return np.zeros((len(rows), len(rows)))
+        segments = np.unique(self.point_segment[places])
+        if len(segments) > 1:
+            raise ArgumentError("points: of several segments, which have nothing in common")
+        number = int(segments[0])
+        random, total = self.parts[number]
+        if systematic and total is None:
+            raise ArgumentError("systematic: the camera's profile has no covariance")
+        first = int(np.searchsorted(self.point_segment, number))
+        rows = np.ascontiguousarray(rows @ self.turns[number])
+        found = (total if systematic else random).functions((places - first).astype(np.int32), rows)
+        return found * (1.0 if systematic else self.variance_factor[number])
 
     @property
     def length(self) -> float:
@@ -238,6 +265,11 @@ def reconstruct(
     return _result(found, names, frames, step, encoder, camera)
 
 
+def _wheel_sigma(segment: dict[str, Any] | None) -> float | None:
+    """Of the first parameter that all poses share, the wheel's scale, where there is one."""
+    return float(np.sqrt(segment["random"].border[0, 0])) if segment and segment["metric"] else None
+
+
 def _stacked(parts: list[npt.NDArray[Any]], shape: tuple[int, ...], dtype: type = np.float64) -> npt.NDArray[Any]:
     return np.concatenate(parts) if parts else np.zeros((0, *shape), dtype)
 
@@ -264,11 +296,11 @@ def _result(
         spin = np.eye(6)
         spin[3:, 3:] = r
         factor = s["variance_factor"]
-        covariances.append(factor * (r @ s["random"]["point"] @ r.T))
-        pose_covariances.append(factor * (spin @ s["random"]["pose"] @ spin.T))
+        covariances.append(factor * (r @ s["random"].point @ r.T))
+        pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
         if s["total"] is not None:
-            systematic.append(r @ (s["total"]["point"] - s["random"]["point"]) @ r.T)
-            pose_systematic.append(spin @ (s["total"]["pose"] - s["random"]["pose"]) @ spin.T)
+            systematic.append(r @ (s["total"].point - s["random"].point) @ r.T)
+            pose_systematic.append(spin @ (s["total"].pose - s["random"].pose) @ spin.T)
     metric = bool(segments) and all(s["metric"] for s in segments)
     status = "failed" if not segments else "partial" if gaps or len(segments) > 1 else "ok"
     reason = "" if status == "ok" else "; ".join(str(gap) for gap in gaps[:3])
@@ -290,9 +322,9 @@ def _result(
         pose_systematic=_stacked(pose_systematic, (6, 6)) if systematic else None,
         unit="metre" if metric else "arbitrary",
         gauge="first frame" if metric else "first frame and distance to the last",
-        scale_sigma=float(first["random"]["wheel_sigma"]) if metric and first else None,
+        scale_sigma=_wheel_sigma(first),
         wheel=float(first["wheel"]) if first else 0.0,
-        wheel_sigma=float(first["random"]["wheel_sigma"]) if first else 0.0,
+        wheel_sigma=_wheel_sigma(first) or 0.0,
         sigma=[s["sigma"] for s in segments],
         variance_factor=[s["variance_factor"] for s in segments],
         observations=sum(s["observations"] for s in segments),
@@ -305,4 +337,6 @@ def _result(
         camera_parameters=camera.covariance_parameters,
         cost=sum(s["cost"] for s in segments),
         iterations=[s["iterations"] for s in segments],
+        parts=[(s["random"], s["total"]) for s in segments],
+        turns=[move[:, :3] for move in moves[: len(segments)]],
     )

@@ -31,6 +31,7 @@ using Triples = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::de
 using Indices = nb::ndarray<const int, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Values = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Square = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Jacobians = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Covariances = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
 
@@ -127,26 +128,46 @@ nb::object sampson_squared(const pf_profile &profile, const Matrix34 &pose, cons
     return to_numpy<double>(out.data(), {n});
 }
 
-template <int N> nb::object stack(const std::vector<Eigen::Matrix<double, N, N>> &matrices)
+// (m,m) covariance of m linear functions of points: jacobian (m, n, 3) of points (n,).
+nb::object functions(const sfm::BundleCovariance &covariance, const Indices &points, const Jacobians &jacobian)
+{
+    const size_t m = jacobian.shape(0), n = points.shape(0);
+    if (jacobian.shape(1) != n) {
+        throw nb::value_error("jacobian: not one column for each point");
+    }
+    std::vector<sfm::BundleCovariance::Solver::MatrixEG> a(n);
+    for (size_t k = 0; k < n; k++) {
+        if (points.data()[k] < 0 || static_cast<size_t>(points.data()[k]) >= covariance.points().size()) {
+            throw nb::value_error("points: no such point");
+        }
+        a[k].resize(3, static_cast<Eigen::Index>(m));
+        for (size_t row = 0; row < m; row++) {
+            const double *from = jacobian.data() + 3 * (row * n + k);
+            a[k].col(static_cast<Eigen::Index>(row)) << from[0], from[1], from[2];
+        }
+    }
+    return matrix_to_numpy(covariance.functions({points.data(), n}, a));
+}
+
+nb::object pose_covariances(const sfm::BundleCovariance &covariance)
 {
     std::vector<double> flat;
-    for (const auto &m : matrices) { // symmetric: the order of storage does not matter
-        flat.insert(flat.end(), m.data(), m.data() + N * N);
+    for (size_t f = 0; f < covariance.frames(); f++) { // symmetric: the order of storage does not matter
+        flat.insert(flat.end(), covariance.pose(f).data(), covariance.pose(f).data() + 36);
     }
-    return to_numpy<double>(flat.data(), {matrices.size(), N, N});
+    return to_numpy<double>(flat.data(), {covariance.frames(), 6, 6});
 }
 
-nb::dict covariance_dict(const sfm::BundleCovariance &covariance)
+nb::object point_covariances(const sfm::BundleCovariance &covariance)
 {
-    nb::dict out;
-    out["pose"] = stack<6>(covariance.pose);
-    out["point"] = stack<3>(covariance.point);
-    out["wheel_sigma"] = covariance.wheel_sigma;
-    out["camera"] = matrix_to_numpy(covariance.camera);
-    return out;
+    std::vector<double> flat;
+    for (const geometry::Matrix3d &m : covariance.points()) {
+        flat.insert(flat.end(), m.data(), m.data() + 9);
+    }
+    return to_numpy<double>(flat.data(), {covariance.points().size(), 3, 3});
 }
 
-nb::dict segment_dict(const sfm::Segment &segment)
+nb::dict segment_dict(sfm::Segment &segment)
 {
     nb::dict out;
     const sfm::Submap &map = segment.map;
@@ -163,8 +184,9 @@ nb::dict segment_dict(const sfm::Segment &segment)
     out["poses"] = to_numpy<double>(poses.data(), {map.poses.size(), 3, 4});
     out["points"] = to_numpy<double>(points.data(), {map.points.size(), 3});
     out["tracks"] = to_numpy<int>(map.tracks.data(), {map.tracks.size()});
-    out["random"] = covariance_dict(segment.random);
-    out["total"] = segment.total.pose.empty() ? nb::object(nb::none()) : nb::object(covariance_dict(segment.total));
+    const bool uncertain = !segment.total.empty();
+    out["random"] = nb::cast(std::move(segment.random));
+    out["total"] = uncertain ? nb::cast(std::move(segment.total)) : nb::object(nb::none());
     out["metric"] = segment.metric;
     out["sigma"] = segment.sigma;
     out["scale_sigma"] = segment.scale_sigma;
@@ -230,7 +252,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     }
     nb::dict out;
     nb::list segments, gaps;
-    for (const sfm::Segment &segment : found.segments) {
+    for (sfm::Segment &segment : found.segments) {
         segments.append(segment_dict(segment));
     }
     for (const sfm::Gap &gap : found.gaps) {
@@ -252,6 +274,14 @@ void bind_sfm(nb::module_ &m)
           nb::arg("uv2").noconvert(), nb::arg("covariance1").noconvert().none(),
           nb::arg("covariance2").noconvert().none(), nb::arg("sigma"), nb::arg("seed"),
           "Relative pose of two views; see pipefish.twoview.");
+    nb::class_<sfm::BundleCovariance>(m, "BundleCovariance", "Covariance of an adjustment, correlations kept.")
+        .def_prop_ro("pose", &pose_covariances, "(K,6,6): rotation on the left, centre.")
+        .def_prop_ro("point", &point_covariances, "(N,3,3)")
+        .def_prop_ro(
+            "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); },
+            "Of wheel, gravity (2) and camera, those that were estimated.")
+        .def("functions", &functions, nb::arg("points").noconvert(), nb::arg("jacobian").noconvert(),
+             "(m,m) covariance of m linear functions of points (n,) int32: jacobian (m,n,3).");
     m.def("reconstruct", &reconstruct, nb::arg("camera"), nb::arg("frames"), nb::arg("tracks"),
           nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(),
           nb::arg("covariance").noconvert().none(), nb::arg("sigma"), nb::arg("method"), nb::arg("seed"),

@@ -33,6 +33,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <span>
 #include <stdexcept>
 #include <vector>
@@ -164,6 +165,44 @@ public:
         return inverse();
     }
 
+    // Covariance (m x m) of the linear functions sum of a[k]^T x of e blocks e[k], a[k]: E x m, from what covariance()
+    // returned last. Exact where the f blocks that these e blocks couple with lie within the band of each other.
+    Eigen::MatrixXd functions(const Covariance &known, std::span<const int> e, std::span<const MatrixEG> a) const
+    {
+        const Eigen::Index m = a.empty() ? 0 : a[0].cols();
+        Eigen::MatrixXd out = Eigen::MatrixXd::Zero(m, m), on_g = Eigen::MatrixXd::Zero(border_, m);
+        std::map<size_t, MatrixFG> on_f; // how the functions depend on the f blocks
+        for (size_t k = 0; k < e.size(); k++) {
+            const size_t block = static_cast<size_t>(e[k]);
+            const MatrixEG solved = inverse_e_[block] * a[k];
+            out.noalias() += a[k].transpose() * solved;
+            for (size_t c = w_offset_[block]; c < w_offset_[block + 1]; c++) {
+                MatrixFG &sum = on_f.try_emplace(static_cast<size_t>(w_index_[c]), MatrixFG::Zero(F, m)).first->second;
+                sum.noalias() += w_[c].transpose() * solved;
+            }
+            if (border_ > 0) {
+                on_g.noalias() += h_eg_[block].transpose() * solved;
+            }
+        }
+        for (const auto &[i, g_i] : on_f) {
+            for (const auto &[j, g_j] : on_f) {
+                if (j > i || i - j >= known.f[i].size()) {
+                    continue;
+                }
+                const Eigen::MatrixXd part = g_i.transpose() * known.f[i][i - j] * g_j;
+                out += i == j ? part : Eigen::MatrixXd(part + part.transpose());
+            }
+            if (border_ > 0) {
+                const Eigen::MatrixXd part = g_i.transpose() * known.fg[i] * on_g;
+                out += part + part.transpose();
+            }
+        }
+        if (border_ > 0) {
+            out += on_g.transpose() * known.g * on_g;
+        }
+        return out;
+    }
+
     // Receives residuals. One a piece of the sums.
     class Sink
     {
@@ -191,7 +230,7 @@ public:
             }
             for (size_t k = 0; k < f.size(); k++) {
                 const RowsMap<F> jf(j_f[k], rows, F);
-                const size_t i = static_cast<size_t>(f[k]);
+                const size_t i = static_cast<size_t>(f[k]) - piece_->first;
                 piece_->b_f[i].noalias() += weight * (jf.transpose() * residual);
                 if (j_e) {
                     owner_->coupling(e_, f[k]).noalias() += weight * (je.transpose() * jf);
@@ -219,6 +258,7 @@ public:
             const Eigen::Matrix<double, Eigen::Dynamic, Columns, Columns == 1 ? Eigen::ColMajor : Eigen::RowMajor>>;
         friend class LeastSquares;
         struct Piece {
+            size_t first = 0; // f block: a piece holds those that its e blocks couple with
             std::vector<MatrixF> h_ff;
             std::vector<MatrixFG> h_fg;
             std::vector<VectorF> b_f;
@@ -290,9 +330,11 @@ private:
         std::vector<typename Sink::Piece> pieces(PIECES + 1);
         parallel_for(PIECES + 1, threads, [&](int number) {
             typename Sink::Piece &piece = pieces[static_cast<size_t>(number)];
-            piece.h_ff.assign(count_f_ * (band_ + 1), MatrixF::Zero());
-            piece.h_fg.assign(count_f_, MatrixFG::Zero(F, border_));
-            piece.b_f.assign(count_f_, VectorF::Zero());
+            const auto [first, last] = touched(number);
+            piece.first = first;
+            piece.h_ff.assign((last - first) * (band_ + 1), MatrixF::Zero());
+            piece.h_fg.assign(last - first, MatrixFG::Zero(F, border_));
+            piece.b_f.assign(last - first, VectorF::Zero());
             piece.h_gg = Eigen::MatrixXd::Zero(border_, border_);
             piece.b_g = Eigen::VectorXd::Zero(border_);
             Sink sink;
@@ -313,18 +355,33 @@ private:
                 problem.linearize(static_cast<int>(e), sink);
             }
         });
-        common_ = std::move(pieces[0]);
-        for (size_t p = 1; p < pieces.size(); p++) {
-            for (size_t i = 0; i < common_.h_ff.size(); i++) {
-                common_.h_ff[i] += pieces[p].h_ff[i];
+        common_ = std::move(pieces[PIECES]);
+        for (size_t p = 0; p < PIECES; p++) {
+            const size_t first = pieces[p].first;
+            for (size_t i = 0; i < pieces[p].h_ff.size(); i++) {
+                common_.h_ff[banded_at(first, 0) + i] += pieces[p].h_ff[i];
             }
-            for (size_t i = 0; i < count_f_; i++) {
-                common_.h_fg[i] += pieces[p].h_fg[i];
-                common_.b_f[i] += pieces[p].b_f[i];
+            for (size_t i = 0; i < pieces[p].b_f.size(); i++) {
+                common_.h_fg[first + i] += pieces[p].h_fg[i];
+                common_.b_f[first + i] += pieces[p].b_f[i];
             }
             common_.h_gg += pieces[p].h_gg;
             common_.b_g += pieces[p].b_g;
         }
+    }
+
+    // First f block, and one past the last, that a piece's e blocks couple with; of the last piece: all.
+    std::pair<size_t, size_t> touched(int number) const
+    {
+        if (number == PIECES) {
+            return {0, count_f_};
+        }
+        size_t first = count_f_, last = 0;
+        for (size_t k = w_offset_[first_of(number)]; k < w_offset_[first_of(number + 1)]; k++) {
+            first = std::min(first, static_cast<size_t>(w_index_[k]));
+            last = std::max(last, static_cast<size_t>(w_index_[k]) + 1);
+        }
+        return {std::min(first, last), last};
     }
 
     static double scaled(double gradient, double diagonal)

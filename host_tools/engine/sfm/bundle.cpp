@@ -13,7 +13,7 @@ namespace pipefish::sfm
 namespace
 {
 
-using Solver = optim::LeastSquares<3, 6>;
+using Solver = BundleCovariance::Solver;
 using Step = optim::Step<3, 6>;
 template <int R, int C> using Rows = Eigen::Matrix<double, R, C, Eigen::RowMajor>;
 using RowsX = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
@@ -72,7 +72,8 @@ public:
     int eliminated() const { return static_cast<int>(state_.point.size()); }
     int banded() const { return static_cast<int>(state_.centre.size()); }
     int border() const { return border_; }
-    int reach() const { return options_.odometry ? 1 : 0; }
+    int reach() const { return std::max(reach_, options_.odometry ? 1 : 0); }
+    void widen(int reach) { reach_ = std::min(reach, banded() - 1); }
     std::span<const int> couplings(int e) const
     {
         const size_t from = offset_[static_cast<size_t>(e)];
@@ -392,7 +393,7 @@ private:
     const TrackTable &table_;
     pf_camera original_, camera_;
     BundleOptions options_;
-    int first_;
+    int first_, reach_ = 0;
     State state_, saved_;
     std::vector<size_t> offset_; // of each point in place_ and frame_
     std::vector<int> place_, frame_, track_;
@@ -444,22 +445,9 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
     report.camera = problem.state().camera;
     if (covariance) {
-        const auto inverse = solver.covariance(problem, options.threads);
-        for (size_t f = 0; f < inverse.f.size(); f++) {
-            covariance->pose.push_back(inverse.f[f][0]);
-            if (f > 0) {
-                covariance->next.push_back(inverse.f[f].size() > 1 ? inverse.f[f][1]
-                                                                   : Eigen::Matrix<double, 6, 6>::Zero());
-            }
-        }
-        covariance->point = inverse.e;
-        if (options.odometry) {
-            covariance->wheel_sigma = std::sqrt(inverse.g(0, 0));
-        }
-        if (options.camera_prior) {
-            const Eigen::Index n = static_cast<Eigen::Index>(options.camera_prior->parameter.size());
-            covariance->camera = inverse.g.bottomRightCorner(n, n);
-        }
+        problem.widen(options.reach);
+        auto known = solver.covariance(problem, options.threads);
+        *covariance = BundleCovariance(std::move(solver), std::move(known));
     }
     problem.store(map);
     return report;
