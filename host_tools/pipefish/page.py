@@ -327,7 +327,8 @@ class Page:
         return [(heading, rows) for heading, rows in tables if rows]
 
 
-def _table(heading: str, rows: list[tuple[str, str]], folded: bool) -> str:
+def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False) -> str:
+    """A table of two columns under its heading; folded: a click opens it."""
     body = "".join(f"<tr><th scope='row'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows)
     table = f"<table>{body}</table>"
     if folded:
@@ -355,7 +356,7 @@ def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
     gallery = page.gallery()
     moving = animation(page.painter, ".webp", HERO_LIMIT, HERO_WIDTH, legend=False, quiet=quiet)
     tracks, device = page.charts_tracks(), page.charts_device()
-    tables = "".join(_table(heading, rows, len(rows) > 14) for heading, rows in page.tables())
+    tables = "".join(table_html(heading, rows, len(rows) > 14) for heading, rows in page.tables())
     values = {
         "still": gallery[len(gallery) // 2]["src"],
         "moving": data_uri(moving, "image/webp"),
