@@ -271,7 +271,7 @@ def measure(
         backwards=bool(ahead.sum() < 0),
         remarks=remarks,
     )
-    _scale(m, diameter, tell)
+    _scale(m, quality, diameter, tell)
     _fit_stretches(m, threads, tell)
     if not m.measured:
         reasons = sorted({s.tube.reason for s in m.stretches})
@@ -331,12 +331,13 @@ def _up(structure: Reconstruction) -> np.ndarray:
     return -structure.down if structure.down is not None else np.array([0.0, -1.0, 0.0])
 
 
-def _scale(m: Measurement, diameter: float | None, tell: Tell) -> None:
+def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
     """Brings the structure into metres, or into diameters of each stretch."""
     if m.structure.unit == "metre":
-        m.scale = Scale(
-            "encoder", "metre", float(m.structure.scale_sigma or 0.0), m.structure.wheel, m.structure.wheel_sigma
-        )
+        # The readings' random part does not average away over the stations: all of them stand on the same readings.
+        drift = quality.noise_m_per_sqrt_m / math.sqrt(max(m.structure.length, 1e-3))
+        sigma = math.hypot(m.structure.scale_sigma or 0.0, drift)
+        m.scale = Scale("encoder", "metre", sigma, m.structure.wheel, m.structure.wheel_sigma)
         return
     m.encoder = None  # of no use: too few of its steps could be used
     factors = []
