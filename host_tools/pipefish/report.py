@@ -127,7 +127,7 @@ def column(document: dict[str, Any], name: str) -> np.ndarray:
 
 def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
     """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
-    together: "passed", "failed", "undecided" (the interval holds the limit), "not measured"."""
+    together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""
     quantity, side, factor, unit = LIMITS[name]
     scale = document["summary"]
     if unit == "mm" and scale["unit"] != "metre":
@@ -146,8 +146,10 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
     shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
     outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
     known = np.isfinite(value)
-    state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
     missing = len(value) - int(known.sum())
+    state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
+    if state == "passed" and missing:
+        state = "passed where measured"
     more = f"; {missing} of {len(value)} stations have no value" if missing else ""
     return _verdict(name, bound, unit, state, shown + more)
 
@@ -504,7 +506,7 @@ class Report:
         """Points on the wall, residuals by angle, encoder against vision."""
         quality = self.document["quality"]
         bins = quality["residuals_by_angle"]
-        names = [f"{b['low_deg']:.0f} to {b['high_deg']:.0f}°" for b in bins]
+        names = [f"{b['low_deg']:.0f}-{b['high_deg']:.0f}°" for b in bins]
         charts: list[Chart] = [
             {
                 "id": "angle",
@@ -598,15 +600,12 @@ class Report:
         elif self.unit == "metre":
             tiles.append((f"{1000 * s['d_mean']:.1f}", "mm", "mean diameter, as given: not measured"))
         digits = 1 if self.unit == "metre" else 3
-        least, most = (f"{self.factor * s[k]:.{digits}f}" for k in ("d_mean_least", "d_mean_most"))
-        tiles.append((f"{least} to {most}", self.short, "mean diameter of the stations, least and most"))
         if "d_max" in s:
-            low, high = (f"{self.factor * s[k]:.{digits}f}" for k in ("d_min", "d_max"))
-            tiles.append((f"{low} to {high}", self.short, "narrowest and widest anywhere"))
+            tiles.append((f"{self.factor * s['d_min']:.{digits}f}", self.short, "narrowest anywhere"))
+            tiles.append((f"{self.factor * s['d_max']:.{digits}f}", self.short, "widest anywhere"))
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
-            tiles.append(
-                (f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {100 * s['ovality_mean']:.2f} %")
-            )
+            mean = 100 * s["ovality_mean"]
+            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {mean:.2f} %"))
         figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
         tiles.append(figure)
         return tiles
@@ -615,13 +614,13 @@ class Report:
         """The limits, passed or failed."""
         if not self.verdicts:
             return "<p class='muted'>No limits were given (<code>--limit ovality=5</code>).</p>"
-        words = {"passed": "passed", "failed": "FAILED", "undecided": "undecided", "not measured": "not measured"}
+        shown = [v | {"word": "FAILED" if v["state"] == "failed" else v["state"]} for v in self.verdicts]
         rows = "".join(
             f"<tr><th scope='row'>{html.escape(v['name'].replace('_', ' '))}</th>"
-            f"<td><span class='state {v['state'].replace(' ', '-')}'>{words[v['state']]}</span></td>"
+            f"<td><span class='state {v['state'].split()[0]}'>{v['word']}</span></td>"
             f"<td>{'at most' if LIMITS[v['name']][1] == 'most' else 'at least'} {v['bound']:g} {v['unit']}</td>"
             f"<td>worst: {html.escape(v['worst'])}</td></tr>"
-            for v in self.verdicts
+            for v in shown
         )
         note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
@@ -690,12 +689,15 @@ class Report:
             for g in d["not_measured"]
             if g["end"] is not None or g["start"] is None
         ]
+        digits = 1 if self.unit == "metre" else 3
+        least, most = (f"{self.factor * s[k]:.{digits}f}" for k in ("d_mean_least", "d_mean_most"))
         measured = [
             ("keyframes with a pose", f"{s['keyframes_with_pose']} of {s['keyframes']}"),
             ("left out: nothing had moved", str(len(structure["standing"]))),
             ("stretches", str(s["stretches"])),
             ("points", str(s["points"])),
             ("observations", str(structure["observations"])),
+            ("mean diameter of the stations", f"{least} to {most} {self.short}"),
             ("stations with diameter", f"{s['stations_measured']} of {s['stations']}"),
             ("stations with ovality", f"{s['stations_with_ovality']} of {s['stations']}"),
             ("residuals", f"{d['quality']['residual_rms_px']:.3f} px rms per coordinate"),
