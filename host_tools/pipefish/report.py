@@ -389,9 +389,12 @@ class Report:
                 "flatshading": False,
                 "lighting": {"ambient": 0.7, "diffuse": 0.5, "specular": 0.1},
                 "colorbar": {
-                    "title": {"text": f"radius - {self.factor * size / 2:.4g}, {self.short}", "side": "right"},
-                    "thickness": 12,
-                    "len": 0.7,
+                    "title": {"text": f"radius - {self.factor * size / 2:.4g}, {self.short}", "side": "top"},
+                    "orientation": "h",
+                    "thickness": 10,
+                    "len": 0.8,
+                    "y": 0,
+                    "yanchor": "bottom",
                 },
                 "hovertemplate": f"%{{intensity:.2f}} {self.short}<extra>wall</extra>",
             }
@@ -415,8 +418,6 @@ class Report:
         line = {"type": "scatter3d", "mode": "lines", "line": {"width": 4, "color": "#d8a012"}, "hoverinfo": "skip"}
         data.append({**line, "name": "camera", **at(np.vstack(rows))})
         data += self._marks(at)
-        ends = np.ptp(xyz.reshape(-1, 3), axis=0)
-        eye = np.array([1.0, -0.9, 0.6]) if ends[2] > ends[0] else np.array([-0.9, 1.0, 0.6])
         return {
             "id": "tube",
             "title": "The pipe in 3-D",
@@ -429,7 +430,7 @@ class Report:
                     "xaxis": {"title": {"text": ""}},
                     "yaxis": {"title": {"text": self.along_unit}},
                     "zaxis": {"title": {"text": ""}},
-                    "camera": {"eye": dict(zip("xyz", (eye * 0.9).tolist(), strict=True))},
+                    "camera": {"eye": {"x": 0.75, "y": -1.85, "z": 0.75}},  # along the pipe: fits tall and wide
                 },
                 "margin": {"l": 0, "r": 0, "t": 28, "b": 0},
                 "dragmode": "orbit",
