@@ -31,8 +31,9 @@ DISAGREE_SIGMA = 3.0
 # A tracker's stated covariance is that of one step's noise. Its errors along a track are a walk: in a simulated
 # concrete pipe 0.07 px after five camera frames, 0.17 after twenty, 0.37 after thirty, with a share that all tracks
 # have in common. A common 0.03 px a keyframe is a drift of the diameter of 10 % in 6 m where the stated 0.05 px
-# outvotes the encoder.
-TRACK_FLOOR_PX = 0.3
+# outvotes the encoder. Scatter of the diameter along that pipe by what is added: 0.3 px 1.2 %, 0.5 px 0.7 %,
+# 0.8 px 0.4 %, 1.2 px 0.25 %; then the encoder's own noise in short stretches takes over.
+TRACK_FLOOR_PX = 1.0
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
 
@@ -73,7 +74,8 @@ class Stretch:
 @dataclass
 class Residuals:
     """Of every observation of a point: position of its frame and of its point in the structure, item of the tracks,
-    (N,2) px, angle from the axis, and size over the stated noise."""
+    (N,2) px, angle from the axis, and size over OUTLIER_SIGMA's unit: the tracker's stated noise times `spread`, the
+    robust spread of the residuals over it."""
 
     frame: np.ndarray
     point: np.ndarray
@@ -81,6 +83,7 @@ class Residuals:
     pixels: np.ndarray
     theta: np.ndarray
     whitened: np.ndarray
+    spread: float
 
     @property
     def inlier(self) -> np.ndarray:
@@ -238,11 +241,11 @@ def measure(
     tracks = dataclasses.replace(
         tracks,
         frame=np.searchsorted(index, tracks.frame),  # missing keyframes take no number
-        covariance=tracks.covariance + TRACK_FLOOR_PX**2 * np.eye(2),
     )
+    weighed = dataclasses.replace(tracks, covariance=tracks.covariance + TRACK_FLOOR_PX**2 * np.eye(2))
     structure = _while_telling(
         lambda: reconstruct(
-            tracks,
+            weighed,
             camera,
             chainage,
             encoder=quality,
@@ -315,9 +318,9 @@ def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Res
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     square = yy * residual[:, 0] ** 2 - 2 * xy * residual[:, 0] * residual[:, 1] + xx * residual[:, 1] ** 2
     whitened = np.sqrt(np.maximum(0, square / determinant / 2))
-    spread = np.array(structure.sigma)[structure.segment[k]]
+    spread = float(np.median(whitened)) / math.sqrt(math.log(2))  # the median of a Rayleigh distribution
     theta = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
-    return Residuals(k, j, item, residual, theta, whitened / np.maximum(spread, 0.5))
+    return Residuals(k, j, item, residual, theta, whitened / max(spread, 0.5), spread)
 
 
 def _segment_path(m: Measurement, segment: int) -> np.ndarray:
@@ -518,7 +521,7 @@ def _remark(m: Measurement, diameter: float | None) -> None:
             f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
             "changes along the pipe, ovality and angles were."
         )
-    worst = max(m.structure.sigma)
+    worst = m.residuals.spread
     if worst > SIGMA_MOST:
         remarks.append(
             f"Residuals scatter {worst:.1f} times as far as the tracks' own noise: a wrong profile, a lens that "

@@ -226,6 +226,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
             "quality": {
                 "residuals_by_angle": trend(residuals, camera, m.tracks),
                 "residual_rms_px": float(np.sqrt(np.mean(residuals.pixels[residuals.inlier] ** 2))),
+                "residuals_over_noise": residuals.spread,
                 "observations": len(residuals.item),
                 "outliers": int((~residuals.inlier).sum()),
                 "encoder": encoder_against_vision(m),

@@ -702,7 +702,7 @@ class Report:
             ("stations with diameter", f"{s['stations_measured']} of {s['stations']}"),
             ("stations with ovality", f"{s['stations_with_ovality']} of {s['stations']}"),
             ("residuals", f"{d['quality']['residual_rms_px']:.3f} px rms per coordinate"),
-            ("residuals over stated noise", ", ".join(f"{v:.2f}" for v in structure["sigma"])),
+            ("residuals over the tracker's stated noise", f"{d['quality']['residuals_over_noise']:.2f}"),
             ("scale from", source),
             ("clock zero", d["clock_zero"]),
             ("nominal diameter", f"{1000 * s['nominal']:.0f} mm" if s["nominal"] else "unknown"),
