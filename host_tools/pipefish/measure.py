@@ -43,6 +43,7 @@ class Scale:
 
     source      "encoder", "diameter" (the given one: then no diameter has been measured), "none"
     unit        "metre", or "diameter": lengths are in mean diameters of their stretch
+    noise       random part of the encoder, metres over a square root of metres: it makes the scale wander
     sigma       relative, shared by all; 0 for a given diameter and without scale: there it is part of the definition
     wheel, wheel_sigma   (true distance over the encoder's) - 1 as estimated; None without an encoder
     check       a given diameter beside an encoder: given, measured, sigma, deviation (in sigmas), consistent
@@ -51,6 +52,7 @@ class Scale:
     source: str
     unit: str
     sigma: float
+    noise: float = 0.0
     wheel: float | None = None
     wheel_sigma: float | None = None
     check: dict[str, Any] | None = None
@@ -284,7 +286,7 @@ def measure(
             f"no pipe around them: {'; '.join(reasons)}"
         )
     m.camera_sigma = _camera_sigma(m)
-    _add_systematic(m)
+    _widen(m)
     _check_diameter(m, diameter)
     _remark(m, diameter)
     return m
@@ -337,10 +339,9 @@ def _up(structure: Reconstruction) -> np.ndarray:
 def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
     """Brings the structure into metres, or into diameters of each stretch."""
     if m.structure.unit == "metre":
-        # The readings' random part does not average away over the stations: all of them stand on the same readings.
-        drift = quality.noise_m_per_sqrt_m / math.sqrt(max(m.structure.length, 1e-3))
-        sigma = math.hypot(m.structure.scale_sigma or 0.0, drift)
-        m.scale = Scale("encoder", "metre", sigma, m.structure.wheel, m.structure.wheel_sigma)
+        sigma = float(m.structure.scale_sigma or 0.0)
+        noise = quality.noise_m_per_sqrt_m
+        m.scale = Scale("encoder", "metre", sigma, noise, m.structure.wheel, m.structure.wheel_sigma)
         return
     m.encoder = None  # of no use: too few of its steps could be used
     factors = []
@@ -445,9 +446,17 @@ def _camera_sigma(m: Measurement) -> float | None:
     return float(np.median(np.concatenate(ratios)))
 
 
-def _add_systematic(m: Measurement) -> None:
+def _widen(m: Measurement) -> None:
+    """Adds to the stations' sigmas what the tube, which takes its points' errors as their own, cannot know: the camera
+    (systematic), and the wander of the scale (random): over a diameter it is known as well as the encoder tells it. An
+    upper bound: vision ties a little more than that together."""
     for stretch in m.measured:
         stations = stretch.tube.stations
+        local = m.scale.noise / math.sqrt(stretch.tube.summary["d_mean"])
+        for name in ("d_mean", "d_area", "d_max", "d_min", "circumference"):
+            stations[name + "_sigma"] = np.hypot(stations[name + "_sigma"], local * stations[name])
+        if stretch.tube.nominal:
+            stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
         for name in [n for n in stations if n.endswith("_systematic")]:
             stations[name] = m.systematic * stations[name.removesuffix("_systematic")]
 
@@ -459,7 +468,8 @@ def mean_diameter(m: Measurement) -> tuple[float, float]:
     weight /= weight.sum()
     value = float(sum(w * t.summary["d_mean"] for w, t in zip(weight, tubes, strict=True)))
     sigma = math.sqrt(sum((w * t.summary["d_mean_sigma"]) ** 2 for w, t in zip(weight, tubes, strict=True)))
-    return value, sigma
+    wander = m.scale.noise / math.sqrt(max(m.structure.length, 1e-3))
+    return value, math.hypot(sigma, wander * value)
 
 
 def _check_diameter(m: Measurement, diameter: float | None) -> None:
