@@ -535,6 +535,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     add_tube(commands)
 
+    from pipefish.cli_reconstruct import add_reconstruct
+
+    add_reconstruct(commands)
+
     p = add_command(
         commands,
         "flash",

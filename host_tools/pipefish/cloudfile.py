@@ -49,6 +49,15 @@ def read_points(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | 
     return points, None if sigma is None else np.asarray(sigma, float)
 
 
+def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """All properties of a PLY file's vertices, (N,) by name. Raises FormatError, OSError."""
+    file = Path(path)
+    try:
+        return _read_ply(file, file.read_bytes())
+    except OSError as error:
+        raise file_error(error, file) from error
+
+
 def _read_npy(file: Path) -> dict[str, np.ndarray]:
     try:
         array = np.load(file, allow_pickle=False)

@@ -320,14 +320,16 @@ class Page:
                 ("frames dropped by the camera", str(status.frames_dropped)),
                 ("keyframes that could not be stored", str(status.keyframes_dropped)),
             ]
-        tables = [("Survey", survey), ("Link", link), ("Gaps and breaks", breaks)]
+        measured = [(name, str(value)) for name, value in self.extra.get("measured_rows", [])]
+        tables = [("The pipe, measured", measured), ("Survey", survey), ("Link", link), ("Gaps and breaks", breaks)]
         if start is not None and start.config:
             settings = [tuple(part.strip() for part in line.partition("=")[::2]) for line in start.config]
             tables.append(("Settings of the device", settings))
         return [(heading, rows) for heading, rows in tables if rows]
 
 
-def _table(heading: str, rows: list[tuple[str, str]], folded: bool) -> str:
+def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False) -> str:
+    """A table of two columns under its heading; folded: a click opens it."""
     body = "".join(f"<tr><th scope='row'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows)
     table = f"<table>{body}</table>"
     if folded:
@@ -355,7 +357,7 @@ def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
     gallery = page.gallery()
     moving = animation(page.painter, ".webp", HERO_LIMIT, HERO_WIDTH, legend=False, quiet=quiet)
     tracks, device = page.charts_tracks(), page.charts_device()
-    tables = "".join(_table(heading, rows, len(rows) > 14) for heading, rows in page.tables())
+    tables = "".join(table_html(heading, rows, len(rows) > 14) for heading, rows in page.tables())
     values = {
         "still": gallery[len(gallery) // 2]["src"],
         "moving": data_uri(moving, "image/webp"),
@@ -368,9 +370,10 @@ def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
         "device": "".join(map(chart_html, device)),
         "tables": tables,
     }
-    return whole_page(
-        "Pipefish survey", title, lead, fill("page.html", values), [*tracks, *device], page.tiles(), gallery=gallery
-    )
+    main = fill("page.html", values)
+    if page.extra.get("report"):
+        main = fill("report_link.html", {"address": html.escape(page.extra["report"], quote=True)}) + main
+    return whole_page("Pipefish survey", title, lead, main, [*tracks, *device], page.tiles(), gallery=gallery)
 
 
 def whole_page(
@@ -446,7 +449,8 @@ def write_page(
     """Writes the page atomically; returns its size in bytes.
 
     evaluation  of pipefish.evaluate, where the truth is known
-    extra       goodput_bytes_per_s, link_rows: list of (name, value)
+    extra       goodput_bytes_per_s; link_rows, measured_rows: lists of (name, value); report: address of a report that
+                is linked to, relative to this page
     Raises PipefishError if the survey has no keyframes; OSError.
     """
     data = render(Page(survey, evaluation, extra or {}), title, lead, quiet).encode()

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from mcap.records import Channel, Message, Metadata
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.errors import FormatError
+from pipefish.errors import ArgumentError, FormatError
 from pipefish.mcapscan import Damage, McapScan, read_chunk
 from pipefish.scene import STATES, frames_in, losses_of
 
@@ -157,30 +157,56 @@ class Keyframe:
 
 @dataclass
 class Tracks:
-    """All observations of a survey, sorted by track, then frame.
+    """Observations of tracks in frames. Arrays are copied, and sorted by track, then frame.
 
-    frame       (N,) int64 index of the keyframe
-    track       (N,) int64, 0..K-1, unique over all boots of the survey
+    frame       (N,) int64 index of the frame (of a survey: of the keyframe), from 0
+    track       (N,) int64, of a survey 0..K-1, unique over all its boots; otherwise any numbers
     pixels      (N,2) float64
-    covariance  (N,2,2) float64 px^2
+    covariance  (N,2,2) float64 px^2, or None where it is not known
     age         (N,) int64 frames since detection, at this observation
     quality     (N,) float64 similarity with the frame before, 0..1; 0 when new
     boot, id    (K,) uint64 boot id and (K,) int64 id on the device, of each track
+
+    The last four are there for the tracks of a survey. Raises ArgumentError for arrays of wrong shapes.
     """
 
     frame: np.ndarray
     track: np.ndarray
     pixels: np.ndarray
-    covariance: np.ndarray
-    age: np.ndarray
-    quality: np.ndarray
-    boot: np.ndarray
-    id: np.ndarray
+    covariance: np.ndarray | None = None
+    age: np.ndarray | None = None
+    quality: np.ndarray | None = None
+    boot: np.ndarray | None = None
+    id: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("frame", "track"):
+            given = np.asarray(getattr(self, name))
+            if given.ndim != 1 or (given.dtype.kind not in "iu" and given.size):
+                raise ArgumentError(f"{name}: expected (N,) integers, got {given.dtype} of shape {given.shape}")
+            setattr(self, name, given.astype(np.int64))
+        count = len(self.frame)
+        self.pixels = np.array(self.pixels, dtype=np.float64)
+        shapes = {"track": (count,), "pixels": (count, 2)}
+        if self.covariance is not None:
+            self.covariance = np.array(self.covariance, dtype=np.float64)
+            shapes["covariance"] = (count, 2, 2)
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ArgumentError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
+        if count and self.frame.min() < 0:
+            raise ArgumentError(f"frame: {self.frame.min()} is negative")
+        order = np.lexsort((self.frame, self.track))
+        if (np.diff(order) < 0).any():
+            for name in ("frame", "track", "pixels", "covariance", "age", "quality"):
+                if getattr(self, name) is not None:
+                    setattr(self, name, getattr(self, name)[order])
 
     @cached_property
     def bounds(self) -> np.ndarray:
-        """(K+1,) int64: track k owns the items bounds[k]..bounds[k+1]-1."""
-        return np.searchsorted(self.track, np.arange(len(self.id) + 1))
+        """(K+1,) int64: track k of a survey owns the items bounds[k]..bounds[k+1]-1."""
+        count = int(self.track[-1]) + 1 if len(self.track) else 0
+        return np.searchsorted(self.track, np.arange(count + 1))
 
     @property
     def length_frames(self) -> np.ndarray:

@@ -26,7 +26,7 @@ def run_program(*command: Path) -> list[dict]:
     """Runs one benchmark program and returns its figures."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise SystemExit(f"{command[-1].name} failed with exit code {done.returncode}: {done.stderr.strip()}")
+        raise SystemExit(f"{command[0]} {command[-1]} failed with exit code {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
 
@@ -50,7 +50,19 @@ def bench_camera() -> list[dict]:
     return [figure for python in PEERS.values() if python.exists() for figure in run_program(python, script, library)]
 
 
-PYTHON_ROOMS = {"calib": room_calib.measure, "camera": bench_camera, "sim": bench_sim, "track": room_track.measure}
+def bench_recon() -> list[dict]:
+    """recon.two_view beside PoseLib, both in one process."""
+    peers = PEERS["pip"].parents[1] / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
+    return run_program(sys.executable, ROOT / "tests" / "bench" / "recon_peers.py", peers) if peers.exists() else []
+
+
+PYTHON_ROOMS = {
+    "calib": room_calib.measure,
+    "camera": bench_camera,
+    "recon": bench_recon,
+    "sim": bench_sim,
+    "track": room_track.measure,
+}
 
 
 def cpu_name() -> str:

@@ -233,6 +233,38 @@ void test_covariance_equals_dense_inverse()
     }
 }
 
+// Proves: the covariance of linear functions of several e blocks is that of the dense inverse, correlations included,
+// where the blocks lie within the band.
+void test_covariance_of_functions_equals_dense_inverse()
+{
+    Toy toy(4);
+    LeastSquares<E, F> solver;
+    solver.minimize(toy);
+    const auto covariance = solver.covariance(toy);
+    Eigen::MatrixXd a;
+    Eigen::VectorXd r;
+    toy.dense(a, r);
+    const Eigen::MatrixXd expected = (a.transpose() * a).inverse();
+    int compared = 0;
+    for (int e = 0; e + 1 < POINTS; e++) {
+        const auto first = toy.couplings(e), second = toy.couplings(e + 1);
+        const int low = std::min(first.front(), second.front()), high = std::max(first.back(), second.back());
+        if (static_cast<size_t>(high - low) >= covariance.f.back().size()) {
+            continue;
+        }
+        compared++;
+        const int blocks[2] = {e, e + 1};
+        std::vector<LeastSquares<E, F>::MatrixEG> rows(2, Eigen::MatrixXd::Random(E, 3));
+        rows[1].setRandom();
+        Eigen::MatrixXd whole = Eigen::MatrixXd::Zero(expected.rows(), 3);
+        whole.middleRows(e * E, E) = rows[0];
+        whole.middleRows((e + 1) * E, E) = rows[1];
+        const Eigen::MatrixXd error = solver.functions(covariance, blocks, rows) - whole.transpose() * expected * whole;
+        TEST_ASSERT_TRUE(error.cwiseAbs().maxCoeff() < 1e-9 * expected.cwiseAbs().maxCoeff());
+    }
+    TEST_ASSERT_TRUE(compared > 0);
+}
+
 // Proves: a curved, robust problem ends where the dense gradient vanishes, and never above where it began.
 void test_curved_robust_problem_ends_at_a_stationary_point()
 {
@@ -314,6 +346,7 @@ int main()
     UNITY_BEGIN();
     RUN_TEST(test_linear_problem_equals_dense_least_squares);
     RUN_TEST(test_covariance_equals_dense_inverse);
+    RUN_TEST(test_covariance_of_functions_equals_dense_inverse);
     RUN_TEST(test_curved_robust_problem_ends_at_a_stationary_point);
     RUN_TEST(test_threads_do_not_change_a_bit);
     RUN_TEST(test_undetermined_parameter_is_refused_a_covariance);

@@ -1,5 +1,5 @@
-// Robust losses of a whitened squared residual s: rho(s) with rho(0) = 0 and rho'(0) = 1, so that small residuals count
-// as in least squares. Used with the weight rho' (iteratively reweighted least squares).
+// Robust losses of a whitened squared residual s: rho(s) with rho(0) = 0 and rho'(0) = 1 (nearly, for a mixture), so
+// that small residuals count as in least squares. Used with the weight rho' (iteratively reweighted least squares).
 #pragma once
 
 #include <cmath>
@@ -8,9 +8,15 @@ namespace pipefish::optim
 {
 
 struct RobustLoss {
-    enum class Kind { squared, huber, cauchy };
+    enum class Kind {
+        squared,
+        huber,
+        cauchy,
+        mixture, // normal, but a share of them with `scale` times the spread: what slips
+    };
     Kind kind = Kind::squared;
     double scale = 1.0; // in standard deviations: where the loss starts to bend
+    double share = 0.0; // of the wide part of a mixture
 
     struct Value {
         double rho, weight;
@@ -29,6 +35,12 @@ struct RobustLoss {
         }
         case Kind::cauchy:
             return {c2 * std::log1p(s / c2), 1.0 / (1.0 + s / c2)};
+        case Kind::mixture: {
+            // rho = -2 log of the density, less its value at 0; the weight is its derivative.
+            const double wide = share / scale, narrow = (1.0 - share) * std::exp(-0.5 * s);
+            const double broad = wide * std::exp(-0.5 * s / c2), sum = narrow + broad;
+            return {-2.0 * std::log(sum / (1.0 - share + wide)), (narrow + broad / c2) / sum};
+        }
         default:
             return {s, 1.0};
         }

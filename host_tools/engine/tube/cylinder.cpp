@@ -1,7 +1,7 @@
 #include "tube/cylinder.hpp"
 
+#include "counter_random.hpp"
 #include "optim/least_squares.hpp"
-#include "sim/random.hpp"
 #include "tube/section.hpp"
 
 #include <Eigen/Geometry>
@@ -276,8 +276,8 @@ Candidate best_circle(const Eigen::Matrix3Xd &points, const Vector3d &axis, cons
     const Eigen::Matrix2Xd flat = cylinder.basis.transpose() * (points.colwise() - start.centre);
     const uint64_t n = static_cast<uint64_t>(flat.cols());
     for (int i = 0; i < SAMPLES; i++) {
-        const uint64_t bits = sim::hash64(1, stream, static_cast<uint64_t>(i));
-        const auto pick = [&](uint64_t k) { return static_cast<Eigen::Index>(sim::mix64(bits + k) % n); };
+        const uint64_t bits = hash64(1, stream, static_cast<uint64_t>(i));
+        const auto pick = [&](uint64_t k) { return static_cast<Eigen::Index>(mix64(bits + k) % n); };
         Circle circle;
         if (!circle_through(flat.col(pick(0)), flat.col(pick(1)), flat.col(pick(2)), circle) ||
             circle.radius < 0.4 * start.rho || circle.radius > 2.5 * start.rho) {

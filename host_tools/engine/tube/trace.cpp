@@ -1,7 +1,7 @@
 #include "tube/trace.hpp"
 
+#include "counter_random.hpp"
 #include "parallel.hpp"
-#include "sim/random.hpp"
 #include "tube/nearest.hpp"
 
 #include <Eigen/Eigenvalues>
@@ -37,7 +37,7 @@ std::vector<int> thinned(const std::vector<int> &all, int count, uint64_t stream
     for (int i = 0; i < count; i++) { // one of each of `count` equal runs
         const size_t from = all.size() * static_cast<size_t>(i) / static_cast<size_t>(count);
         const size_t to = all.size() * static_cast<size_t>(i + 1) / static_cast<size_t>(count);
-        out.push_back(all[from + sim::hash64(2, stream, static_cast<uint64_t>(i)) % (to - from)]);
+        out.push_back(all[from + hash64(2, stream, static_cast<uint64_t>(i)) % (to - from)]);
     }
     return out;
 }
@@ -138,8 +138,8 @@ Found look(const Cloud &cloud, const std::vector<int> &around, uint64_t stream)
     const std::vector<Vector3d> normal = normals_of(points);
     const uint64_t n = normal.size();
     for (uint64_t i = 0; i < HYPOTHESES; i++) {
-        const uint64_t bits = sim::hash64(3, stream, i);
-        const size_t a = sim::mix64(bits) % n, b = sim::mix64(bits + 1) % n;
+        const uint64_t bits = hash64(3, stream, i);
+        const size_t a = mix64(bits) % n, b = mix64(bits + 1) % n;
         Cylinder c;
         if (a != b && cylinder_through(points.col(static_cast<Eigen::Index>(a)), normal[a],
                                        points.col(static_cast<Eigen::Index>(b)), normal[b], c)) {
@@ -219,7 +219,7 @@ Cylinder find_cylinder(const Cloud &cloud, int threads)
             }
         } else {
             const auto at =
-                static_cast<Eigen::Index>(sim::hash64(4, static_cast<uint64_t>(place), 0) % static_cast<uint64_t>(n));
+                static_cast<Eigen::Index>(hash64(4, static_cast<uint64_t>(place), 0) % static_cast<uint64_t>(n));
             around = nearest_many(cloud.points, cloud.points.col(at), size);
         }
         found[static_cast<size_t>(job)] = look(cloud, around, static_cast<uint64_t>(job));

@@ -1,0 +1,327 @@
+// Two views and whole reconstructions for Python; pipefish.twoview.py and pipefish/structure.py check the arguments.
+#include "geometry/minimal.hpp"
+#include "geometry/two_view.hpp"
+#include "pipefish/profile.h"
+#include "sfm/reconstruct.hpp"
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <array>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace nb = nanobind;
+namespace geometry = pipefish::geometry;
+namespace sfm = pipefish::sfm;
+
+void bind_sfm(nb::module_ &m);
+
+namespace
+{
+
+using Pixels = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Triples = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const int, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Values = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Square = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Jacobians = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using Covariances = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
+
+template <typename T, typename In> nb::object to_numpy(const In *data, std::initializer_list<size_t> shape)
+{
+    size_t n = 1;
+    for (const size_t s : shape) {
+        n *= s;
+    }
+    auto kept = std::make_unique<T[]>(n);
+    std::copy(data, data + n, kept.get());
+    T *raw = kept.get();
+    const nb::capsule owner(kept.release(), [](void *p) noexcept { delete[] static_cast<T *>(p); });
+    return nb::cast(nb::ndarray<nb::numpy, T>(raw, shape, owner));
+}
+
+template <typename Derived> nb::object matrix_to_numpy(const Eigen::MatrixBase<Derived> &m)
+{
+    const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> rows = m;
+    return to_numpy<double>(rows.data(), {static_cast<size_t>(rows.rows()), static_cast<size_t>(rows.cols())});
+}
+
+const char *status_name(geometry::TwoViewStatus status)
+{
+    switch (status) {
+    case geometry::TwoViewStatus::ok:
+        return "ok";
+    case geometry::TwoViewStatus::plane:
+        return "plane";
+    case geometry::TwoViewStatus::no_baseline:
+        return "no_baseline";
+    case geometry::TwoViewStatus::behind:
+        return "behind";
+    default:
+        return "too_few";
+    }
+}
+
+nb::dict two_view(const pf_profile &first, const pf_profile &second, const Pixels &uv1, const Pixels &uv2,
+                  const std::optional<Covariances> &covariance1, const std::optional<Covariances> &covariance2,
+                  double sigma, uint64_t seed)
+{
+    geometry::TwoView found;
+    {
+        const nb::gil_scoped_release release;
+        const auto sights = [sigma](const pf_profile &profile, const Pixels &uv, const std::optional<Covariances> &c) {
+            return geometry::make_sights(profile.camera, uv.shape(0), uv.data(), c ? c->data() : nullptr, sigma);
+        };
+        geometry::TwoViewOptions options;
+        options.seed = seed;
+        found = geometry::two_view(sights(first, uv1, covariance1), sights(second, uv2, covariance2), options);
+    }
+    nb::dict out;
+    out["status"] = status_name(found.status);
+    out["rotation"] = matrix_to_numpy(found.pose.r);
+    out["direction"] = to_numpy<double>(found.pose.t.data(), {3});
+    out["inlier"] = to_numpy<bool>(found.inlier.data(), {found.inlier.size()});
+    out["iterations"] = found.iterations;
+    out["sigma"] = found.sigma;
+    out["median_parallax"] = found.median_parallax;
+    out["sextants"] = found.sextants;
+    out["off_axis"] = found.off_axis;
+    Eigen::Matrix<double, 6, 5> spread = Eigen::Matrix<double, 6, 5>::Zero();
+    spread.topLeftCorner<3, 3>().setIdentity();
+    spread.bottomRightCorner<3, 2>() = found.direction_basis;
+    out["covariance"] = matrix_to_numpy(spread * found.covariance * spread.transpose());
+    return out;
+}
+
+template <size_t N> std::array<geometry::Vector3d, N> vectors(const Triples &rows)
+{
+    if (rows.shape(0) != N) {
+        throw nb::value_error("wrong number of vectors");
+    }
+    std::array<geometry::Vector3d, N> out;
+    for (size_t i = 0; i < N; i++) {
+        out[i] = {rows.data()[3 * i], rows.data()[3 * i + 1], rows.data()[3 * i + 2]};
+    }
+    return out;
+}
+
+nb::object sampson_squared(const pf_profile &profile, const Matrix34 &pose, const Pixels &uv1, const Pixels &uv2,
+                           double sigma)
+{
+    const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(pose.data());
+    const geometry::Pose relative{m.leftCols<3>(), m.col(3)};
+    const size_t n = std::min(uv1.shape(0), uv2.shape(0));
+    const auto a = geometry::make_sights(profile.camera, n, uv1.data(), nullptr, sigma);
+    const auto b = geometry::make_sights(profile.camera, n, uv2.data(), nullptr, sigma);
+    std::vector<double> out(n);
+    for (size_t i = 0; i < n; i++) {
+        out[i] = geometry::sampson_squared(relative, a[i], b[i]);
+    }
+    return to_numpy<double>(out.data(), {n});
+}
+
+// (m,m) covariance of m linear functions of points: jacobian (m, n, 3) of points (n,).
+nb::object functions(const sfm::BundleCovariance &covariance, const Indices &points, const Jacobians &jacobian)
+{
+    const size_t m = jacobian.shape(0), n = points.shape(0);
+    if (jacobian.shape(1) != n) {
+        throw nb::value_error("jacobian: not one column for each point");
+    }
+    std::vector<sfm::BundleCovariance::Solver::MatrixEG> a(n);
+    for (size_t k = 0; k < n; k++) {
+        if (points.data()[k] < 0 || static_cast<size_t>(points.data()[k]) >= covariance.points().size()) {
+            throw nb::value_error("points: no such point");
+        }
+        a[k].resize(3, static_cast<Eigen::Index>(m));
+        for (size_t row = 0; row < m; row++) {
+            const double *from = jacobian.data() + 3 * (row * n + k);
+            a[k].col(static_cast<Eigen::Index>(row)) << from[0], from[1], from[2];
+        }
+    }
+    return matrix_to_numpy(covariance.functions({points.data(), n}, a));
+}
+
+nb::object pose_covariances(const sfm::BundleCovariance &covariance)
+{
+    std::vector<double> flat;
+    for (size_t f = 0; f < covariance.frames(); f++) { // symmetric: the order of storage does not matter
+        flat.insert(flat.end(), covariance.pose(f).data(), covariance.pose(f).data() + 36);
+    }
+    return to_numpy<double>(flat.data(), {covariance.frames(), 6, 6});
+}
+
+nb::object point_covariances(const sfm::BundleCovariance &covariance)
+{
+    std::vector<double> flat;
+    for (const geometry::Matrix3d &m : covariance.points()) {
+        flat.insert(flat.end(), m.data(), m.data() + 9);
+    }
+    return to_numpy<double>(flat.data(), {covariance.points().size(), 3, 3});
+}
+
+nb::dict segment_dict(sfm::Segment &segment)
+{
+    nb::dict out;
+    const sfm::Submap &map = segment.map;
+    std::vector<double> poses, points;
+    for (const geometry::Pose &pose : map.poses) {
+        for (Eigen::Index row = 0; row < 3; row++) {
+            poses.insert(poses.end(), {pose.r(row, 0), pose.r(row, 1), pose.r(row, 2), pose.t[row]});
+        }
+    }
+    for (const geometry::Vector3d &x : map.points) {
+        points.insert(points.end(), x.data(), x.data() + 3);
+    }
+    out["first"] = map.first;
+    out["poses"] = to_numpy<double>(poses.data(), {map.poses.size(), 3, 4});
+    out["points"] = to_numpy<double>(points.data(), {map.points.size(), 3});
+    out["tracks"] = to_numpy<int>(map.tracks.data(), {map.tracks.size()});
+    const bool uncertain = !segment.total.empty();
+    out["random"] = nb::cast(std::move(segment.random));
+    out["total"] = uncertain ? nb::cast(std::move(segment.total)) : nb::object(nb::none());
+    out["metric"] = segment.metric;
+    out["sigma"] = segment.sigma;
+    out["scale_sigma"] = segment.scale_sigma;
+    out["variance_factor"] = segment.report.variance_factor;
+    out["observations"] = segment.report.observations;
+    out["cost"] = segment.report.summary.final_cost;
+    out["iterations"] = segment.report.summary.iterations;
+    out["converged"] = segment.report.summary.status == pipefish::optim::Status::converged;
+    out["wheel"] = segment.report.wheel;
+    out["down"] = to_numpy<double>(segment.report.down.data(), {3});
+    out["camera"] = to_numpy<double>(segment.report.camera.data(), {static_cast<size_t>(segment.report.camera.size())});
+    return out;
+}
+
+struct Extras { // what may be known beside the tracks
+    sfm::Odometry odometry;
+    sfm::Gravity gravity;
+    sfm::CameraPrior camera;
+};
+
+nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const Indices &frame, const Indices &track,
+                     const Pixels &uv, const std::optional<Covariances> &covariance, double sigma,
+                     const std::string &method, uint64_t seed, int threads, double still,
+                     const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
+                     const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
+                     const std::optional<Square> &uncertainty)
+{
+    Extras extras;
+    sfm::ReconstructOptions options;
+    options.method = method == "incremental" ? sfm::Method::incremental : sfm::Method::hierarchical;
+    options.limits.seed = seed;
+    options.threads = threads;
+    options.still = still;
+    if (step && step_sigma) {
+        extras.odometry.step.assign(step->data(), step->data() + step->shape(0));
+        extras.odometry.sigma.assign(step_sigma->data(), step_sigma->data() + step_sigma->shape(0));
+        extras.odometry.scale_sigma = scale_sigma;
+        options.odometry = &extras.odometry;
+    }
+    if (down) {
+        for (size_t i = 0; i < down->shape(0); i++) {
+            extras.gravity.down.emplace_back(down->data()[3 * i], down->data()[3 * i + 1], down->data()[3 * i + 2]);
+        }
+        extras.gravity.sigma = down_sigma;
+        options.gravity = &extras.gravity;
+    }
+    if (uncertainty) {
+        const Eigen::Index n = static_cast<Eigen::Index>(uncertain.size());
+        extras.camera.parameter = uncertain;
+        extras.camera.covariance = Eigen::Map<const Eigen::MatrixXd>(uncertainty->data(), n, n);
+        options.camera_prior = &extras.camera;
+    }
+    sfm::Reconstruction found;
+    int outside = 0, repeated = 0;
+    {
+        const nb::gil_scoped_release release;
+        const sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
+                                    {track.data(), track.shape(0)}, uv.data(),
+                                    covariance ? covariance->data() : nullptr, sigma);
+        outside = table.outside();
+        repeated = table.repeated();
+        found = sfm::reconstruct(table, profile.camera, options);
+    }
+    nb::dict out;
+    nb::list segments, gaps;
+    for (sfm::Segment &segment : found.segments) {
+        segments.append(segment_dict(segment));
+    }
+    for (const sfm::Gap &gap : found.gaps) {
+        gaps.append(nb::make_tuple(gap.from, gap.to, sfm::trouble_name(gap.trouble), gap.common));
+    }
+    out["frames"] = to_numpy<int>(found.frames.data(), {found.frames.size()});
+    out["segments"] = segments;
+    out["gaps"] = gaps;
+    out["outside"] = outside;
+    out["repeated"] = repeated;
+    return out;
+}
+
+} // namespace
+
+void bind_sfm(nb::module_ &m)
+{
+    m.def("two_view", &two_view, nb::arg("first"), nb::arg("second"), nb::arg("uv1").noconvert(),
+          nb::arg("uv2").noconvert(), nb::arg("covariance1").noconvert().none(),
+          nb::arg("covariance2").noconvert().none(), nb::arg("sigma"), nb::arg("seed"),
+          "Relative pose of two views; see pipefish.twoview.");
+    nb::class_<sfm::BundleCovariance>(m, "BundleCovariance", "Covariance of an adjustment, correlations kept.")
+        .def_prop_ro("pose", &pose_covariances, "(K,6,6): rotation on the left, centre.")
+        .def_prop_ro("point", &point_covariances, "(N,3,3)")
+        .def_prop_ro(
+            "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); },
+            "Of wheel, gravity (2) and camera, those that were estimated.")
+        .def("functions", &functions, nb::arg("points").noconvert(), nb::arg("jacobian").noconvert(),
+             "(m,m) covariance of m linear functions of points (n,) int32: jacobian (m,n,3).");
+    m.def("reconstruct", &reconstruct, nb::arg("camera"), nb::arg("frames"), nb::arg("tracks"),
+          nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(),
+          nb::arg("covariance").noconvert().none(), nb::arg("sigma"), nb::arg("method"), nb::arg("seed"),
+          nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
+          nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
+          nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(),
+          "Poses and points from tracks; see pipefish.structure.");
+    m.def("sampson_squared", &sampson_squared, nb::arg("camera"), nb::arg("pose").noconvert(),
+          nb::arg("uv1").noconvert(), nb::arg("uv2").noconvert(), nb::arg("sigma"),
+          "Squared Sampson distances (N,) of pairs of pixels with noise sigma under cam2_from_cam1 (3,4).");
+    m.def(
+        "five_point",
+        [](const Triples &f1, const Triples &f2) {
+            std::vector<nb::object> out;
+            for (const geometry::Matrix3d &e : geometry::five_point(vectors<5>(f1), vectors<5>(f2))) {
+                out.push_back(matrix_to_numpy(e));
+            }
+            return out;
+        },
+        nb::arg("f1").noconvert(), nb::arg("f2").noconvert(), "Essential matrices of five pairs of unit rays (5,3).");
+    m.def(
+        "three_point",
+        [](const Triples &f, const Triples &x) {
+            std::vector<nb::object> out;
+            for (const geometry::Pose &pose : geometry::three_point(vectors<3>(f), vectors<3>(x))) {
+                Eigen::Matrix<double, 3, 4> m34;
+                m34 << pose.r, pose.t;
+                out.push_back(matrix_to_numpy(m34));
+            }
+            return out;
+        },
+        nb::arg("f").noconvert(), nb::arg("x").noconvert(), "Poses (3,4) of three unit rays to three points (3,3).");
+    m.def(
+        "ray_angles_squared",
+        [](const Triples &essential, const Triples &f1, const Triples &f2) {
+            const auto rows = vectors<3>(essential);
+            geometry::Matrix3d e;
+            e << rows[0].transpose(), rows[1].transpose(), rows[2].transpose();
+            return geometry::ray_angles_squared(e, vectors<1>(f1)[0], vectors<1>(f2)[0]);
+        },
+        nb::arg("essential").noconvert(), nb::arg("f1").noconvert(), nb::arg("f2").noconvert(),
+        "Least sum of squared sines by which two unit rays (1,3) turn to meet.");
+}

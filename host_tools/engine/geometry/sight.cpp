@@ -1,0 +1,64 @@
+#include "geometry/sight.hpp"
+
+#include <Eigen/SVD>
+
+#include <cmath>
+
+namespace pipefish::geometry
+{
+
+std::vector<Sight> make_sights(const pf_camera &camera, size_t n, const double *uv, const double *covariance,
+                               double sigma)
+{
+    std::vector<Sight> sights(n);
+    for (size_t i = 0; i < n; i++) {
+        Sight &sight = sights[i];
+        sight.uv = {uv[2 * i], uv[2 * i + 1]};
+        Eigen::Matrix<double, 3, 2, Eigen::RowMajor> d_ray;
+        if (pf_camera_unproject(&camera, sight.uv.data(), sight.ray.data(), sight.origin.data(), d_ray.data()) !=
+            PF_OK) {
+            continue;
+        }
+        sight.root = sigma * Eigen::Matrix2d::Identity();
+        if (covariance) {
+            const double *s = covariance + 4 * i;
+            const double a = std::sqrt(s[0]), b = 0.5 * (s[1] + s[2]) / a, c = std::sqrt(s[3] - b * b);
+            sight.root << a, 0, b, c;
+        }
+        sight.b = d_ray * sight.root;
+        sight.valid = sight.b.allFinite() && sight.root(0, 0) > 0.0 && sight.root(1, 1) > 0.0;
+    }
+    return sights;
+}
+
+Matrix3d rotation_exp(const Vector3d &w)
+{
+    const double s = w.squaredNorm(), angle = std::sqrt(s);
+    const Matrix3d k = cross_matrix(w);
+    const double a = s < 1e-8 ? 1.0 - s / 6.0 : std::sin(angle) / angle;
+    const double b = s < 1e-8 ? 0.5 - s / 24.0 : (1.0 - std::cos(angle)) / s;
+    return Matrix3d::Identity() + a * k + b * k * k;
+}
+
+Vector3d rotation_log(const Matrix3d &r)
+{
+    const Eigen::AngleAxisd turn(r);
+    return turn.angle() * turn.axis();
+}
+
+Matrix3d nearest_rotation(const Matrix3d &m)
+{
+    const Eigen::JacobiSVD<Matrix3d> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
+    const double sign = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0.0 ? -1.0 : 1.0;
+    return svd.matrixU() * Vector3d(1.0, 1.0, sign).asDiagonal() * svd.matrixV().transpose();
+}
+
+Matrix32 tangent_basis(const Vector3d &f)
+{
+    Matrix32 basis;
+    basis.col(0) = f.unitOrthogonal();
+    basis.col(1) = f.cross(basis.col(0));
+    return basis;
+}
+
+} // namespace pipefish::geometry

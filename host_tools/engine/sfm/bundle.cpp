@@ -1,0 +1,456 @@
+#include "sfm/bundle.hpp"
+
+#include <Eigen/Cholesky>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+
+namespace pipefish::sfm
+{
+
+namespace
+{
+
+using Solver = BundleCovariance::Solver;
+using Step = optim::Step<3, 6>;
+template <int R, int C> using Rows = Eigen::Matrix<double, R, C, Eigen::RowMajor>;
+using RowsX = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+
+// What the optimiser moves.
+struct State {
+    std::vector<Matrix3d> rotation;
+    std::vector<Vector3d> centre, point;
+    double wheel = 0.0;
+    Vector3d down = Vector3d::UnitY();
+    Eigen::VectorXd camera;
+};
+
+// The relative whitened residual of the distance from the first to the last frame: stiff enough to be exact beside
+// thousands of observations, soft enough to leave digits to the rest.
+constexpr double SCALE_SIGMA = 1e-7;
+
+class Problem
+{
+public:
+    Problem(const Submap &map, const TrackTable &table, const pf_camera &camera, const BundleOptions &options)
+        : table_(table), original_(camera), camera_(camera), options_(options), first_(map.first)
+    {
+        for (const Pose &pose : map.poses) {
+            state_.rotation.push_back(pose.r);
+            state_.centre.push_back(pose.centre());
+        }
+        offset_.push_back(0);
+        for (size_t p = 0; p < map.tracks.size(); p++) {
+            const size_t before = place_.size();
+            for (const Observation &o : table.of_track(map.tracks[p])) {
+                if (!map.has(o.frame)) {
+                    continue;
+                }
+                const double squared = reprojection_squared(camera, map.pose(o.frame), map.points[p], o);
+                if (std::isfinite(squared) && (options.gate <= 0.0 || squared < options.gate * options.gate)) {
+                    place_.push_back(static_cast<int>(&o - table.observations().data()));
+                    frame_.push_back(o.frame - first_);
+                }
+            }
+            if (place_.size() - before < static_cast<size_t>(options.min_views)) {
+                place_.resize(before);
+                frame_.resize(before);
+                continue;
+            }
+            offset_.push_back(place_.size());
+            state_.point.push_back(map.points[p]);
+            track_.push_back(map.tracks[p]);
+        }
+        set_border();
+        start_length_ = (state_.centre.back() - state_.centre.front()).norm();
+        saved_ = state_;
+        project_all();
+    }
+
+    int eliminated() const { return static_cast<int>(state_.point.size()); }
+    int banded() const { return static_cast<int>(state_.centre.size()); }
+    int border() const { return border_; }
+    int reach() const { return std::max(reach_, options_.odometry ? 1 : 0); }
+    void widen(int reach) { reach_ = std::min(reach, banded() - 1); }
+    std::span<const int> couplings(int e) const
+    {
+        const size_t from = offset_[static_cast<size_t>(e)];
+        return {frame_.data() + from, offset_[static_cast<size_t>(e) + 1] - from};
+    }
+
+    template <class Sink> void linearize(int e, Sink &sink) const
+    {
+        if (e < 0) {
+            linearize_rest(sink);
+            return;
+        }
+        const size_t point = static_cast<size_t>(e);
+        RowsX j_border = RowsX::Zero(2, border_);
+        for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
+            const Observation &o = table_[place_[k]];
+            const size_t f = static_cast<size_t>(frame_[k]);
+            const Vector3d x = state_.rotation[f] * (state_.point[point] - state_.centre[f]);
+            Vector2d uv;
+            Rows<2, 3> slope;
+            Rows<2, PF_CAMERA_PARAMS> by_camera;
+            if (pf_camera_project(&camera_, x.data(), uv.data(), slope.data(),
+                                  camera_columns_ ? by_camera.data() : nullptr) != PF_OK) {
+                continue;
+            }
+            const Vector2d r = o.whiten * (uv - o.sight.uv);
+            const Rows<2, 3> whitened = o.whiten * slope;
+            const Rows<2, 3> j_point = whitened * state_.rotation[f];
+            Rows<2, 6> j_pose;
+            if (is_held(frame_[k])) {
+                j_pose.setZero();
+            } else {
+                for (int row = 0; row < 2; row++) { // d(R (X - c)) = w x x - R dc
+                    j_pose.row(row).head<3>() = x.cross(Vector3d(whitened.row(row))).transpose();
+                }
+                j_pose.rightCols<3>() = -j_point;
+            }
+            for (int c = 0; c < camera_columns_; c++) {
+                j_border.col(camera_at_ + c) =
+                    o.whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
+            }
+            const std::array<const double *, 1> j_f{j_pose.data()};
+            sink.add(2, r.data(), options_.loss, j_point.data(), std::span(&frame_[k], 1), j_f,
+                     camera_columns_ ? j_border.data() : nullptr);
+        }
+    }
+
+    double cost(int e) const
+    {
+        if (e < 0) {
+            return cost_rest();
+        }
+        const size_t point = static_cast<size_t>(e);
+        double sum = 0.0;
+        for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
+            if (!seen_[k]) {
+                return std::numeric_limits<double>::infinity();
+            }
+            const Observation &o = table_[place_[k]];
+            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) - o.sight.uv;
+            sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
+        }
+        return sum;
+    }
+
+    void apply(const Step &step)
+    {
+        for (size_t f = 0; f < state_.centre.size(); f++) {
+            state_.rotation[f] = geometry::rotation_exp(step.f[f].head<3>()) * saved_.rotation[f];
+            state_.centre[f] = saved_.centre[f] + step.f[f].tail<3>();
+        }
+        for (size_t e = 0; e < state_.point.size(); e++) {
+            state_.point[e] = saved_.point[e] + step.e[e];
+        }
+        if (options_.odometry) {
+            state_.wheel = saved_.wheel + step.g[0];
+        }
+        if (options_.gravity) {
+            state_.down =
+                (saved_.down + geometry::tangent_basis(saved_.down) * step.g.segment<2>(down_at_)).normalized();
+        }
+        if (camera_columns_ > 0) {
+            state_.camera = saved_.camera + step.g.tail(camera_columns_);
+            camera_ = changed_camera(original_, *options_.camera_prior, state_.camera);
+        }
+        project_all();
+    }
+
+    void save() { saved_ = state_; }
+
+    // The result, into the map.
+    void store(Submap &map) const
+    {
+        for (size_t f = 0; f < map.poses.size(); f++) {
+            const Matrix3d r = geometry::nearest_rotation(state_.rotation[f]);
+            map.poses[f] = {r, -r * state_.centre[f]};
+        }
+        map.tracks = track_;
+        map.points = state_.point;
+    }
+
+    const State &state() const { return state_; }
+    int observations() const { return static_cast<int>(place_.size()); }
+    int down_at() const { return down_at_; }
+
+    // Degrees of freedom of the residuals, those of the rest included.
+    int redundancy() const
+    {
+        const int frames = banded() - options_.held_front - options_.held_back;
+        const bool scale_free = options_.hold_scale && !options_.odometry;
+        return 2 * observations() - 6 * frames - 3 * eliminated() + (scale_free ? 1 : 0) + extra_rows_ - border_;
+    }
+
+private:
+    // All pixels in one batch, which takes a tenth of the time of one by one.
+    void project_all()
+    {
+        const size_t n = place_.size();
+        in_camera_.resize(3 * n);
+        pixel_.resize(2 * n);
+        seen_.resize(n);
+        for (size_t p = 0; p < state_.point.size(); p++) {
+            for (size_t k = offset_[p]; k < offset_[p + 1]; k++) {
+                const size_t f = static_cast<size_t>(frame_[k]);
+                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) =
+                    state_.rotation[f] * (state_.point[p] - state_.centre[f]);
+            }
+        }
+        pf_camera_project_n(&camera_, n, in_camera_.data(), pixel_.data(), seen_.data());
+    }
+
+    bool is_held(int f) const { return f < options_.held_front || f >= banded() - options_.held_back; }
+
+    void set_border()
+    {
+        if (options_.odometry) {
+            border_ = 1;
+            extra_rows_ = 1;
+            for (int f = 0; f + 1 < banded(); f++) {
+                extra_rows_ += has_step(f);
+            }
+        }
+        if (options_.gravity) {
+            down_at_ = border_;
+            border_ += 2;
+            Vector3d sum = Vector3d::Zero();
+            for (size_t f = 0; f < state_.rotation.size(); f++) {
+                const Vector3d &down = options_.gravity->down[f + static_cast<size_t>(first_)];
+                extra_rows_ += down.isZero() ? 0 : 2;
+                sum += state_.rotation[f].transpose() * down;
+            }
+            state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
+        }
+        if (options_.camera_prior) {
+            camera_at_ = border_;
+            camera_columns_ = static_cast<int>(options_.camera_prior->parameter.size());
+            border_ += camera_columns_;
+            extra_rows_ += camera_columns_;
+            state_.camera = Eigen::VectorXd::Zero(camera_columns_);
+            const Eigen::LLT<Eigen::MatrixXd> llt(options_.camera_prior->covariance);
+            camera_root_ = llt.matrixL().solve(Eigen::MatrixXd::Identity(camera_columns_, camera_columns_));
+        }
+    }
+
+    bool has_step(int f) const { return std::isfinite(options_.odometry->step[static_cast<size_t>(f + first_)]); }
+
+    optim::RobustLoss slip() const
+    {
+        return optim::RobustLoss{optim::RobustLoss::Kind::mixture, options_.odometry->slip_spread,
+                                 options_.odometry->slip_share};
+    }
+
+    double step_residual(int f, Vector3d *direction) const
+    {
+        const size_t i = static_cast<size_t>(f), global = static_cast<size_t>(f + first_);
+        const Vector3d moved = state_.centre[i + 1] - state_.centre[i];
+        const double length = moved.norm();
+        if (direction) {
+            *direction = length > 0.0 ? Vector3d(moved / length) : Vector3d(Vector3d::Zero());
+        }
+        // In readings, whose noise it is: in metres the fit would shrink everything to make the noise smaller.
+        return (length / (1.0 + state_.wheel) - std::abs(options_.odometry->step[global])) /
+               options_.odometry->sigma[global];
+    }
+
+    Vector2d down_residual(int f) const
+    {
+        const size_t i = static_cast<size_t>(f);
+        const Vector3d &measured = options_.gravity->down[i + static_cast<size_t>(first_)];
+        return geometry::tangent_basis(measured).transpose() * (state_.rotation[i] * state_.down) /
+               options_.gravity->sigma;
+    }
+
+    double scale_residual() const
+    {
+        return ((state_.centre.back() - state_.centre.front()).norm() / start_length_ - 1.0) / SCALE_SIGMA;
+    }
+
+    bool holds_scale() const { return options_.hold_scale && !options_.odometry && options_.held_back == 0; }
+
+    double cost_rest() const
+    {
+        double sum = 0.0;
+        if (holds_scale()) {
+            sum += scale_residual() * scale_residual();
+        }
+        if (options_.odometry) {
+            const optim::RobustLoss loss = slip();
+            for (int f = 0; f + 1 < banded(); f++) {
+                if (has_step(f)) {
+                    const double r = step_residual(f, nullptr);
+                    sum += loss(r * r).rho;
+                }
+            }
+            sum += std::pow(state_.wheel / options_.odometry->scale_sigma, 2);
+        }
+        if (options_.gravity) {
+            for (int f = 0; f < banded(); f++) {
+                if (!options_.gravity->down[static_cast<size_t>(f + first_)].isZero()) {
+                    sum += down_residual(f).squaredNorm();
+                }
+            }
+        }
+        if (camera_columns_ > 0) {
+            sum += (camera_root_ * state_.camera).squaredNorm();
+        }
+        return 0.5 * sum;
+    }
+
+    template <class Sink> void linearize_rest(Sink &sink) const
+    {
+        const optim::RobustLoss plain;
+        for (int f = 0; f < banded(); f++) {
+            if (is_held(f)) { // its derivatives are left out everywhere else
+                const Eigen::Matrix<double, 6, 1> zero = Eigen::Matrix<double, 6, 1>::Zero();
+                const Rows<6, 6> one = Rows<6, 6>::Identity();
+                const std::array<const double *, 1> j{one.data()};
+                sink.add(6, zero.data(), plain, nullptr, std::span(&f, 1), j, nullptr);
+            }
+        }
+        if (holds_scale()) {
+            const int last = banded() - 1;
+            const double r = scale_residual();
+            Rows<1, 6> j_last = Rows<1, 6>::Zero();
+            j_last.rightCols<3>() =
+                (state_.centre.back() - state_.centre.front()).normalized().transpose() / (start_length_ * SCALE_SIGMA);
+            const std::array<const double *, 1> j{j_last.data()};
+            sink.add(1, &r, plain, nullptr, std::span(&last, 1), j, nullptr);
+        }
+        if (options_.odometry) {
+            linearize_odometry(sink);
+        }
+        if (options_.gravity) {
+            linearize_gravity(sink);
+        }
+        if (camera_columns_ > 0) {
+            RowsX j = RowsX::Zero(camera_columns_, border_);
+            j.rightCols(camera_columns_) = camera_root_;
+            const Eigen::VectorXd r = camera_root_ * state_.camera;
+            sink.add(camera_columns_, r.data(), plain, nullptr, {}, {}, j.data());
+        }
+    }
+
+    template <class Sink> void linearize_odometry(Sink &sink) const
+    {
+        const optim::RobustLoss loss = slip();
+        RowsX j_border = RowsX::Zero(1, border_);
+        for (int f = 0; f + 1 < banded(); f++) {
+            if (!has_step(f)) {
+                continue;
+            }
+            const size_t global = static_cast<size_t>(f + first_);
+            const double gain = 1.0 + state_.wheel, inverse = 1.0 / (gain * options_.odometry->sigma[global]);
+            Vector3d direction;
+            const double r = step_residual(f, &direction);
+            Rows<1, 6> j[2] = {Rows<1, 6>::Zero(), Rows<1, 6>::Zero()};
+            const int frames[2] = {f, f + 1};
+            for (int side = 0; side < 2; side++) {
+                if (!is_held(frames[side])) {
+                    j[side].rightCols<3>() = (side == 0 ? -inverse : inverse) * direction.transpose();
+                }
+            }
+            const double length =
+                (state_.centre[static_cast<size_t>(f) + 1] - state_.centre[static_cast<size_t>(f)]).norm();
+            j_border(0, 0) = -inverse * length / gain;
+            const std::array<const double *, 2> j_f{j[0].data(), j[1].data()};
+            sink.add(1, &r, loss, nullptr, frames, j_f, j_border.data());
+        }
+        j_border.setZero();
+        j_border(0, 0) = 1.0 / options_.odometry->scale_sigma;
+        const double r = state_.wheel * j_border(0, 0);
+        sink.add(1, &r, optim::RobustLoss{}, nullptr, {}, {}, j_border.data());
+    }
+
+    template <class Sink> void linearize_gravity(Sink &sink) const
+    {
+        const Matrix32 basis = geometry::tangent_basis(state_.down);
+        RowsX j_border = RowsX::Zero(2, border_);
+        for (int f = 0; f < banded(); f++) {
+            const Vector3d &measured = options_.gravity->down[static_cast<size_t>(f + first_)];
+            if (measured.isZero()) {
+                continue;
+            }
+            const size_t i = static_cast<size_t>(f);
+            const Vector2d r = down_residual(f);
+            const Matrix23 across = geometry::tangent_basis(measured).transpose() / options_.gravity->sigma;
+            Rows<2, 6> j = Rows<2, 6>::Zero();
+            if (!is_held(f)) {
+                j.leftCols<3>() = -across * geometry::cross_matrix(state_.rotation[i] * state_.down);
+            }
+            j_border.middleCols(down_at_, 2) = across * state_.rotation[i] * basis;
+            const std::array<const double *, 1> j_f{j.data()};
+            sink.add(2, r.data(), optim::RobustLoss{}, nullptr, std::span(&f, 1), j_f, j_border.data());
+        }
+    }
+
+    const TrackTable &table_;
+    pf_camera original_, camera_;
+    BundleOptions options_;
+    int first_, reach_ = 0;
+    State state_, saved_;
+    std::vector<size_t> offset_; // of each point in place_ and frame_
+    std::vector<int> place_, frame_, track_;
+    std::vector<double> in_camera_, pixel_; // of all observations, at the state
+    std::vector<uint8_t> seen_;
+    int border_ = 0, down_at_ = 0, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
+    Eigen::MatrixXd camera_root_;
+    double start_length_ = 1.0;
+};
+
+} // namespace
+
+pf_camera changed_camera(const pf_camera &camera, const CameraPrior &prior, const Eigen::VectorXd &change)
+{
+    pf_camera changed = camera;
+    for (size_t i = 0; i < prior.parameter.size(); i++) {
+        *pf_camera_param_at(&changed, prior.parameter[i]) += change[static_cast<Eigen::Index>(i)];
+    }
+    return changed;
+}
+
+double reprojection_squared(const pf_camera &camera, const Pose &pose, const Vector3d &x, const Observation &o)
+{
+    const Vector3d y = pose * x;
+    Vector2d uv;
+    if (pf_camera_project(&camera, y.data(), uv.data(), nullptr, nullptr) != PF_OK) {
+        return std::numeric_limits<double>::infinity();
+    }
+    return (o.whiten * (uv - o.sight.uv)).squaredNorm();
+}
+
+BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camera, const BundleOptions &options,
+                    BundleCovariance *covariance)
+{
+    Problem problem(map, table, camera, options);
+    Solver solver;
+    optim::Options settings;
+    settings.max_iterations = options.max_iterations;
+    settings.cost_tolerance = options.cost_tolerance;
+    settings.threads = options.threads;
+    settings.lambda = options.lambda;
+    BundleReport report;
+    report.observations = problem.observations();
+    report.points = problem.eliminated();
+    report.summary = solver.minimize(problem, settings);
+    report.variance_factor = 2.0 * report.summary.final_cost / std::max(problem.redundancy(), 1);
+    report.redundancy = std::max(problem.redundancy(), 1);
+    report.wheel = problem.state().wheel;
+    report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
+    report.camera = problem.state().camera;
+    if (covariance) {
+        problem.widen(options.reach);
+        auto known = solver.covariance(problem, options.threads);
+        *covariance = BundleCovariance(std::move(solver), std::move(known));
+    }
+    problem.store(map);
+    return report;
+}
+
+} // namespace pipefish::sfm

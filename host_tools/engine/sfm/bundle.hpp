@@ -1,0 +1,115 @@
+// Bundle adjustment of a stretch of frames: reprojection in pixels of the raw image, with odometry, gravity and the
+// camera's uncertainty where they are known.
+#pragma once
+
+#include "optim/least_squares.hpp"
+#include "sfm/tracks.hpp"
+
+#include <vector>
+
+namespace pipefish::sfm
+{
+
+// Frames first .. first + poses.size() - 1, and the points of tracks seen there.
+struct Submap {
+    int first = 0;
+    std::vector<Pose> poses; // cam_from_world
+    std::vector<int> tracks; // ascending
+    std::vector<Vector3d> points;
+
+    int end() const { return first + static_cast<int>(poses.size()); }
+    const Pose &pose(int frame) const { return poses[static_cast<size_t>(frame - first)]; }
+    bool has(int frame) const { return frame >= first && frame < end(); }
+};
+
+// Distance driven between frames, from wheels: truth = reading (1 + w), w unknown with sigma `scale_sigma`.
+struct Odometry {
+    std::vector<double> step;   // from frame i to i + 1, metres; NaN where unknown
+    std::vector<double> sigma;  // of it, metres, without w
+    double scale_sigma = 0.003; // of w
+    double slip_share = 0.05;   // of steps in which the wheel slips
+    double slip_spread = 30.0;  // their spread, in sigmas
+};
+
+// Direction of gravity in the camera's frame, from an inclinometer.
+struct Gravity {
+    std::vector<Vector3d> down; // unit, one a frame; zero where unknown
+    double sigma = 0.01;        // radians
+};
+
+// Which of the camera's parameters are uncertain, and how much.
+struct CameraPrior {
+    std::vector<uint32_t> parameter; // pf_camera_param
+    Eigen::MatrixXd covariance;
+};
+
+struct BundleOptions {
+    optim::RobustLoss loss;
+    int held_front = 1, held_back = 0; // frames whose poses stay
+    bool hold_scale = true;            // keep the distance from the first to the last frame (where odometry does not)
+    int max_iterations = 50;
+    double cost_tolerance = 1e-8;
+    double lambda =
+        1e-4;          // first damping: small where the start is good, for a chain's soft bends hardly change the cost
+    double gate = 0.0; // observations further off than this many sigmas are left out; 0: all that can be projected
+    int min_views = 2; // points with fewer are left out
+    int threads = 1;
+    int reach = 0; // covariance of poses at least so many frames apart is kept
+    const Odometry *odometry = nullptr;
+    const Gravity *gravity = nullptr;
+    const CameraPrior *camera_prior = nullptr;
+};
+
+struct BundleReport {
+    optim::Summary summary;
+    int observations = 0, points = 0;
+    int redundancy = 1;           // degrees of freedom of the residuals
+    double variance_factor = 1.0; // cost over degrees of freedom: 1 = noise as stated
+    double wheel = 0.0;           // w
+    Vector3d down = Vector3d::Zero();
+    Eigen::VectorXd camera; // changes of the camera's parameters
+};
+
+class BundleCovariance
+{
+public:
+    using Solver = optim::LeastSquares<3, 6>;
+
+    BundleCovariance() = default;
+    BundleCovariance(Solver &&solver, Solver::Covariance &&known) : solver_(std::move(solver)), known_(std::move(known))
+    {
+    }
+
+    bool empty() const { return known_.f.empty(); }
+    size_t frames() const { return known_.f.size(); }
+    const Eigen::Matrix<double, 6, 6> &pose(size_t frame) const
+    {
+        return known_.f[frame][0];
+    }                                                                // rotation (left), centre
+    const std::vector<Matrix3d> &points() const { return known_.e; } // as the map's points
+    const Eigen::MatrixXd &border() const { return known_.g; }       // wheel, gravity (2), camera: those of the options
+
+    // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
+    // Poses further apart than `reach` of the options and the longest track are taken to be independent.
+    Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const
+    {
+        return solver_.functions(known_, points, a);
+    }
+
+private:
+    Solver solver_;
+    Solver::Covariance known_;
+};
+
+// Adjusts `map` in place; points that lose their observations are removed from it. `covariance`, where not null, is of
+// the result, with the loss's weights, in the gauge of the options.
+BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camera, const BundleOptions &options,
+                    BundleCovariance *covariance = nullptr);
+
+// The camera with `change` added to the parameters of the prior.
+pf_camera changed_camera(const pf_camera &camera, const CameraPrior &prior, const Eigen::VectorXd &change);
+
+// Whitened squared distance of an observation; infinity where the point cannot be seen.
+double reprojection_squared(const pf_camera &camera, const Pose &pose, const Vector3d &x, const Observation &o);
+
+} // namespace pipefish::sfm

@@ -1,0 +1,48 @@
+// From tracks to poses and points: both ways of building, and the adjustment that ends them.
+#pragma once
+
+#include "sfm/submap.hpp"
+
+namespace pipefish::sfm
+{
+
+enum class Method { hierarchical, incremental };
+
+struct ReconstructOptions {
+    Method method = Method::hierarchical;
+    Limits limits;
+    int threads = 1;
+    double still = 0.5; // px: frames whose tracks moved less than this (median) since the last one used are not used
+    const Odometry *odometry = nullptr; // by frame of the table
+    const Gravity *gravity = nullptr;   // by frame of the table
+    const CameraPrior *camera_prior = nullptr;
+};
+
+// A stretch that could not be measured, between two frames.
+struct Gap {
+    int from = 0, to = 0;
+    Trouble trouble = Trouble::none;
+    int common = 0;
+};
+
+struct Segment {
+    Submap map; // frames are numbers in `frames`
+    BundleReport report;
+    BundleCovariance random, total; // with the camera as it is; with its uncertainty (empty where that is not known)
+    double sigma = 1.0;             // robust, of the whitened residuals before the last selection
+    bool metric = false;            // scale from odometry
+    double scale_sigma = 0.0;       // relative, of the scale from odometry before the adjustment
+};
+
+struct Reconstruction {
+    std::vector<int> frames;       // of the table, that were used, ascending
+    std::vector<Segment> segments; // in order; frames of different segments have nothing but odometry in common
+    std::vector<Gap> gaps;         // numbers in `frames`
+};
+
+Reconstruction reconstruct(const TrackTable &table, const pf_camera &camera, const ReconstructOptions &options);
+
+// Frames to use: those whose tracks moved since the last.
+std::vector<int> moving_frames(const TrackTable &table, double still);
+
+} // namespace pipefish::sfm

@@ -1,0 +1,76 @@
+#include "sfm/tracks.hpp"
+
+#include <Eigen/LU>
+
+#include <algorithm>
+
+namespace pipefish::sfm
+{
+
+TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::span<const int> frame,
+                       std::span<const int> track, const double *uv, const double *covariance, double sigma)
+{
+    const std::vector<Sight> sights = geometry::make_sights(camera, frame.size(), uv, covariance, sigma);
+    for (size_t i = 0; i < frame.size(); i++) {
+        if (!sights[i].valid) {
+            outside_++;
+            continue;
+        }
+        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse()});
+    }
+    std::stable_sort(all_.begin(), all_.end(), [](const Observation &a, const Observation &b) {
+        return a.track != b.track ? a.track < b.track : a.frame < b.frame;
+    });
+    const auto same = [](const Observation &a, const Observation &b) {
+        return a.track == b.track && a.frame == b.frame;
+    };
+    const auto end = std::unique(all_.begin(), all_.end(), same);
+    repeated_ = static_cast<int>(all_.end() - end);
+    all_.erase(end, all_.end());
+    index(frames, tracks);
+}
+
+TrackTable TrackTable::only(std::span<const int> kept) const
+{
+    std::vector<int> number(by_frame_.size(), -1);
+    for (size_t i = 0; i < kept.size(); i++) {
+        number[static_cast<size_t>(kept[i])] = static_cast<int>(i);
+    }
+    TrackTable out;
+    for (const Observation &o : all_) {
+        if (number[static_cast<size_t>(o.frame)] >= 0) {
+            out.all_.push_back(o);
+            out.all_.back().frame = number[static_cast<size_t>(o.frame)];
+        }
+    }
+    out.index(static_cast<int>(kept.size()), tracks());
+    out.outside_ = outside_;
+    out.repeated_ = repeated_;
+    return out;
+}
+
+void TrackTable::index(int frames, int tracks)
+{
+    by_frame_.assign(static_cast<size_t>(frames), {});
+    begin_.assign(static_cast<size_t>(tracks) + 1, all_.size());
+    for (size_t i = all_.size(); i-- > 0;) {
+        begin_[static_cast<size_t>(all_[i].track)] = i;
+    }
+    for (size_t k = begin_.size() - 1; k-- > 0;) {
+        begin_[k] = std::min(begin_[k], begin_[k + 1]);
+    }
+    for (size_t i = 0; i < all_.size(); i++) {
+        by_frame_[static_cast<size_t>(all_[i].frame)].push_back(static_cast<int>(i));
+    }
+}
+
+void TrackTable::scale_noise(double factor)
+{
+    for (Observation &o : all_) {
+        o.sight.root *= factor;
+        o.sight.b *= factor;
+        o.whiten /= factor;
+    }
+}
+
+} // namespace pipefish::sfm

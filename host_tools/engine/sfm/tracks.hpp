@@ -1,0 +1,78 @@
+// Observations of tracks, as reconstruction reads them.
+#pragma once
+
+#include "geometry/sight.hpp"
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+namespace pipefish::sfm
+{
+
+using geometry::Matrix23;
+using geometry::Matrix32;
+using geometry::Matrix3d;
+using geometry::Pose;
+using geometry::Sight;
+using geometry::Vector2d;
+using geometry::Vector3d;
+
+struct Observation {
+    int frame, track;
+    Sight sight;
+    Eigen::Matrix2d whiten; // of a pixel error: root^-1
+};
+
+// Sorted by track, then frame; at most one observation a track and frame, all of them inside the camera's model.
+class TrackTable
+{
+public:
+    // `frame`, `track`: n, any order, 0 <= frame < frames, 0 <= track < tracks.
+    TrackTable(const pf_camera &camera, int frames, int tracks, std::span<const int> frame, std::span<const int> track,
+               const double *uv, const double *covariance, double sigma);
+
+    // The same observations in frames `kept` only (ascending), numbered in their order.
+    TrackTable only(std::span<const int> kept) const;
+
+    int frames() const { return static_cast<int>(by_frame_.size()); }
+    int tracks() const { return static_cast<int>(begin_.size()) - 1; }
+    std::span<const Observation> observations() const { return all_; }
+    std::span<const Observation> of_track(int track) const
+    {
+        const size_t from = begin_[static_cast<size_t>(track)];
+        return {all_.data() + from, begin_[static_cast<size_t>(track) + 1] - from};
+    }
+    // Places in observations(), by track.
+    std::span<const int> of_frame(int frame) const { return by_frame_[static_cast<size_t>(frame)]; }
+    const Observation &operator[](int place) const { return all_[static_cast<size_t>(place)]; }
+
+    int outside() const { return outside_; }   // observations left out: beyond the model
+    int repeated() const { return repeated_; } // observations left out: their track was there already in their frame
+    void scale_noise(double factor);           // all covariances by factor^2
+
+    // Calls body(first, second) with the observations of each track that two frames share.
+    template <typename Body> void for_pairs(int first, int second, const Body &body) const
+    {
+        const std::span<const int> a = of_frame(first), b = of_frame(second);
+        for (size_t i = 0, j = 0; i < a.size() && j < b.size();) {
+            const Observation &x = (*this)[a[i]], &y = (*this)[b[j]];
+            if (x.track == y.track) {
+                body(x, y);
+            }
+            i += x.track <= y.track;
+            j += y.track <= x.track;
+        }
+    }
+
+private:
+    TrackTable() = default;
+    void index(int frames, int tracks);
+
+    std::vector<Observation> all_;
+    std::vector<size_t> begin_; // of each track
+    std::vector<std::vector<int>> by_frame_;
+    int outside_ = 0, repeated_ = 0;
+};
+
+} // namespace pipefish::sfm

@@ -1,0 +1,343 @@
+"""Structure from motion: camera poses and wall points from tracks, with their covariances.
+
+Works on rays, so views of 180 degrees and beyond are ordinary. docs/reconstruct.md describes the method.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _engine
+from .camera import PARAMETERS, Camera
+from .errors import ArgumentError
+from .survey import Tracks
+
+Floats = npt.NDArray[np.float64]
+
+#: Why a stretch was not measured, in words.
+REASONS = {
+    "weak_texture": "too few tracks in common",
+    "no_baseline": "the camera stood still or only turned",
+    "no_rigid_scene": "the tracks agree with no motion of this camera (wrong profile, or a scene that moves)",
+    "low_parallax": "the points' depths are not determined",
+    "merge_failed": "two stretches do not fit together",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoder:
+    """How good the distances are.
+
+    noise_m_per_sqrt_m  random part: sigma of the distance over one metre; 0.5 mm in 5 cm are 0.00224
+    scale_sigma         relative sigma of the wheel's scale, the same over the whole survey
+    quantum             metres a count: readings are multiples of it
+    """
+
+    noise_m_per_sqrt_m: float = 0.00224
+    scale_sigma: float = 0.003
+    quantum: float = 0.0
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A stretch between two frames that was not measured."""
+
+    first: int
+    last: int
+    reason: str  #: a key of REASONS
+    common: int  #: tracks in common
+
+    def __str__(self) -> str:
+        return f"frames {self.first} to {self.last}: {REASONS[self.reason]}"
+
+
+@dataclass
+class Reconstruction:
+    """Poses and points.
+
+    status           "ok"; "partial": some stretches are missing (gaps); "failed": nothing was measured (reason)
+    reason           one line, empty for "ok"
+    frames           (K,) int64, frames with a pose, ascending
+    poses            (K,3,4) cam_from_world; the world is the camera of the first frame
+    segment          (K,) int64: frames of one segment were measured against each other; between segments there is
+                     odometry at best
+    points           (N,3), track (N,) int64 the track of each, point_segment (N,)
+    covariance       (N,3,3) of the points and pose_covariance (K,6,6) of the poses (rotation on the left, then centre),
+                     random part, in the gauge of `gauge`; first frame of each segment: 0
+    systematic       (N,3,3), pose_systematic (K,6,6): what the camera's own uncertainty adds; None where the profile
+                     has no covariance
+    unit             "metre", or "arbitrary" where there is no source of scale
+    gauge            what the covariances are relative to
+    scale_sigma      relative sigma of the scale, wheel included; None without a source
+    wheel            (true distance over reading) - 1 as estimated, and wheel_sigma
+    sigma            robust spread of the residuals, in units of the stated noise; variance_factor likewise, after
+                     outliers were removed, of each segment
+    observations     used; outside: beyond the camera's model; repeated: the same track twice in a frame
+    standing         frames not used: nothing had moved since the one before
+    gaps             list of Gap
+    down             (3,) direction of gravity in the world, None without an inclinometer
+    camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
+    cost             sum of half the squared residuals
+    """
+
+    status: str
+    reason: str
+    frames: npt.NDArray[np.int64]
+    poses: Floats
+    segment: npt.NDArray[np.int64]
+    points: Floats
+    track: npt.NDArray[np.int64]
+    point_segment: npt.NDArray[np.int64]
+    covariance: Floats
+    pose_covariance: Floats
+    systematic: Floats | None
+    pose_systematic: Floats | None
+    unit: str
+    gauge: str
+    scale_sigma: float | None
+    wheel: float
+    wheel_sigma: float
+    sigma: list[float]
+    variance_factor: list[float]
+    observations: int
+    outside: int
+    repeated: int
+    standing: list[int]
+    gaps: list[Gap]
+    down: Floats | None
+    camera_change: Floats | None
+    camera_parameters: tuple[str, ...]
+    cost: float
+    iterations: list[int] = field(default_factory=list)
+    parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
+    turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
+
+    @property
+    def centres(self) -> Floats:
+        """(K,3) where the camera was."""
+        return -np.einsum("nij,ni->nj", self.poses[:, :, :3], self.poses[:, :, 3])
+
+    def functions_covariance(
+        self, points: npt.ArrayLike, jacobian: npt.ArrayLike, *, systematic: bool = False
+    ) -> Floats:
+        """(m,m) covariance of m linear functions of points, with all that they share through the poses.
+
+        points (n,) places in `points`, all of one segment; jacobian (m,n,3). systematic: with the camera's uncertainty.
+        Variances of the points alone, added up, are several times too small for what is averaged over many points.
+        Raises ArgumentError for points of several segments, or where the camera's uncertainty is not known."""
+        places, rows = np.asarray(points, dtype=np.int64), np.asarray(jacobian, dtype=np.float64)
+        if places.ndim != 1 or rows.ndim != 3 or rows.shape[1:] != (len(places), 3):
+            raise ArgumentError(f"jacobian: expected shape (m, {len(places)}, 3), got {rows.shape}")
+        if not len(places):
+            return np.zeros((len(rows), len(rows)))
+        segments = np.unique(self.point_segment[places])
+        if len(segments) > 1:
+            raise ArgumentError("points: of several segments, which have nothing in common")
+        number = int(segments[0])
+        random, total = self.parts[number]
+        if systematic and total is None:
+            raise ArgumentError("systematic: the camera's profile has no covariance")
+        first = int(np.searchsorted(self.point_segment, number))
+        rows = np.ascontiguousarray(rows @ self.turns[number])
+        found = (total if systematic else random).functions((places - first).astype(np.int32), rows)
+        return found * (1.0 if systematic else self.variance_factor[number])
+
+    @property
+    def length(self) -> float:
+        """Of the camera's path, within segments."""
+        steps = np.linalg.norm(np.diff(self.centres, axis=0), axis=1)
+        return float(steps[np.diff(self.segment) == 0].sum())
+
+
+def _steps(chainage: npt.ArrayLike, frames: int, encoder: Encoder) -> tuple[Floats, Floats]:
+    """Distance from each frame to the next (frames,), and its sigma."""
+    given = np.asarray(chainage, dtype=np.float64)
+    if given.ndim != 1 or len(given) < frames:
+        raise ArgumentError(f"chainage: expected one number for each of {frames} frames, got shape {given.shape}")
+    step = np.append(np.diff(given[:frames]), np.nan)
+    noise = encoder.noise_m_per_sqrt_m**2 * np.abs(np.nan_to_num(step)) + encoder.quantum**2 / 6.0
+    if not (noise[np.isfinite(step) & (step != 0.0)] > 0.0).all():
+        raise ArgumentError("encoder: neither noise_m_per_sqrt_m nor quantum is above 0")
+    return step, np.sqrt(np.maximum(noise, 1e-12))
+
+
+def _down(attitude: npt.ArrayLike, frames: int) -> Floats:
+    """Gravity in the camera's frame (frames,3) from roll and pitch; zero where they are not known."""
+    given = np.asarray(attitude, dtype=np.float64)
+    if given.ndim != 2 or given.shape[1] != 2 or len(given) < frames:
+        raise ArgumentError(f"attitude: expected roll and pitch for each of {frames} frames, got shape {given.shape}")
+    roll, pitch = given[:frames].T
+    down = np.column_stack([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])
+    return np.ascontiguousarray(np.nan_to_num(down))
+
+
+def _merged(segments: Sequence[dict[str, Any]], steps: Floats | None, frames: npt.NDArray[np.int64]) -> list[Floats]:
+    """For each segment the (3,4) that takes it into the world of the first: along the path by odometry, where there is
+    any."""
+    moves = [np.eye(3, 4)]
+    for before, after in itertools.pairwise(segments):
+        r, t = moves[-1][:, :3], moves[-1][:, 3]
+        centres = [-np.einsum("nij,ni->nj", s["poses"][:, :, :3], s["poses"][:, :, 3]) for s in (before, after)]
+        ahead = r @ (centres[0][-1] - centres[0][-2])
+        first = centres[1][1] - centres[1][0]
+        ahead, first = ahead / np.linalg.norm(ahead), first / np.linalg.norm(first)
+        distance = 0.0
+        if steps is not None:
+            start, end = frames[before["first"] + len(before["poses"]) - 1], frames[after["first"]]
+            distance = float(np.nan_to_num(np.abs(steps[start:end])).sum())
+        axis, cosine = np.cross(first, ahead), float(first @ ahead)
+        k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        turn = np.eye(3) + k + k @ k / (1 + cosine) if cosine > -0.999 else r
+        place = r @ centres[0][-1] + t + distance * ahead
+        moves.append(np.column_stack([turn, place - turn @ centres[1][0]]))
+    return moves
+
+
+def reconstruct(
+    tracks: Tracks,
+    camera: Camera,
+    chainage: npt.ArrayLike | None = None,
+    *,
+    encoder: Encoder | None = None,
+    attitude: npt.ArrayLike | None = None,
+    attitude_sigma: float = 0.01,
+    sigma: float = 0.3,
+    method: str = "hierarchical",
+    threads: int | None = None,
+    seed: int = 0,
+    still: float = 0.5,
+) -> Reconstruction:
+    """Poses of the frames and points of the tracks.
+
+    chainage   (F,) metres driven at each frame 0..F-1, NaN where unknown; encoder: how good it is. Without it the
+               result has no unit: the distance from the first to the last frame of each segment is 1.
+    attitude   (F,2) roll and pitch of each frame, radians (Telemetry's), NaN where unknown, with attitude_sigma
+    sigma      px, of pixels without a covariance
+    method     "hierarchical" (leaves of three and more frames, merged) or "incremental" (frame after frame): equal
+               results but for rounding
+    threads    None: all cores; the result is the same for any number
+    still      px: frames in which tracks moved less (median) are not used
+
+    What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
+    that are wrong in themselves.
+    """
+    if method not in ("hierarchical", "incremental"):
+        raise ArgumentError(f"method: {method!r} is neither 'hierarchical' nor 'incremental'")
+    if not sigma > 0.0:
+        raise ArgumentError(f"sigma: {sigma} is not above 0")
+    frames = int(tracks.frame.max()) + 1 if len(tracks.frame) else 0
+    names, numbers = np.unique(tracks.track, return_inverse=True)
+    step = step_sigma = down = None
+    encoder = encoder or Encoder()
+    if chainage is not None:
+        step, step_sigma = _steps(chainage, frames, encoder)
+    if attitude is not None:
+        down = _down(attitude, frames)
+    uncertain = [PARAMETERS.index(name) for name in camera.covariance_parameters]
+    found = _engine.reconstruct(
+        camera._profile,
+        frames,
+        len(names),
+        tracks.frame.astype(np.int32),
+        numbers.astype(np.int32),
+        tracks.pixels,
+        tracks.covariance,
+        float(sigma),
+        method,
+        seed,
+        threads or len(os.sched_getaffinity(0)),
+        float(still),
+        step,
+        step_sigma,
+        float(encoder.scale_sigma),
+        down,
+        float(attitude_sigma),
+        uncertain,
+        None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
+    )
+    return _result(found, names, frames, step, encoder, camera)
+
+
+def _wheel_sigma(segment: dict[str, Any] | None) -> float | None:
+    """Of the first parameter that all poses share, the wheel's scale, where there is one."""
+    return float(np.sqrt(segment["random"].border[0, 0])) if segment and segment["metric"] else None
+
+
+def _stacked(parts: list[npt.NDArray[Any]], shape: tuple[int, ...], dtype: type = np.float64) -> npt.NDArray[Any]:
+    return np.concatenate(parts) if parts else np.zeros((0, *shape), dtype)
+
+
+def _result(
+    found: dict[str, Any],
+    names: npt.NDArray[np.int64],
+    count: int,
+    step: Floats | None,
+    encoder: Encoder,
+    camera: Camera,
+) -> Reconstruction:
+    """The engine's answer in terms of the caller's frames and tracks."""
+    used = found["frames"].astype(np.int64)
+    segments = found["segments"]
+    gaps = [Gap(int(used[a]), int(used[b]), reason, common) for a, b, reason, common in found["gaps"]]
+    moves = _merged(segments, step, used)
+    poses, points, covariances, pose_covariances, systematic, pose_systematic = [], [], [], [], [], []
+    for s, move in zip(segments, moves, strict=False):
+        r, t = move[:, :3], move[:, 3]
+        turned = s["poses"][:, :, :3] @ r.T
+        poses.append(np.concatenate([turned, (s["poses"][:, :, 3] - turned @ t)[:, :, None]], axis=2))
+        points.append(s["points"] @ r.T + t)
+        spin = np.eye(6)
+        spin[3:, 3:] = r
+        factor = s["variance_factor"]
+        covariances.append(factor * (r @ s["random"].point @ r.T))
+        pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
+        pose_covariances[-1][0] = 0.0  # held; the engine has the unit matrix there
+        if s["total"] is not None:
+            systematic.append(r @ (s["total"].point - s["random"].point) @ r.T)
+            pose_systematic.append(spin @ (s["total"].pose - s["random"].pose) @ spin.T)
+    metric = bool(segments) and all(s["metric"] for s in segments)
+    status = "failed" if not segments else "partial" if gaps or len(segments) > 1 else "ok"
+    reason = "" if status == "ok" else "; ".join(str(gap) for gap in gaps[:3])
+    if status == "failed" and not reason:
+        reason = f"fewer than three frames with something to see that moves ({len(used)} of {count})"
+    first = segments[0] if segments else None
+    return Reconstruction(
+        status=status,
+        reason=reason,
+        frames=_stacked([used[s["first"] : s["first"] + len(s["poses"])] for s in segments], (), np.int64),
+        poses=_stacked(poses, (3, 4)),
+        segment=_stacked([np.full(len(s["poses"]), i) for i, s in enumerate(segments)], (), np.int64),
+        points=_stacked(points, (3,)),
+        track=_stacked([names[s["tracks"]] for s in segments], (), np.int64),
+        point_segment=_stacked([np.full(len(s["points"]), i) for i, s in enumerate(segments)], (), np.int64),
+        covariance=_stacked(covariances, (3, 3)),
+        pose_covariance=_stacked(pose_covariances, (6, 6)),
+        systematic=_stacked(systematic, (3, 3)) if systematic else None,
+        pose_systematic=_stacked(pose_systematic, (6, 6)) if systematic else None,
+        unit="metre" if metric else "arbitrary",
+        gauge="first frame" if metric else "first frame and distance to the last",
+        scale_sigma=_wheel_sigma(first),
+        wheel=float(first["wheel"]) if first else 0.0,
+        wheel_sigma=_wheel_sigma(first) or 0.0,
+        sigma=[s["sigma"] for s in segments],
+        variance_factor=[s["variance_factor"] for s in segments],
+        observations=sum(s["observations"] for s in segments),
+        outside=found["outside"],
+        repeated=found["repeated"],
+        standing=sorted(set(range(count)) - set(used.tolist())),
+        gaps=gaps,
+        down=first["down"] if first and np.any(first["down"]) else None,
+        camera_change=first["camera"] if first and len(first["camera"]) else None,
+        camera_parameters=camera.covariance_parameters,
+        cost=sum(s["cost"] for s in segments),
+        iterations=[s["iterations"] for s in segments],
+        parts=[(s["random"], s["total"]) for s in segments],
+        turns=[move[:, :3] for move in moves[: len(segments)]],
+    )
