@@ -133,6 +133,7 @@ class Single:
         camera = self.bundle.camera(self.index)
         camera.theta_max = _engine.rising_end(camera, _THETA_END)
         self.bundle.set_camera(self.index, camera)
+        self.bundle.set_used(np.ones(len(self.pixels), dtype=bool))  # a lost view's points were not
         fresh = {int(v): self.bundle.view_pose(int(v)) for v in bad}
         camera.theta_max = _THETA_END
         self.bundle.set_camera(self.index, camera)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pipefish as pf
-from calib_scenes import RADII, Lens, bearing_error, board, turn, views_of
+from calib_scenes import RADII, Lens, bearing_error, board, random_lens, turn, views_of
 from pipefish import _engine
 from pipefish.calibration import Calibration, CalibrationError, View, calibrate
 
@@ -52,6 +52,14 @@ def test_a_board_at_180_degrees_and_more_keeps_its_side() -> None:
     result = calibrate(views, (1024, 1024), "p9", "flat")
     assert np.allclose(result.poses, poses, atol=1e-6)
     assert result.camera.theta_covered > math.radians(95)
+
+
+def test_views_beyond_the_first_lens_are_taken_back_by_the_better_one() -> None:
+    """Views at 105 degrees and more, for which the first p6 had no rays, were taken for another camera's."""
+    random = np.random.default_rng(598)  # five of 21 views of this set-up were lost
+    lens, count, noise = random_lens(random), int(random.integers(5, 31)), float(random.uniform(0.0, 0.5))
+    views, _ = views_of(random, lens, count, noise, 0.02)
+    assert all(v["used"] for v in calibrate(views, (1024, 1024), "p9", "flat").report["views"])
 
 
 def test_derivatives_of_everything_lead_to_the_exact_solution_in_a_few_steps() -> None:
