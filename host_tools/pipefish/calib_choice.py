@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from .calib_data import Array
+from .calib_data import Array, CalibrationError
 from .calib_fit import Fit
 from .calib_model import Model
+from .calib_report import covariance_of
 
 _FOLDS = 5
 _GAIN = 0.003  # of the held-out RMS: less is not worth its parameters
@@ -95,7 +96,7 @@ def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Mo
             row = _row(candidate, trial, new, points, gain, bound, False)
             row["against"] = model.name
             table.append(row)
-            if gain > _GAIN and bound > 0 and (best is None or gain > best[0]):
+            if gain > _GAIN and bound > 0 and (best is None or gain > best[0]) and _determined(trial):
                 best = (gain, candidate, trial, new, row)
         if best is None:
             break
@@ -103,6 +104,16 @@ def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Mo
         row["accepted"] = True
         tried.add(model)
     return model, table
+
+
+def _determined(fit: Fit) -> bool:
+    """Not where camera and board drift along together, as aspect does where no view is rolled: held-out views of the
+    same kind cannot tell."""
+    try:
+        covariance_of(fit.copy())
+    except CalibrationError:
+        return False
+    return True
 
 
 def _row(
