@@ -19,6 +19,7 @@ _FOLDS = 5
 _GAIN = 0.003  # of the held-out RMS: less is not worth its parameters
 _BOOTSTRAP = 1000
 _ROUNDS = 8
+_DRIFT = 0.01  # of the focal length, one sigma: more is a drift with the board's aspect
 _FOLD_TOLERANCE = 1e-4  # of the cost: a sixtieth of _GAIN in RMS
 
 
@@ -110,10 +111,11 @@ def _determined(fit: Fit) -> bool:
     """Not where camera and board drift along together, as aspect does where no view is rolled: held-out views of the
     same kind cannot tell."""
     try:
-        covariance_of(fit.copy())
+        found = covariance_of(fit.copy())
     except CalibrationError:
         return False
-    return True
+    focal = [abs(fit.bundle.camera(c).f_u) for c in range(len(found))]
+    return all(math.sqrt(u.parameters()[0, 0]) < _DRIFT * f for u, f in zip(found, focal, strict=True))
 
 
 def _row(
