@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from .calib_data import Array
+from .calib_data import Array, CalibrationError
 from .calib_fit import Fit
 from .calib_model import Model
+from .calib_report import covariance_of
 
 _FOLDS = 5
 _GAIN = 0.003  # of the held-out RMS: less is not worth its parameters
 _BOOTSTRAP = 1000
 _ROUNDS = 8
-_MOST_POINTS = 6000  # for folds; more say the same and cost time
+_DRIFT = 0.01  # of the focal length, one sigma: more is a drift with the board's aspect
+_FOLD_TOLERANCE = 1e-4  # of the cost: a sixtieth of _GAIN in RMS
 
 
 def folds(fit: Fit, count: int = _FOLDS) -> Array:
@@ -43,7 +47,7 @@ def held_out(fit: Fit, model: Model, number: Array) -> tuple[Array, Array]:
             continue
         rest = fit.copy()
         rest.used = fit.used & ~out
-        rest.fit(model, iterations=10, tolerance=1e-5)
+        rest.fit(model, iterations=10, tolerance=_FOLD_TOLERANCE)
         rest.used = out
         rest.freeze()
         rest.bundle.adjust(10, 1e-6)
@@ -60,6 +64,18 @@ def bound_of_gain(old: Array, new: Array, seed: int = 1) -> float:
     return float(1 - np.quantile(ratio, 0.9))
 
 
+def tries(state: Fit, candidates: list[Model], number: Array) -> Iterator[tuple[Fit, Array]]:
+    """Each candidate's fit and its sums of squares of held-out frames, in order; as many at once as there are cores."""
+
+    def one(candidate: Model) -> tuple[Fit, Array]:
+        trial = state.copy()
+        trial.fit(candidate, iterations=20, tolerance=1e-6)
+        return trial, held_out(trial, candidate, number)[0]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(one, candidates)
+
+
 def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Model, list[dict[str, Any]]]:
     """The model that held-out views accept, from a settled p9 on a flat board, and the table of all that were tried."""
     number = folds(fit)
@@ -73,19 +89,15 @@ def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Mo
     for turn in range(_ROUNDS):
         best: tuple[float, Model, Fit, Array, dict[str, Any]] | None = None
         candidates = [m for m in model.steps() if (shape or m.shape == "flat") and m not in tried]
-        for i, candidate in enumerate(candidates):
-            progress((turn + i / len(candidates)) / _ROUNDS)
-            if sum(candidate.freedom) > 0.1 * state.used.sum():
-                continue
-            trial = state.copy()
-            trial.fit(candidate, iterations=20, tolerance=1e-6)
-            new, _ = held_out(trial, candidate, number)
+        candidates = [m for m in candidates if sum(m.freedom) <= 0.1 * state.used.sum()]
+        for i, (candidate, (trial, new)) in enumerate(zip(candidates, tries(state, candidates, number), strict=True)):
+            progress((turn + (i + 1) / len(candidates)) / _ROUNDS)
             gain = 1 - math.sqrt(new.sum() / squares.sum())
             bound = bound_of_gain(squares[alive], new[alive])
             row = _row(candidate, trial, new, points, gain, bound, False)
             row["against"] = model.name
             table.append(row)
-            if gain > _GAIN and bound > 0 and (best is None or gain > best[0]):
+            if gain > _GAIN and bound > 0 and (best is None or gain > best[0]) and _determined(trial):
                 best = (gain, candidate, trial, new, row)
         if best is None:
             break
@@ -93,6 +105,17 @@ def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Mo
         row["accepted"] = True
         tried.add(model)
     return model, table
+
+
+def _determined(fit: Fit) -> bool:
+    """Not where camera and board drift along together, as aspect does where no view is rolled: held-out views of the
+    same kind cannot tell."""
+    try:
+        found = covariance_of(fit.copy())
+    except CalibrationError:
+        return False
+    focal = [abs(fit.bundle.camera(c).f_u) for c in range(len(found))]
+    return all(math.sqrt(u.parameters()[0, 0]) < _DRIFT * f for u, f in zip(found, focal, strict=True))
 
 
 def _row(

@@ -204,13 +204,20 @@ class Data:
         return out
 
     def disc_planes(self) -> tuple[Array, Array]:
-        """Two unit vectors (N, 3) in the plane of each disc: that of the board, or of the nearest discs on it."""
+        """Two unit vectors (N, 3) in the plane of each disc: of the board, of the wall that a sleeve around its Z axis
+        lies on, or of the nearest discs."""
         across, down = np.zeros_like(self.xyz), np.zeros_like(self.xyz)
         across[:, 0], down[:, 1] = 1.0, 1.0
         for i, board in enumerate(self.boards):
             if board.planar:
                 continue
             mine = np.flatnonzero(self.board_of[self.view_of] == i)
+            radius = np.hypot(board.points[:, 0], board.points[:, 1])
+            if np.ptp(radius) < 1e-6 * radius.max():
+                x, y = (self.xyz[mine, :2] / np.hypot(*self.xyz[mine, :2].T)[:, None]).T
+                across[mine] = np.stack([-y, x, 0 * x], axis=1)
+                down[mine] = [0.0, 0.0, 1.0]
+                continue
             for k in mine:
                 near = np.argsort(((board.points - self.xyz[k]) ** 2).sum(axis=1))[:9]
                 _, _, axes = np.linalg.svd(board.points[near] - board.points[near].mean(axis=0))

@@ -80,12 +80,13 @@ class Single:
         width, height = self.data.size[self.index]
         c_u, c_v = circle[:2] if circle else ((width - 1) / 2, (height - 1) / 2)
         best: tuple[float, Any, Mask] | None = None
-        for profile, median, _ in self.bundle.sweep(self.index, width, height, c_u, c_v):
-            if best is not None and median > 5 * best[0] + 20:
-                break
-            tried = self._try(profile)
-            if tried is not None and (best is None or tried[0] < best[0]):
-                best = tried
+        for classical in (False, True):  # nearly every lens is found from the equidistant start
+            for profile, median, _ in self.bundle.sweep(self.index, width, height, c_u, c_v, classical):
+                if best is not None and (best[0] < 0.0004 * max(width, height) or median > 5 * best[0] + 20):
+                    break
+                tried = self._try(profile)
+                if tried is not None and (best is None or tried[0] < best[0]):
+                    best = tried
             if best is not None and best[0] < 0.0004 * max(width, height):
                 break
         if best is None:
@@ -138,6 +139,7 @@ class Single:
         camera = self.bundle.camera(self.index)
         camera.theta_max = _engine.rising_end(camera, THETA_END)
         self.bundle.set_camera(self.index, camera)
+        self.bundle.set_used(np.ones(len(self.pixels), dtype=bool))  # a lost view's points were not
         fresh = {int(v): self.bundle.view_pose(int(v)) for v in bad}
         camera.theta_max = THETA_END
         self.bundle.set_camera(self.index, camera)

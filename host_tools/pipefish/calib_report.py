@@ -123,7 +123,7 @@ def _cross(v: Array) -> Array:
     return out - out.swapaxes(-1, -2)
 
 
-def covariance_of(fit: Fit, noise: str) -> list[Uncertainty]:
+def covariance_of(fit: Fit) -> list[Uncertainty]:
     """Of every camera, from the state of a fit. Raises CalibrationError where the views leave something open."""
     data, bundle = fit.data, fit.bundle
     fit.free(fit.model)
@@ -268,7 +268,7 @@ def halves_difference(fit: Fit) -> list[dict[str, float]]:
         part.used = fit.used & np.isin(frame_of_point, frames[half::2])
         part.fit(fit.model, iterations=40, tolerance=1e-8)
         try:
-            uncertainties.append(covariance_of(part, "field"))
+            uncertainties.append(covariance_of(part))
         except CalibrationError:  # half of the views may leave something open
             return []
         cameras.append([_bounded(part, c) for c in range(len(data.cameras))])

@@ -6,8 +6,20 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+import pipefish as pf
 from pipefish.calibration import View
+
+#: Pictures: folder, pattern, squares of the checkerboard (rows, cols), metres (where unknown: any).
+PICTURES = {
+    "Fisheye1": ("ocam", "Fisheye1_*.jpg", 9, 7, 0.03),
+    "Fisheye2": ("ocam", "Fisheye2_*.jpg", 9, 7, 0.03),
+    "catadioptric": ("catadioptric", "*.jpg", 7, 10, 0.03),
+    "camodocal": ("camodocal", "*.png", 7, 10, 0.03),
+    "jy_stereo left": ("jy_stereo/left", "*.jpg", 7, 9, 0.0244),
+    "jy_stereo right": ("jy_stereo/right", "*.jpg", 7, 9, 0.0244),
+}
 
 
 def ov_plane(data: Path, part: str) -> tuple[list[View], tuple[int, int]]:
@@ -33,3 +45,22 @@ def jy_stereo(data: Path, camera: int) -> tuple[list[View], tuple[int, int]]:
         pixels = np.array(node.find("data").text.split(), dtype=float).reshape(-1, 2)
         views.append(View(board, pixels, camera=camera - 1, name=f"{i}"))
     return views, (1280, 800)
+
+
+def pictures(data: Path, name: str, every: int = 1) -> tuple[list[View], tuple[int, int], int]:
+    """Views of one of PICTURES with the project's own detector and its default options, each `every`-th picture, and
+    how many pictures that were; jy_stereo's right camera is camera 1, pairs share a name."""
+    folder, pattern, rows, cols, spacing = PICTURES[name]
+    target = pf.Target("checkerboard", rows, cols, spacing)
+    files = sorted((data / folder).glob(pattern))[::every]
+    views, size = [], (0, 0)
+    for file in files:
+        picture = Image.open(file).convert("L")
+        found = pf.detect_target(np.array(picture), target)
+        if found:
+            number = "".join(c for c in file.stem if c.isdigit())
+            views.append(
+                View(target.points()[found.ids], found.pixels, camera=int(name.endswith("right")), name=number)
+            )
+        size = picture.size
+    return views, size, len(files)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pipefish as pf
-from calib_scenes import RADII, Lens, bearing_error, board, turn, views_of
+from calib_scenes import RADII, Lens, bearing_error, board, random_lens, turn, views_of
 from pipefish import _engine
 from pipefish.calibration import Calibration, CalibrationError, View, calibrate
 
@@ -52,6 +52,14 @@ def test_a_board_at_180_degrees_and_more_keeps_its_side() -> None:
     result = calibrate(views, (1024, 1024), "p9", "flat")
     assert np.allclose(result.poses, poses, atol=1e-6)
     assert result.camera.theta_covered > math.radians(95)
+
+
+def test_views_beyond_the_first_lens_are_taken_back_by_the_better_one() -> None:
+    """Views at 105 degrees and more, for which the first p6 had no rays, were taken for another camera's."""
+    random = np.random.default_rng(598)  # five of 21 views of this set-up were lost
+    lens, count, noise = random_lens(random), int(random.integers(5, 31)), float(random.uniform(0.0, 0.5))
+    views, _ = views_of(random, lens, count, noise, 0.02)
+    assert all(v["used"] for v in calibrate(views, (1024, 1024), "p9", "flat").report["views"])
 
 
 def test_derivatives_of_everything_lead_to_the_exact_solution_in_a_few_steps() -> None:
@@ -172,6 +180,60 @@ def test_circles_leave_no_bias_when_their_radius_is_known() -> None:
     assert with_radius.rms < 2e-5
     assert without.rms > 100 * with_radius.rms  # and the bias that poses and lens take up is not even in it
     assert np.allclose(with_radius.poses, poses, atol=1e-6)
+
+
+def sleeve_views(target: pf.Target, count: int, noise: float, radius: float) -> tuple[list[View], list[np.ndarray]]:
+    """From inside the pipe, looking along it; pixels are centroids of discs if they have a radius."""
+    random = np.random.default_rng(31)
+    views, poses = [], []
+    while len(views) < count:
+        rotation = turn(np.array([*random.uniform(-0.5, 0.5, 2), 0.0])) @ turn(
+            np.array([0, 0, random.uniform(0, 6.28)])
+        )
+        centre = np.array([*random.uniform(-0.05, 0.05, 2), random.uniform(-0.12, 0.05)])
+        pose = np.column_stack([rotation, -rotation @ centre])
+        points = target.points()
+        pixels, seen = LENS.project(points @ pose[:, :3].T + pose[:, 3])
+        if seen.sum() < 20:
+            continue
+        if radius:
+            spin = 2 * np.pi * np.arange(64) / 64
+            for i in np.flatnonzero(seen):  # discs drawn on a tangent plane; area by Green over a fine rim
+                out = points[i] * [1, 1, 0] / np.hypot(*points[i, :2])
+                across, down = np.cross(out, [0, 0, 1.0]), np.array([0, 0, 1.0])
+                rim = points[i] + radius * (np.outer(np.cos(spin), across) + np.outer(np.sin(spin), down))
+                u, v = (LENS.project(rim @ pose[:, :3].T + pose[:, 3])[0] - pixels[i]).T
+                next_u, next_v = np.roll(u, -1), np.roll(v, -1)
+                part = u * next_v - next_u * v
+                pixels[i] += np.array([((u + next_u) * part).sum(), ((v + next_v) * part).sum()]) / (3 * part.sum())
+        views.append(View(points[seen], pixels[seen] + random.normal(0, noise, (int(seen.sum()), 2))))
+        poses.append(pose)
+    return views, poses
+
+
+def test_a_sleeve_around_the_inside_of_a_pipe_calibrates_without_a_guess() -> None:
+    """Not a plane: the start is the 3 x 4 form. Exact points give the exact lens; noisy ones leave what they must."""
+    target = pf.Target("sleeve", 5, 16, 0.05, diameter_m=0.3)
+    views, poses = sleeve_views(target, 8, 0.0, 0.0)
+    exact = calibrate(views, SIZE, "p9")
+    assert exact.model == "p9"  # a sheet's shape means nothing here
+    assert exact.camera.f_u == pytest.approx(330, abs=1e-6)
+    assert np.allclose(exact.poses, poses, atol=1e-9)
+    views, poses = sleeve_views(target, 8, 0.1, 0.0)
+    result = calibrate(views, SIZE)
+    assert result.rms == pytest.approx(0.1 * math.sqrt(2), rel=0.1)
+    # Some 300 points an axis for 8 + 48 unknowns: 0.1 px * sqrt(56 / 600) in the mean, three times that at worst.
+    assert bearing_error(result.camera, LENS, views, poses) * LENS.f < 0.1
+
+
+def test_discs_of_a_sleeve_lie_in_the_wall() -> None:
+    """Their planes come from their neighbours: a disc in another plane has another centroid."""
+    target = pf.Target("sleeve", 5, 16, 0.05, diameter_m=0.3)
+    views, _ = sleeve_views(target, 8, 0.0, 0.012)
+    right = calibrate(views, SIZE, "p9", circle_radius=0.012)
+    points = calibrate(views, SIZE, "p9")
+    assert right.rms < 0.1 * points.rms
+    assert abs(right.camera.f_u - 330) < 0.2 * abs(points.camera.f_u - 330)
 
 
 def test_outliers_are_left_out_and_named() -> None:
@@ -407,6 +469,26 @@ def test_more_views_make_pipes_more_certain_and_the_report_is_plain() -> None:
     assert camera["noise"]["sigma_px"][0] == pytest.approx(0.1, rel=0.4)
     assert many.camera.provenance.views == 24
     assert many.camera.covariance.shape == (8, 8)
+
+
+def test_the_profile_carries_covariance_and_held_out_error_through_its_file(tmp_path) -> None:
+    """p23's 22 parameters are free in 20 directions: its two unit vectors have one each that means nothing."""
+    views, _ = scene(24, 12)
+    result = calibrate(views, SIZE, "p23", "flat")
+    result.camera.save(tmp_path / "p23.json")
+    back = pf.Camera.load(tmp_path / "p23.json")
+    assert back.covariance_parameters == result.camera.covariance_parameters and len(back.covariance_parameters) == 22
+    np.testing.assert_allclose(back.covariance, result.covariance, rtol=1e-12)
+    sigma = np.sqrt(np.diag(back.covariance))
+    values = np.linalg.eigvalsh(back.covariance / np.outer(sigma, sigma))
+    assert (values > 1e-9).sum() == 20
+    assert back.held_out_rms_px is None
+    chosen = calibrate(views, SIZE)
+    chosen.camera.save(tmp_path / "auto.json")
+    back = pf.Camera.load(tmp_path / "auto.json")
+    assert back.held_out_rms_px == [r["held_out_rms_px"] for r in chosen.report["models"] if r["accepted"]][-1]
+    assert back.held_out_rms_px == pytest.approx(0.1 * math.sqrt(2), rel=0.1)
+    assert back.provenance.held_out_views == 12
 
 
 def test_results_do_not_depend_on_the_run() -> None:

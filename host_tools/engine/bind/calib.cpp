@@ -180,14 +180,15 @@ nb::object view_pose_of(const Bundle &bundle, size_t index)
     return pose ? nb::cast(from_pose(*pose)) : nb::none();
 }
 
-nb::list sweep_of(const Bundle &bundle, int camera, uint32_t width, uint32_t height, double c_u, double c_v)
+nb::list sweep_of(const Bundle &bundle, int camera, uint32_t width, uint32_t height, double c_u, double c_v,
+                  bool classical)
 {
     std::vector<View> views;
     for (const View &view : bundle.views)
         if (view.camera == camera)
             views.push_back(view);
     nb::list out;
-    for (const Start &start : sweep(views, width, height, c_u, c_v)) {
+    for (const Start &start : sweep(views, width, height, c_u, c_v, classical)) {
         pf_profile profile{};
         profile.camera = start.camera;
         out.append(nb::make_tuple(profile, start.median_px, start.radial));
@@ -300,8 +301,8 @@ void bind_calib(nb::module_ &m)
                  return matrix(b.parameter_slope(i));
              })
         .def("view_pose", &view_pose_of, nb::arg("view"), "Board to camera (3, 4) by rays alone, or None.")
-        .def("sweep", &sweep_of, nb::arg("camera"), nb::arg("width"), nb::arg("height"), nb::arg("c_u"),
-             nb::arg("c_v"));
+        .def("sweep", &sweep_of, nb::arg("camera"), nb::arg("width"), nb::arg("height"), nb::arg("c_u"), nb::arg("c_v"),
+             nb::arg("classical"));
     m.def(
         "rising_end", [](const pf_profile &p, double end) { return rising_end(p.camera, end); },
         "Largest angle, at most `end`, up to which the radius rises.");

@@ -25,28 +25,31 @@ Eigen::Vector3d Shape::at(const Eigen::Vector3d &drawn, Eigen::Matrix<double, 3,
     }
     const double s = (drawn.x() - centre_x) / half, t = (drawn.y() - centre_y) / half;
     const std::array<double, 7> p = legendre(s), q = legendre(t);
-    Eigen::Matrix<double, 3, kShape> basis = Eigen::Matrix<double, 3, kShape>::Zero();
-    basis(0, 0) = 0.5 * half * s;
-    basis(1, 0) = -0.5 * half * t;
-    basis(0, 1) = half * t;
+    // One row of the basis is not zero for each coefficient but the first: no matrix unless it is asked for.
+    if (d) {
+        d->setZero();
+    }
+    Eigen::Vector3d point = drawn;
+    const auto add = [&](int row, int term, double value) {
+        point[row] += coefficient[static_cast<size_t>(term)] * value;
+        if (d) {
+            (*d)(row, term) = value;
+        }
+    };
+    add(0, 0, 0.5 * half * s);
+    add(1, 0, -0.5 * half * t);
+    add(0, 1, half * t);
     int height = kShapeHeight, plane = kShapeInPlane;
     for (size_t degree = 2; degree <= 6; degree++) {
         for (size_t i = 0; i <= degree; i++) {
             const double value = half * p[degree - i] * q[i];
-            basis(2, height++) = value;
+            add(2, height++, value);
             if (degree <= 3) {
-                basis(0, plane) = value;
-                basis(1, plane + 7) = value;
+                add(0, plane, value);
+                add(1, plane + 7, value);
                 plane++;
             }
         }
-    }
-    Eigen::Vector3d point = drawn;
-    for (int i = 0; i < kShape; i++) {
-        point += coefficient[static_cast<size_t>(i)] * basis.col(i);
-    }
-    if (d) {
-        *d = basis;
     }
     return point;
 }

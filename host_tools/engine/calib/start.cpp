@@ -235,7 +235,8 @@ std::optional<Pose> view_pose(const pf_camera &camera, const View &view, const S
     return pose;
 }
 
-std::vector<Start> sweep(std::span<const View> views, uint32_t width, uint32_t height, double c_u, double c_v)
+std::vector<Start> sweep(std::span<const View> views, uint32_t width, uint32_t height, double c_u, double c_v,
+                         bool classical)
 {
     constexpr size_t kViews = 12, kPoints = 30;
     constexpr double kFirst = 0.08, kRatio = 1.18; // of the width: 220 degrees in a third of it, to 20 across it
@@ -269,6 +270,10 @@ std::vector<Start> sweep(std::span<const View> views, uint32_t width, uint32_t h
         return best_step;
     };
     const int middle = best_of(PF_RADIAL_EQUIDISTANT, 0, kSteps - 1);
+    if (!classical) {
+        return starts;
+    }
+    starts.clear();
     for (const uint32_t radial :
          {PF_RADIAL_EQUISOLID, PF_RADIAL_STEREOGRAPHIC, PF_RADIAL_PERSPECTIVE, PF_RADIAL_ORTHOGRAPHIC}) {
         best_of(radial, std::max(0, middle - 3), std::min(kSteps - 1, middle + 2));

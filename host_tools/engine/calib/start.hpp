@@ -27,7 +27,9 @@ struct Start {
     uint32_t radial = 0;    // the classical projection that it comes from
 };
 
-// The best of each classical projection over focal lengths, best first. Views are of one camera.
-std::vector<Start> sweep(std::span<const View> views, uint32_t width, uint32_t height, double c_u, double c_v);
+// The best equidistant lens over focal lengths; or, `classical`, that of each other classical projection near the best
+// equidistant one, best first. Views are of one camera. Empty: none explains them.
+std::vector<Start> sweep(std::span<const View> views, uint32_t width, uint32_t height, double c_u, double c_v,
+                         bool classical);
 
 } // namespace pipefish::calib

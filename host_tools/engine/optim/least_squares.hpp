@@ -248,7 +248,7 @@ public:
             }
             if (j_g) {
                 piece_->b_g.noalias() += weight * (jg.transpose() * residual);
-                piece_->h_gg.noalias() += weight * (jg.transpose() * jg);
+                piece_->h_gg.template selfadjointView<Eigen::Lower>().rankUpdate(jg.transpose(), weight);
             }
         }
 
@@ -444,7 +444,7 @@ private:
                 }
             }
             if (border_ > 0) {
-                s_gg_.noalias() -= h_eg_[e].transpose() * (inverse_e_[e] * h_eg_[e]);
+                s_gg_.template triangularView<Eigen::Lower>() -= h_eg_[e].transpose() * (inverse_e_[e] * h_eg_[e]);
             }
         }
         return factor_band() && factor_border();
@@ -491,7 +491,7 @@ private:
         }
         forward(s_fg_);
         for (size_t i = 0; i < count_f_; i++) {
-            s_gg_.noalias() -= s_fg_[i].transpose() * s_fg_[i];
+            s_gg_.template selfadjointView<Eigen::Lower>().rankUpdate(s_fg_[i].transpose(), -1.0);
         }
         // Scaled to unit diagonal before factoring, so that "singular" does not depend on units.
         scale_g_ = common_.h_gg.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
