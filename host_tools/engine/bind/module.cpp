@@ -8,6 +8,7 @@ void bind_camera(nb::module_ &m);
 void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
+void bind_match(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 void bind_tube(nb::module_ &m);
@@ -20,6 +21,7 @@ NB_MODULE(_engine, m)
     bind_conics(m);
     bind_detect(m);
     bind_link(m);
+    bind_match(m);
     bind_sim(m);
     bind_sim_studio(m);
     bind_tube(m);

@@ -1,0 +1,477 @@
+#include "match/grow.hpp"
+
+#include "match/moments.hpp"
+#include "match/refine.hpp"
+#include "match/vec.hpp"
+#include "parallel.hpp"
+
+#include <Eigen/LU>
+#include <opencv2/imgproc.hpp>
+
+#include <algorithm>
+#include <cmath>
+
+namespace pipefish::match
+{
+
+namespace
+{
+
+constexpr int kReach = 2;      // new matches within 5 x 5 pixels of their parent
+constexpr int kRadiusMost = 7; // of the correlation window
+constexpr int kFree = -1, kBarred = -2;
+constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
+
+// Best first, in constant time: 4096 classes of correlation, first in first out within a class.
+class Queue
+{
+public:
+    void push(float zncc, int id)
+    {
+        const int k = std::clamp(static_cast<int>(zncc * kClasses), 0, kClasses - 1);
+        next_.resize(static_cast<size_t>(std::max<int>(id + 1, static_cast<int>(next_.size()))), -1);
+        (tail_[k] < 0 ? head_[k] : next_[static_cast<size_t>(tail_[k])]) = id;
+        tail_[k] = id;
+        top_ = std::max(top_, k);
+    }
+
+    // -1 when empty.
+    int pop()
+    {
+        while (top_ >= 0 && head_[top_] < 0)
+            top_--;
+        if (top_ < 0)
+            return -1;
+        const int id = head_[top_];
+        head_[top_] = next_[static_cast<size_t>(id)];
+        if (head_[top_] < 0)
+            tail_[top_] = -1;
+        return id;
+    }
+
+private:
+    static constexpr int kClasses = 4096;
+    std::vector<int> head_ = std::vector<int>(kClasses, -1), tail_ = head_, next_;
+    int top_ = -1;
+};
+
+struct Candidate {
+    int order; // of the neighbour: breaks ties
+    int x, y;
+    Eigen::Vector2f centre;
+    float zncc;
+    bool at_border;
+};
+
+// A window of image 1, mean removed, rows in whole Float4s that end in zeros: a product with any other window then is
+// the sum over the window only.
+struct Window {
+    int side = 0, vectors = 0;
+    alignas(16) float v[(2 * kRadiusMost + 1) * (2 * kRadiusMost + 2)];
+    float inverse_sigma = 0;
+
+    // `from`: top left; values `step` apart. False where flat.
+    bool take(const float *from, size_t stride, int step, int radius, double sigma_min)
+    {
+        side = 2 * radius + 1;
+        vectors = (side + 3) / 4;
+        float sum = 0;
+        for (int j = 0; j < side; j++)
+            for (int i = 0; i < side; i++)
+                sum += from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)];
+        const float mean = sum / static_cast<float>(side * side);
+        float squares = 0;
+        for (int j = 0; j < side; j++) {
+            float *row = v + j * 4 * vectors;
+            store(row + 4 * vectors - 4, Float4{});
+            for (int i = 0; i < side; i++) {
+                row[i] = from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)] - mean;
+                squares += row[i] * row[i];
+            }
+        }
+        const auto count = static_cast<float>(side * side);
+        inverse_sigma = 1 / std::sqrt(squares);
+        return squares >= static_cast<float>(sigma_min * sigma_min) * count;
+    }
+
+    // Sum of products with the window at `from` (values next to each other).
+    float dot(const float *from, size_t stride) const
+    {
+        Float4 sum = {};
+        for (int j = 0; j < side; j++)
+            for (int k = 0; k < vectors; k++)
+                sum += load(v + 4 * (j * vectors + k)) * load(from + static_cast<size_t>(j) * stride + 4 * k);
+        return total(sum);
+    }
+};
+
+// Where the maximum of a parabola through three values is, -0.5..0.5.
+float parabola(float left, float middle, float right)
+{
+    const float bend = left - 2 * middle + right;
+    return bend < 0 ? std::clamp(0.5F * (left - right) / bend, -0.5F, 0.5F) : 0.0F;
+}
+
+// Correlations at the 3 x 3 places around a prediction: the best, and the maximum near it.
+struct Peak {
+    float zncc = -1;
+    Eigen::Vector2f at = Eigen::Vector2f::Zero();
+    bool at_border = false;
+
+    explicit Peak(const float (&z)[3][3])
+    {
+        int bi = 1, bj = 1;
+        zncc = z[1][1];
+        for (int j = 0; j < 3; j++)
+            for (int i = 0; i < 3; i++)
+                if (z[j][i] > zncc)
+                    zncc = z[j][i], bi = i, bj = j;
+        at_border = bi != 1 || bj != 1;
+        at = {static_cast<float>(bi - 1), static_cast<float>(bj - 1)};
+        if (bi == 1 && z[bj][0] > -1 && z[bj][2] > -1)
+            at.x() = parabola(z[bj][0], z[bj][1], z[bj][2]);
+        if (bj == 1 && z[0][bi] > -1 && z[2][bi] > -1)
+            at.y() = parabola(z[0][bi], z[1][bi], z[2][bi]);
+    }
+};
+
+class Grower
+{
+public:
+    Grower(const ScaleStack &first, const ScaleStack &second, const Options &options, const Epipolar *epipolar)
+        : first_(first), second_(second), options_(options), epipolar_(epipolar)
+    {
+        const auto map_of = [&](const ScaleStack &stack) {
+            cv::Mat1i map(stack.height(), stack.width(), kBarred);
+            map.setTo(kFree, textured(stack.image(), options.texture));
+            return map;
+        };
+        map_1_ = map_of(first);
+        map_2_ = map_of(second);
+        if (options.mode == Mode::kTranslation)
+            window_statistics();
+    }
+
+    Growth run(const std::vector<Seed> &seeds)
+    {
+        plant(seeds);
+        std::vector<Candidate> found;
+        for (int id = queue_.pop(); id >= 0; id = queue_.pop()) {
+            const Match parent = out_.matches[static_cast<size_t>(id)];
+            found.clear();
+            if (options_.mode == Mode::kTranslation)
+                look_around_whole(parent, found);
+            else
+                look_around(parent, found);
+            std::sort(found.begin(), found.end(), [](const Candidate &p, const Candidate &q) {
+                return p.zncc != q.zncc ? p.zncc > q.zncc : p.order < q.order;
+            });
+            for (const Candidate &c : found)
+                accept(c, parent, id);
+        }
+        return std::move(out_);
+    }
+
+private:
+    int *cell_2(const Eigen::Vector2f &at)
+    {
+        const auto x = static_cast<int>(std::lround(at.x())), y = static_cast<int>(std::lround(at.y()));
+        return x >= 0 && y >= 0 && x < map_2_.cols && y < map_2_.rows ? &map_2_(y, x) : nullptr;
+    }
+
+    bool is_free(int x, int y) const
+    {
+        return x >= 0 && y >= 0 && x < map_1_.cols && y < map_1_.rows && map_1_(y, x) == kFree;
+    }
+
+    void commit(const Match &m)
+    {
+        const int id = static_cast<int>(out_.matches.size());
+        map_1_(m.y, m.x) = id;
+        *cell_2(m.centre) = id;
+        out_.matches.push_back(m);
+        queue_.push(m.zncc, id);
+    }
+
+    // Seeds are fitted on a larger patch first: they come from detectors, to a pixel or two.
+    void plant(const std::vector<Seed> &seeds)
+    {
+        std::vector<Match> ready(seeds.size());
+        parallel_for(static_cast<int>(seeds.size()), options_.threads, [&](int k) {
+            const Seed &s = seeds[static_cast<size_t>(k)];
+            Match &m = ready[static_cast<size_t>(k)];
+            m.x = static_cast<int>(std::lround(s.at.x()));
+            m.y = static_cast<int>(std::lround(s.at.y()));
+            m.seed = k;
+            Local local;
+            local.a = s.a.cast<float>();
+            local.centre = (s.centre + s.a * (Eigen::Vector2d(m.x, m.y) - s.at)).cast<float>();
+            if (!sane(local.a))
+                return;
+            const Local given = local;
+            for (int i = 0; i < (options_.refine_seeds ? 10 : 0); i++)
+                if (!refine(first_, second_, m.x, m.y, kPatchMost, options_.sigma_min, 3.0F, 0.4F, local))
+                    break;
+            if ((local.centre - given.centre).norm() > 3 * std::sqrt(std::abs(given.a.determinant())) + 1 ||
+                !measure(first_, second_, m.x, m.y, 7, options_.sigma_min, local))
+                return;
+            if (options_.mode == Mode::kTranslation)
+                local.a.setIdentity();
+            m.centre = local.centre;
+            m.a = local.a;
+            m.zncc = local.zncc;
+        });
+        std::vector<size_t> order(ready.size());
+        for (size_t k = 0; k < order.size(); k++)
+            order[k] = k;
+        std::stable_sort(order.begin(), order.end(), [&](size_t p, size_t q) { return ready[p].zncc > ready[q].zncc; });
+        for (const size_t k : order) {
+            const Match &m = ready[k];
+            if (static_cast<double>(m.zncc) < options_.seed_zncc_min || !is_free(m.x, m.y))
+                continue;
+            const int *cell = cell_2(m.centre);
+            const auto line = line_at(m.x, m.y, m.centre);
+            if (!cell || *cell != kFree || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
+                continue;
+            commit(m);
+            out_.seeds_used++;
+        }
+    }
+
+    std::optional<EpipolarLine> line_at(int x, int y, const Eigen::Vector2f &centre) const
+    {
+        return epipolar_ ? epipolar_->at({x, y}, centre.cast<double>()) : std::nullopt;
+    }
+
+    // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once: all windows of
+    // all neighbours are then windows of two small pictures. Where image 1 is the finer one, samples are `step` apart.
+    void look_around(const Match &m, std::vector<Candidate> &found)
+    {
+        int free = 0;
+        for (int dy = -kReach; dy <= kReach; dy++)
+            for (int dx = -kReach; dx <= kReach; dx++)
+                free += is_free(m.x + dx, m.y + dy);
+        if (!free)
+            return;
+        const Sampling s = sampling_for(first_, second_, m.a);
+        const int half = kReach + s.step * (options_.radius + 1), side = 2 * half + 1;
+        sample_block(m, s, half, side);
+        int order = 0;
+        for (int dy = -kReach; dy <= kReach; dy++)
+            for (int dx = -kReach; dx <= kReach; dx++, order++)
+                if (is_free(m.x + dx, m.y + dy))
+                    try_neighbour(m, s, half, dx, dy, order, found);
+    }
+
+    void sample_block(const Match &m, const Sampling &s, int half, int side)
+    {
+        stride_ = static_cast<size_t>(side + 4);
+        block_.assign(stride_ * static_cast<size_t>(side + 1), 0.0F);
+        const Eigen::Vector2f start = m.centre - static_cast<float>(half) * (m.a.col(0) + m.a.col(1));
+        const float middle = bilinear(*s.second, m.centre.x(), m.centre.y());
+        for (int j = 0; j < side; j++) {
+            const Eigen::Vector2f row = start + m.a.col(1) * static_cast<float>(j);
+            float *out = block_.data() + static_cast<size_t>(j) * stride_;
+            for (int i = 0; i < side; i++) {
+                const auto t = static_cast<float>(i);
+                out[i] = bilinear(*s.second, row.x() + m.a(0, 0) * t, row.y() + m.a(1, 0) * t) - middle;
+            }
+        }
+        std::fill(std::begin(known_), std::end(known_), false);
+    }
+
+    // Mean-free norm of the window of the block whose top left is (i, j): kept, up to nine neighbours ask for it. 0 if
+    // flat.
+    float inverse_sigma_at(int i, int j, int step)
+    {
+        const auto key = static_cast<size_t>(j * (2 * (kReach + 4) + 1) + i);
+        if (!known_[key]) {
+            known_[key] = true;
+            const int n = 2 * options_.radius + 1;
+            float sum = 0, squares = 0;
+            for (int v = 0; v < n; v++) {
+                const float *row = block_.data() + static_cast<size_t>(j + v * step) * stride_ + i;
+                for (int u = 0; u < n; u++) {
+                    sum += row[u * step];
+                    squares += row[u * step] * row[u * step];
+                }
+            }
+            const auto count = static_cast<float>(n * n);
+            const float variance = squares - sum * sum / count;
+            inverse_[key] = variance >= static_cast<float>(options_.sigma_min * options_.sigma_min) * count
+                                ? 1 / std::sqrt(variance)
+                                : 0;
+        }
+        return inverse_[key];
+    }
+
+    void try_neighbour(const Match &m, const Sampling &s, int half, int dx, int dy, int order,
+                       std::vector<Candidate> &found)
+    {
+        const int r = options_.radius, k = s.step, x = m.x + dx, y = m.y + dy;
+        if (x < r * k || y < r * k || x + r * k >= first_.width() || y + r * k >= first_.height())
+            return;
+        out_.tried++;
+        Window window;
+        if (!window.take((*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))
+            return;
+        float z[3][3];
+        for (int ej = -1; ej <= 1; ej++)
+            for (int ei = -1; ei <= 1; ei++) {
+                const int i = half + dx + (ei - r) * k, j = half + dy + (ej - r) * k;
+                const Eigen::Vector2f offset(static_cast<float>(dx + ei * k), static_cast<float>(dy + ej * k));
+                float &out = z[ej + 1][ei + 1];
+                out = -1;
+                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(r * k)))
+                    continue;
+                const float scale = inverse_sigma_at(i, j, k);
+                if (scale > 0)
+                    out = scale * window.inverse_sigma * product(window, i, j, k);
+            }
+        const Peak peak(z);
+        if (static_cast<double>(peak.zncc) < options_.zncc_min) {
+            out_.low_zncc++;
+            return;
+        }
+        const Eigen::Vector2f offset =
+            Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)) + peak.at * static_cast<float>(k);
+        found.push_back({order, x, y, m.centre + m.a * offset, peak.zncc, peak.at_border});
+    }
+
+    float product(const Window &window, int i, int j, int step)
+    {
+        const float *from = block_.data() + static_cast<size_t>(j) * stride_ + i;
+        if (step == 1)
+            return window.dot(from, stride_);
+        float sum = 0;
+        for (int v = 0; v < window.side; v++)
+            for (int u = 0; u < window.side; u++)
+                sum += window.v[v * 4 * window.vectors + u] *
+                       from[static_cast<size_t>(v * step) * stride_ + static_cast<size_t>(u * step)];
+        return sum;
+    }
+
+    // ---- translation: windows of the images themselves, their means and deviations computed once
+
+    void window_statistics()
+    {
+        const int n = 2 * options_.radius + 1;
+        const auto of = [&](const Image &image, cv::Mat1f &inverse) {
+            cv::Mat1f mean, squares;
+            cv::boxFilter(image, mean, CV_32F, {n, n});
+            cv::sqrBoxFilter(image, squares, CV_32F, {n, n});
+            inverse.create(image.size());
+            const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
+            for (int y = 0; y < image.rows; y++)
+                for (int x = 0; x < image.cols; x++) {
+                    const float variance = squares(y, x) - mean(y, x) * mean(y, x);
+                    inverse(y, x) = variance >= floor ? 1 / std::sqrt(variance * static_cast<float>(n * n)) : 0.0F;
+                }
+        };
+        of(second_.image(), inverse_2_);
+    }
+
+    void look_around_whole(const Match &m, std::vector<Candidate> &found)
+    {
+        const int r = options_.radius, margin = r + 4;
+        const int tx = static_cast<int>(std::lround(m.centre.x())) - m.x,
+                  ty = static_cast<int>(std::lround(m.centre.y())) - m.y;
+        int order = 0;
+        for (int y = m.y - kReach; y <= m.y + kReach; y++)
+            for (int x = m.x - kReach; x <= m.x + kReach; x++, order++) {
+                const int x_2 = x + tx, y_2 = y + ty;
+                if (!is_free(x, y) || x < margin || y < margin || x + margin >= map_1_.cols ||
+                    y + margin >= map_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= map_2_.cols ||
+                    y_2 + margin >= map_2_.rows)
+                    continue;
+                out_.tried++;
+                Window window;
+                const Image &one = first_.image(), &two = second_.image();
+                if (!window.take(one[y - r] + x - r, one.step1(), 1, r, options_.sigma_min))
+                    continue;
+                float z[3][3];
+                for (int ej = -1; ej <= 1; ej++)
+                    for (int ei = -1; ei <= 1; ei++)
+                        z[ej + 1][ei + 1] = inverse_2_(y_2 + ej, x_2 + ei) * window.inverse_sigma *
+                                            window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
+                const Peak peak(z);
+                if (static_cast<double>(peak.zncc) < options_.zncc_min) {
+                    out_.low_zncc++;
+                    continue;
+                }
+                found.push_back({order, x, y,
+                                 Eigen::Vector2f(static_cast<float>(x_2), static_cast<float>(y_2)) + peak.at, peak.zncc,
+                                 peak.at_border});
+            }
+    }
+
+    // ---- taking a candidate
+
+    void accept(const Candidate &c, const Match &parent, int id)
+    {
+        if (map_1_(c.y, c.x) != kFree)
+            return;
+        const int *cell = cell_2(c.centre);
+        if (!cell || *cell != kFree) {
+            out_.taken++;
+            return;
+        }
+        const auto line = line_at(c.x, c.y, c.centre);
+        if (epipolar_ && (!line || line->distance() > options_.epipolar_px)) {
+            out_.off_line++;
+            return;
+        }
+        Local local{c.centre, parent.a, c.zncc};
+        if (options_.mode != Mode::kTranslation)
+            adapt(c, line ? &*line : nullptr, local);
+        cell = cell_2(local.centre);
+        if (!cell || *cell != kFree || static_cast<double>(local.zncc) < options_.zncc_min) {
+            out_.taken++;
+            return;
+        }
+        out_.at_border += c.at_border;
+        commit({c.x, c.y, local.centre, local.a, local.zncc, id, parent.seed});
+    }
+
+    void adapt(const Candidate &c, const EpipolarLine *line, Local &local)
+    {
+        const int r = options_.radius;
+        if (options_.mode == Mode::kConstant) {
+            refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.0F, local);
+            return;
+        }
+        if (options_.adaptation != Adaptation::kFit)
+            adapt_by_moments(first_, second_, c.x, c.y, options_, line, local);
+        if (options_.adaptation != Adaptation::kIntensity && c.zncc >= 0.8F)
+            refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local);
+        if (line) {
+            Local held = local;
+            held.a = line->corrected(local.a);
+            if (sane(held.a) && (held.a - local.a).norm() <= 0.4F * local.a.norm() &&
+                measure(first_, second_, c.x, c.y, r + 1, options_.sigma_min, held) && held.zncc >= local.zncc)
+                local = held;
+        }
+    }
+
+    const ScaleStack &first_, &second_;
+    const Options &options_;
+    const Epipolar *epipolar_;
+    cv::Mat1i map_1_, map_2_; // index of the match, kFree or kBarred
+    cv::Mat1f inverse_2_;
+    Queue queue_;
+    Growth out_;
+    std::vector<float> block_;
+    size_t stride_ = 0;
+    bool known_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
+    float inverse_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
+};
+
+} // namespace
+
+Growth grow(const ScaleStack &first, const ScaleStack &second, const std::vector<Seed> &seeds, const Options &options,
+            const Epipolar *epipolar)
+{
+    return Grower(first, second, options, epipolar).run(seeds);
+}
+
+} // namespace pipefish::match

@@ -1,0 +1,65 @@
+// Grey images for matching: values 0..1, pixel centres at integers, and the same image blurred for coarser sampling.
+#pragma once
+
+#include <Eigen/Core>
+#include <opencv2/core.hpp>
+
+#include <algorithm>
+#include <array>
+#include <memory>
+#include <mutex>
+
+namespace pipefish::match
+{
+
+using Image = cv::Mat_<float>;
+
+// An image and its blurred copies, all at full resolution: level l is for samples 2^(l/2) pixels apart. Copies are made
+// when first asked for. Safe to share between threads.
+class ScaleStack
+{
+public:
+    static constexpr int kLevels = 6;
+
+    explicit ScaleStack(Image image);
+
+    // The level for samples `step` pixels apart: the sampling then is as if the image were coarser, not aliased.
+    const Image &for_step(double step) const;
+    const Image &image() const { return levels_[0]; }
+    int width() const { return levels_[0].cols; }
+    int height() const { return levels_[0].rows; }
+
+private:
+    mutable std::array<Image, kLevels> levels_;
+    mutable std::array<std::once_flag, kLevels> made_;
+};
+
+// 255 where a pixel differs from one of its four neighbours by more than `threshold`: the texture confidence of
+// Lhuillier and Quan. The border of one pixel is 0.
+cv::Mat_<uint8_t> textured(const Image &image, double threshold);
+
+// Bilinear value; (x, y) is clamped into the image.
+inline float bilinear(const Image &image, float x, float y)
+{
+    x = std::min(std::max(x, 0.0F), static_cast<float>(image.cols - 1) - 1e-3F);
+    y = std::min(std::max(y, 0.0F), static_cast<float>(image.rows - 1) - 1e-3F);
+    const int i = static_cast<int>(x), j = static_cast<int>(y);
+    const float a = x - static_cast<float>(i), b = y - static_cast<float>(j);
+    const float *p = image[j] + i, *q = image[j + 1] + i;
+    const float top = p[0] + a * (p[1] - p[0]), bottom = q[0] + a * (q[1] - q[0]);
+    return top + b * (bottom - top);
+}
+
+// Cubic (Catmull-Rom) value; 1 <= x < width - 2 and likewise y.
+float cubic(const Image &image, float x, float y);
+
+// Whether the parallelogram centre + A [-r, r]^2 lies where cubic() may be asked.
+inline bool inside(const Image &image, const Eigen::Vector2f &centre, const Eigen::Matrix2f &a, float r)
+{
+    const Eigen::Vector2f reach = r * a.cwiseAbs().rowwise().sum();
+    return centre.x() - reach.x() >= 1.0F && centre.y() - reach.y() >= 1.0F &&
+           centre.x() + reach.x() < static_cast<float>(image.cols - 2) &&
+           centre.y() + reach.y() < static_cast<float>(image.rows - 2);
+}
+
+} // namespace pipefish::match
