@@ -179,6 +179,20 @@ private:
         return x >= 0 && y >= 0 && x < map_2_.cols && y < map_2_.rows ? &map_2_(y, x) : nullptr;
     }
 
+    // Whether a place in image 2 is free among the nine where a search of steps `a` looks. The search may end up to
+    // half a step beside them; what is missed so costs a match now and then, what is saved is most of the work where
+    // image 1 is the finer one.
+    bool any_free_2(const Eigen::Vector2f &at, const Eigen::Matrix2f &a)
+    {
+        for (int j = -1; j <= 1; j++)
+            for (int i = -1; i <= 1; i++) {
+                const int *cell = cell_2(at + a * Eigen::Vector2f(static_cast<float>(i), static_cast<float>(j)));
+                if (cell && *cell == kFree)
+                    return true;
+            }
+        return false;
+    }
+
     bool is_free(int x, int y) const
     {
         return x >= 0 && y >= 0 && x < map_1_.cols && y < map_1_.rows && map_1_(y, x) == kFree;
@@ -277,7 +291,52 @@ private:
                 out[i] = bilinear(*s.second, row.x() + m.a(0, 0) * t, row.y() + m.a(1, 0) * t) - middle;
             }
         }
-        std::fill(std::begin(known_), std::end(known_), false);
+        if (s.step == 1)
+            box_sums(side);
+        else
+            std::fill(std::begin(known_), std::end(known_), false);
+    }
+
+    // Sums over all windows of a block of samples one apart, by running sums.
+    void box_sums(int side)
+    {
+        constexpr int kPlaces = 2 * (kReach + 1) + 1;
+        const int n = 2 * options_.radius + 1;
+        float sums[kBlockMost][kPlaces], squares[kBlockMost][kPlaces];
+        for (int j = 0; j < side; j++) {
+            const float *row = block_.data() + static_cast<size_t>(j) * stride_;
+            float sum = 0, square = 0;
+            for (int i = 0; i < n; i++) {
+                sum += row[i];
+                square += row[i] * row[i];
+            }
+            for (int i = 0; i < kPlaces; i++) {
+                sums[j][i] = sum;
+                squares[j][i] = square;
+                sum += row[i + n] - row[i];
+                square += row[i + n] * row[i + n] - row[i] * row[i];
+            }
+        }
+        for (int j = 0; j < kPlaces; j++) {
+            float sum[kPlaces] = {}, square[kPlaces] = {};
+            for (int v = j; v < j + n; v++)
+                for (int i = 0; i < kPlaces; i++) {
+                    sum[i] += sums[v][i];
+                    square[i] += squares[v][i];
+                }
+            for (int i = 0; i < kPlaces; i++)
+                keep(j, i, sum[i], square[i]);
+        }
+    }
+
+    void keep(int j, int i, float sum, float squares)
+    {
+        const auto key = static_cast<size_t>(j * (2 * (kReach + 4) + 1) + i);
+        const auto count = static_cast<float>((2 * options_.radius + 1) * (2 * options_.radius + 1));
+        const float variance = squares - sum * sum / count;
+        const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
+        inverse_[key] = variance >= floor * count ? 1 / std::sqrt(variance) : 0;
+        known_[key] = true;
     }
 
     // Mean-free norm of the window of the block whose top left is (i, j): kept, up to nine neighbours ask for it. 0 if
@@ -286,7 +345,6 @@ private:
     {
         const auto key = static_cast<size_t>(j * (2 * (kReach + 4) + 1) + i);
         if (!known_[key]) {
-            known_[key] = true;
             const int n = 2 * options_.radius + 1;
             float sum = 0, squares = 0;
             for (int v = 0; v < n; v++) {
@@ -296,11 +354,7 @@ private:
                     squares += row[u * step] * row[u * step];
                 }
             }
-            const auto count = static_cast<float>(n * n);
-            const float variance = squares - sum * sum / count;
-            inverse_[key] = variance >= static_cast<float>(options_.sigma_min * options_.sigma_min) * count
-                                ? 1 / std::sqrt(variance)
-                                : 0;
+            keep(j, i, sum, squares);
         }
         return inverse_[key];
     }
@@ -311,6 +365,11 @@ private:
         const int r = options_.radius, k = s.step, x = m.x + dx, y = m.y + dy;
         if (x < r * k || y < r * k || x + r * k >= first_.width() || y + r * k >= first_.height())
             return;
+        if (!any_free_2(m.centre + m.a * Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)),
+                        m.a * static_cast<float>(k))) {
+            out_.taken++;
+            return;
+        }
         out_.tried++;
         Window window;
         if (!window.take((*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))

@@ -1,7 +1,5 @@
 #include "match/image.hpp"
 
-#include "match/vec.hpp"
-
 #include <opencv2/imgproc.hpp>
 
 #include <cmath>
@@ -41,29 +39,6 @@ cv::Mat_<uint8_t> textured(const Image &image, double threshold)
         }
     }
     return out;
-}
-
-namespace
-{
-
-Float4 weights(float t)
-{
-    const float t2 = t * t, t3 = t2 * t;
-    return Float4{0.5F * (-t + 2 * t2 - t3), 0.5F * (2 - 5 * t2 + 3 * t3), 0.5F * (t + 4 * t2 - 3 * t3),
-                  0.5F * (t3 - t2)};
-}
-
-} // namespace
-
-float cubic(const Image &image, float x, float y)
-{
-    const int i = static_cast<int>(x), j = static_cast<int>(y);
-    const Float4 wx = weights(x - static_cast<float>(i)), wy = weights(y - static_cast<float>(j));
-    const size_t step = image.step1();
-    const float *p = image[j - 1] + i - 1;
-    const Float4 columns =
-        wy[0] * load(p) + wy[1] * load(p + step) + wy[2] * load(p + 2 * step) + wy[3] * load(p + 3 * step);
-    return total(columns * wx);
 }
 
 } // namespace pipefish::match

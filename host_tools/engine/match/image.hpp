@@ -1,6 +1,8 @@
 // Grey images for matching: values 0..1, pixel centres at integers, and the same image blurred for coarser sampling.
 #pragma once
 
+#include "match/vec.hpp"
+
 #include <Eigen/Core>
 #include <opencv2/core.hpp>
 
@@ -51,7 +53,19 @@ inline float bilinear(const Image &image, float x, float y)
 }
 
 // Cubic (Catmull-Rom) value; 1 <= x < width - 2 and likewise y.
-float cubic(const Image &image, float x, float y);
+inline float cubic(const Image &image, float x, float y)
+{
+    constexpr Float4 c0 = {0, 1, 0, 0}, c1 = {-0.5F, 0, 0.5F, 0}, c2 = {1, -2.5F, 2, -0.5F},
+                     c3 = {-0.5F, 1.5F, -1.5F, 0.5F};
+    const int i = static_cast<int>(x), j = static_cast<int>(y);
+    const float tx = x - static_cast<float>(i), ty = y - static_cast<float>(j);
+    const Float4 wx = ((c3 * tx + c2) * tx + c1) * tx + c0, wy = ((c3 * ty + c2) * ty + c1) * ty + c0;
+    const size_t step = image.step1();
+    const float *p = image[j - 1] + i - 1;
+    const Float4 columns =
+        wy[0] * load(p) + wy[1] * load(p + step) + wy[2] * load(p + 2 * step) + wy[3] * load(p + 3 * step);
+    return total(columns * wx);
+}
 
 // Whether the parallelogram centre + A [-r, r]^2 lies where cubic() may be asked.
 inline bool inside(const Image &image, const Eigen::Vector2f &centre, const Eigen::Matrix2f &a, float r)

@@ -20,12 +20,12 @@ void sample_first(const Sampling &s, int x, int y, int r, Patch &out)
     }
 }
 
-void sample_second(const Sampling &s, const Local &at, int r, Patch &out)
+void sample_second(const Sampling &s, const Local &at, int r, Patch &out, int rim)
 {
     const Eigen::Matrix2f a = at.a * static_cast<float>(s.step);
-    for (int j = 0; j < 2 * r + 3; j++) {
+    for (int j = 1 - rim; j < 2 * r + 2 + rim; j++) {
         const Eigen::Vector2f start = at.centre + a.col(1) * static_cast<float>(j - r - 1);
-        for (int i = 0; i < 2 * r + 3; i++) {
+        for (int i = 1 - rim; i < 2 * r + 2 + rim; i++) {
             const Eigen::Vector2f p = start + a.col(0) * static_cast<float>(i - r - 1);
             out.v[j][i] = cubic(*s.second, p.x(), p.y());
         }

@@ -34,7 +34,7 @@ struct Patch {
     alignas(16) float v[2 * kPatchMost + 3][kPatchWide + 4];
 };
 void sample_first(const Sampling &s, int x, int y, int r, Patch &out);
-void sample_second(const Sampling &s, const Local &at, int r, Patch &out);
+void sample_second(const Sampling &s, const Local &at, int r, Patch &out, int rim = 1); // rim 0: not the rim
 // Whether both may be sampled.
 bool fits(const Sampling &s, int x, int y, int r, const Local &at);
 

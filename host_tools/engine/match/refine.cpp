@@ -141,7 +141,20 @@ bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int
     moved.centre += local.a * t * static_cast<float>(s.step);
     if (max_change > 0)
         moved.a = local.a * (Eigen::Matrix2f::Identity() + c);
-    if (!sane(moved.a) || !measure(first, second, x, y, r, sigma_min, moved) || moved.zncc < local.zncc)
+    const Sampling s_2 = sampling_for(first, second, moved.a);
+    if (!sane(moved.a) || !fits(s_2, x, y, r, moved))
+        return false;
+    if (s_2.step != s.step || s_2.first != s.first) {
+        if (!measure(first, second, x, y, r, sigma_min, moved))
+            return false;
+    } else {
+        sample_second(s_2, moved, r, q, 0);
+        const Level moved_lq = level_of(q, r);
+        moved.zncc = correlate(p, lp, q, moved_lq, r);
+        if (static_cast<double>(moved_lq.sigma) < sigma_min)
+            return false;
+    }
+    if (moved.zncc < local.zncc)
         return false;
     local = moved;
     return true;

@@ -23,6 +23,20 @@ constexpr int kSide = 2 * kHalf + 1;
 
 constexpr int kAdaptHalf = 9;
 
+// exp(-i^2 / 2 sigma^2), -half <= i <= half
+template <size_t Size> std::array<double, Size> gaussian(double sigma)
+{
+    std::array<double, Size> out = {};
+    for (size_t i = 0; i < Size; i++) {
+        const double t = (static_cast<double>(i) - static_cast<double>(Size / 2)) / sigma;
+        out[i] = std::exp(-0.5 * t * t);
+    }
+    return out;
+}
+const auto kAdaptWindow = gaussian<2 * kAdaptHalf + 1>(4.5);
+const auto kTurnWindow = gaussian<kSide>(8);
+const auto kDescribeWindow = gaussian<kSide>(kHalf);
+
 using Normalised = std::array<std::array<float, kSide + 2>, kSide + 2>; // with a rim of one sample
 
 // at + shape * v for v in [-1, 1]^2 (and a rim), from the level whose blur suits the spacing.
@@ -67,7 +81,8 @@ bool adapt_shape(const ScaleStack &stack, Region &region)
                         p[static_cast<size_t>(j + dj + kAdaptHalf + 1)][static_cast<size_t>(i + di + kAdaptHalf + 1)]);
                 };
                 const Eigen::Vector2d g(at(1, 0) - at(-1, 0), at(0, 1) - at(0, -1));
-                const double w = std::exp(-0.5 * (i * i + j * j) / (4.5 * 4.5));
+                const double w = kAdaptWindow[static_cast<size_t>(i + kAdaptHalf)] *
+                                 kAdaptWindow[static_cast<size_t>(j + kAdaptHalf)];
                 m += w * g * g.transpose();
             }
         if (!(m.determinant() > 1e-6 * m.trace() * m.trace()))
@@ -92,11 +107,10 @@ std::vector<double> orientations(const Normalised &p)
     for (int j = 1; j <= kSide; j++)
         for (int i = 1; i <= kSide; i++) {
             const auto u = static_cast<size_t>(i), v = static_cast<size_t>(j);
-            const double gx = static_cast<double>(p[v][u + 1] - p[v][u - 1]);
-            const double gy = static_cast<double>(p[v + 1][u] - p[v - 1][u]);
-            const double r2 = (i - kHalf - 1) * (i - kHalf - 1) + (j - kHalf - 1) * (j - kHalf - 1);
-            const double at = std::atan2(gy, gx) / (2 * std::numbers::pi) * bins + bins;
-            raw[static_cast<size_t>(at) % bins] += std::exp(-r2 / (2 * 8.0 * 8.0)) * std::hypot(gx, gy);
+            const float gx = p[v][u + 1] - p[v][u - 1], gy = p[v + 1][u] - p[v - 1][u];
+            const auto at = static_cast<size_t>(cv::fastAtan2(gy, gx) * (bins / 360.0F));
+            raw[at % bins] +=
+                kTurnWindow[u - 1] * kTurnWindow[v - 1] * static_cast<double>(std::sqrt(gx * gx + gy * gy));
         }
     for (size_t k = 0; k < bins; k++)
         h[k] = 6 * raw[k] + 4 * (raw[(k + 1) % bins] + raw[(k + bins - 1) % bins]) + raw[(k + 2) % bins] +
@@ -127,9 +141,10 @@ Eigen::Matrix<float, kDescriptor, 1> descriptor(const Normalised &p)
             const auto u = static_cast<size_t>(i), v = static_cast<size_t>(j);
             const float gx = p[v][u + 1] - p[v][u - 1], gy = p[v + 1][u] - p[v - 1][u];
             const auto x = static_cast<float>(i - kHalf - 1), y = static_cast<float>(j - kHalf - 1);
-            const float w = std::sqrt(gx * gx + gy * gy) * std::exp(-(x * x + y * y) / (2.0F * kHalf * kHalf));
+            const float w =
+                std::sqrt(gx * gx + gy * gy) * static_cast<float>(kDescribeWindow[u - 1] * kDescribeWindow[v - 1]);
             const float bx = x / cell + 1.5F, by = y / cell + 1.5F;
-            const float turn = (std::atan2(gy, gx) / (2 * std::numbers::pi_v<float>)+1) * 8;
+            const float turn = cv::fastAtan2(gy, gx) * (8 / 360.0F);
             const int ix = static_cast<int>(std::floor(bx)), iy = static_cast<int>(std::floor(by));
             const int it = static_cast<int>(turn);
             const float fx = bx - static_cast<float>(ix), fy = by - static_cast<float>(iy),

@@ -18,29 +18,45 @@ struct Choice {
     float distance = 4, next = 4; // squared; `next` of a region elsewhere
 };
 
-// For each region of `from` its best in `to`. In strips: the products of all with all would be too large.
-std::vector<Choice> choose(const Described &from, const Described &to, int threads)
+// For each region of one image its best in the other, and the reverse (without `next`).
+struct Choices {
+    std::vector<Choice> there, back;
+};
+
+// In strips: the products of all with all would be too large.
+Choices choose(const Described &one, const Described &two, int threads)
 {
     constexpr int strip = 256;
-    const int n = static_cast<int>(from.regions.size()), m = static_cast<int>(to.regions.size());
-    std::vector<Choice> out(static_cast<size_t>(n));
-    parallel_for((n + strip - 1) / strip, threads, [&](int s) {
+    const int n = static_cast<int>(one.regions.size()), m = static_cast<int>(two.regions.size());
+    const int strips = (n + strip - 1) / strip;
+    Choices out{std::vector<Choice>(static_cast<size_t>(n)), std::vector<Choice>(static_cast<size_t>(m))};
+    std::vector<std::vector<Choice>> back(static_cast<size_t>(strips));
+    parallel_for(strips, threads, [&](int s) {
         const int begin = s * strip, count = std::min(strip, n - begin);
         Eigen::MatrixXf product(m, count);
-        product.noalias() = to.descriptors.transpose() * from.descriptors.middleCols(begin, count);
+        product.noalias() = two.descriptors.transpose() * one.descriptors.middleCols(begin, count);
+        std::vector<Choice> &column = back[static_cast<size_t>(s)];
+        column.resize(static_cast<size_t>(m));
         for (int k = 0; k < count; k++) {
-            Choice &c = out[static_cast<size_t>(begin + k)];
+            Choice &c = out.there[static_cast<size_t>(begin + k)];
             Eigen::Index best = 0;
             c.distance = 2 - 2 * product.col(k).maxCoeff(&best);
             c.best = static_cast<int>(best);
-            const Eigen::Vector2d at = to.regions[static_cast<size_t>(best)].at;
+            const Eigen::Vector2d at = two.regions[static_cast<size_t>(best)].at;
             for (int i = 0; i < m; i++) {
                 const float d = 2 - 2 * product(i, k);
-                if (d < c.next && (to.regions[static_cast<size_t>(i)].at - at).squaredNorm() > 25)
+                Choice &b = column[static_cast<size_t>(i)];
+                if (d < b.distance)
+                    b = {begin + k, d, 4};
+                if (d < c.next && (two.regions[static_cast<size_t>(i)].at - at).squaredNorm() > 25)
                     c.next = d; // not the same place in another shape
             }
         }
     });
+    for (const std::vector<Choice> &column : back) // in order: the first of equals stays
+        for (size_t i = 0; i < column.size(); i++)
+            if (column[i].distance < out.back[i].distance)
+                out.back[i] = column[i];
     return out;
 }
 
@@ -51,8 +67,7 @@ std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, 
     const Described one = describe_regions(first, options.regions), two = describe_regions(second, options.regions);
     if (one.regions.empty() || two.regions.empty())
         return {};
-    const std::vector<Choice> there = choose(one, two, options.regions.threads);
-    const std::vector<Choice> back = choose(two, one, options.regions.threads);
+    const auto [there, back] = choose(one, two, options.regions.threads);
     std::vector<std::pair<float, Seed>> found;
     const auto most = static_cast<float>(options.ratio * options.ratio);
     for (size_t k = 0; k < there.size(); k++) {
