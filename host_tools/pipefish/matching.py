@@ -100,7 +100,7 @@ def grey(image: ArrayLike, name: str) -> NDArray[np.float32]:
     return np.ascontiguousarray(value)
 
 
-def find_seeds(image1: ArrayLike, image2: ArrayLike, most: int = 3000, affine: bool = True, threads: int = 1) -> Seeds:
+def find_seeds(image1: ArrayLike, image2: ArrayLike, most: int = 1000, affine: bool = True, threads: int = 1) -> Seeds:
     """Seeds from affine-covariant regions of both images (SIFT's points with and without adapted shapes, and maximally
     stable extremal regions), matched by descriptors. Many may be wrong. most: regions an image; affine=False: circles
     only, faster."""
@@ -186,8 +186,8 @@ def match_quasi_dense(
 
     image1, image2  (H,W) or (H,W,3), uint8, uint16 or floats of 0..1
     seeds           Seeds, (xy1, xy2), (xy1, xy2, affine) or (S,4) rows x1 y1 x2 y2 in pixels; None: found by itself
-    cameras         a Camera, or one for each image; with relative_pose: only matches on their epipolar lines (curves, on
-                    a fisheye), and maps held to them
+    cameras         a Camera, or one for each image; with relative_pose: only matches on their epipolar lines (on a
+                    fisheye: curves), and maps held to them
     relative_pose   (3,4) cam2_from_cam1; the length of the translation does not count
     mode            "adaptive": the map is estimated at each match. "constant": it stays the seed's. "translation": no
                     map, for a narrow baseline, fastest
@@ -224,7 +224,9 @@ def match_quasi_dense(
     for k, camera in enumerate(profiles[:2]):
         if camera is not None and (camera.height, camera.width) != (one, two)[k].shape:
             raise ArgumentError(f"cameras: {camera.width}x{camera.height} is not the size of image{k + 1}")
-    start = find_seeds(one, two, affine=mode != "translation", threads=threads) if seeds is None else _given_seeds(seeds)
+    start = (
+        find_seeds(one, two, affine=mode != "translation", threads=threads) if seeds is None else _given_seeds(seeds)
+    )
     grown = _engine.grow_matches(one, two, start.xy1, start.xy2, start.affine, options, *profiles)
     arrays = {name: grown.pop(name) for name in ("xy1", "xy2", "affine", "zncc", "parent", "seed")}
     status = "ok"

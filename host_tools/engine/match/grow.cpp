@@ -184,8 +184,9 @@ private:
     // image 1 is the finer one.
     bool any_free_2(const Eigen::Vector2f &at, const Eigen::Matrix2f &a)
     {
-        for (int j = -1; j <= 1; j++)
-            for (int i = -1; i <= 1; i++) {
+        const int reach = std::abs(a.determinant()) < 1 ? 0 : 1;
+        for (int j = -reach; j <= reach; j++)
+            for (int i = -reach; i <= reach; i++) {
                 const int *cell = cell_2(at + a * Eigen::Vector2f(static_cast<float>(i), static_cast<float>(j)));
                 if (cell && *cell == kFree)
                     return true;
@@ -502,7 +503,7 @@ private:
         if (options_.adaptation != Adaptation::kFit)
             adapt_by_moments(first_, second_, c.x, c.y, options_, line, local);
         if (options_.adaptation != Adaptation::kIntensity && c.zncc >= 0.8F)
-            refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local);
+            refine(first_, second_, c.x, c.y, r, options_.sigma_min, 1.0F, 0.4F, local);
         if (line) {
             Local held = local;
             held.a = line->corrected(local.a);
