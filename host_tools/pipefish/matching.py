@@ -48,8 +48,8 @@ class Matches:
     zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1
     parent   (K,) the match each grew from, -1 for a seed
     seed     (K,) the seed each comes from, an index into `seeds`
-    status   "ok", "no seeds" (none found, or none that fits its surroundings) or "no growth" (fewer than 50 matches a
-             seed everywhere: the images probably have nothing in common)
+    status   "ok", "no seeds" (none found, or none that fits its surroundings) or "no growth" (no seed came to 200
+             matches: the images probably have nothing in common)
     counts   what became of candidates: tried, low_zncc, taken (its place was), off_line (the epipolar line), at_border
              (found at the rim of the search: more than a fifth of the matches means that maps are wrong), seeds_used
     """
@@ -232,6 +232,6 @@ def match_quasi_dense(
     status = "ok"
     if not grown["seeds_used"]:
         status = "no seeds"
-    elif np.bincount(arrays["seed"]).max() < 50:
+    elif np.bincount(arrays["seed"]).max() < 200:
         status = "no growth"
     return Matches(**arrays, seeds=start, status=status, shape1=one.shape, shape2=two.shape, counts=grown)

@@ -128,7 +128,7 @@ def statistics(m: Matches) -> dict[str, Any]:
         "matches": n,
         "share_of_image1": share,
         "seeds": len(m.seeds),
-        "seeds_that_grew": int((np.bincount(m.seed) >= 50).sum()) if n else 0,
+        "seeds_that_grew": int((np.bincount(m.seed) > 1).sum()) if n else 0,
         "zncc": {k: float(np.percentile(m.zncc, q)) for k, q in spread.items()} if n else None,
         "scale": {k: float(np.percentile(scale, q)) for k, q in spread.items()} if n else None,
         "at_border_share": m.counts["at_border"] / n if n else 0.0,

@@ -364,7 +364,8 @@ private:
                        std::vector<Candidate> &found)
     {
         const int r = options_.radius, k = s.step, x = m.x + dx, y = m.y + dy;
-        if (x < r * k || y < r * k || x + r * k >= first_.width() || y + r * k >= first_.height())
+        const int reach = (r + 2) * k; // of the patch that is fitted next, with its rim
+        if (x < reach || y < reach || x + reach >= first_.width() || y + reach >= first_.height())
             return;
         if (!any_free_2(m.centre + m.a * Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)),
                         m.a * static_cast<float>(k))) {
@@ -382,12 +383,14 @@ private:
                 const Eigen::Vector2f offset(static_cast<float>(dx + ei * k), static_cast<float>(dy + ej * k));
                 float &out = z[ej + 1][ei + 1];
                 out = -1;
-                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(r * k)))
+                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(reach)))
                     continue;
                 const float scale = inverse_sigma_at(i, j, k);
                 if (scale > 0)
                     out = scale * window.inverse_sigma * product(window, i, j, k);
             }
+        if (z[1][1] <= -1)
+            return; // where it should be is not in image 2: what is beside it is not it
         const Peak peak(z);
         if (static_cast<double>(peak.zncc) < options_.zncc_min) {
             out_.low_zncc++;
@@ -482,35 +485,84 @@ private:
             return;
         }
         Local local{c.centre, parent.a, c.zncc};
-        if (options_.mode != Mode::kTranslation)
-            adapt(c, line ? &*line : nullptr, local);
+        if (options_.mode == Mode::kTranslation)
+            local.centre = nudged(c);
+        else if (!adapt(c, line ? &*line : nullptr, local) && c.at_border)
+            return; // found at the rim of its search, and no fit confirms it
         cell = cell_2(local.centre);
         if (!cell || *cell != kFree || static_cast<double>(local.zncc) < options_.zncc_min) {
             out_.taken++;
             return;
         }
         out_.at_border += c.at_border;
-        commit({c.x, c.y, local.centre, local.a, local.zncc, id, parent.seed});
+        commit({c.x, c.y, local.centre, local.a, std::min(local.zncc, 1.0F), id, parent.seed}); // 1 but for rounding
     }
 
-    void adapt(const Candidate &c, const EpipolarLine *line, Local &local)
+    // One Gauss-Newton step of the place alone, in whole windows with the mean gradient of both, gain and offset
+    // removed.
+    Eigen::Vector2f nudged(const Candidate &c) const
+    {
+        const int r = options_.radius, n = (2 * r + 1) * (2 * r + 1);
+        const auto x_2 = static_cast<int>(std::lround(c.centre.x())), y_2 = static_cast<int>(std::lround(c.centre.y()));
+        const Image &one = first_.image(), &two = second_.image();
+        float sum[2] = {}, squares[2] = {};
+        const float origin[2] = {one(c.y, c.x), two(y_2, x_2)};
+        for (int j = -r; j <= r; j++)
+            for (int i = -r; i <= r; i++) {
+                const float v[2] = {one[c.y + j][c.x + i] - origin[0], two[y_2 + j][x_2 + i] - origin[1]};
+                for (int k = 0; k < 2; k++) {
+                    sum[k] += v[k];
+                    squares[k] += v[k] * v[k];
+                }
+            }
+        const auto count = static_cast<float>(n);
+        float mean[2], inverse[2];
+        for (int k = 0; k < 2; k++) {
+            mean[k] = sum[k] / count + origin[k];
+            inverse[k] = 1 / std::sqrt(std::max(squares[k] - sum[k] * sum[k] / count, 1e-12F));
+        }
+        float xx = 0, xy = 0, yy = 0, xe = 0, ye = 0;
+        for (int j = -r; j <= r; j++) {
+            const float *p = one[c.y + j] + c.x, *q = two[y_2 + j] + x_2;
+            const float *p0 = one[c.y + j - 1] + c.x, *p1 = one[c.y + j + 1] + c.x;
+            const float *q0 = two[y_2 + j - 1] + x_2, *q1 = two[y_2 + j + 1] + x_2;
+            for (int i = -r; i <= r; i++) {
+                const float gx = 0.25F * ((p[i + 1] - p[i - 1]) * inverse[0] + (q[i + 1] - q[i - 1]) * inverse[1]);
+                const float gy = 0.25F * ((p1[i] - p0[i]) * inverse[0] + (q1[i] - q0[i]) * inverse[1]);
+                const float e = (p[i] - mean[0]) * inverse[0] - (q[i] - mean[1]) * inverse[1];
+                xx += gx * gx;
+                xy += gx * gy;
+                yy += gy * gy;
+                xe += gx * e;
+                ye += gy * e;
+            }
+        }
+        const float ridge = 1e-3F * (xx + yy), det = (xx + ridge) * (yy + ridge) - xy * xy;
+        const Eigen::Vector2f t = Eigen::Vector2f((yy + ridge) * xe - xy * ye, (xx + ridge) * ye - xy * xe) / det;
+        const Eigen::Vector2f whole(static_cast<float>(x_2), static_cast<float>(y_2));
+        return t.cwiseAbs().maxCoeff() <= 0.75F ? Eigen::Vector2f(whole + t) : c.centre;
+    }
+
+    // Whether a fit was taken.
+    bool adapt(const Candidate &c, const EpipolarLine *line, Local &local)
     {
         const int r = options_.radius;
-        if (options_.mode == Mode::kConstant) {
-            refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.0F, local);
-            return;
-        }
+        if (options_.mode == Mode::kConstant)
+            return refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.0F, local);
         if (options_.adaptation != Adaptation::kFit)
             adapt_by_moments(first_, second_, c.x, c.y, options_, line, local);
-        if (options_.adaptation != Adaptation::kIntensity && c.zncc >= 0.8F)
-            refine(first_, second_, c.x, c.y, r, options_.sigma_min, 1.0F, 0.4F, local);
+        const bool fitted =
+            options_.adaptation == Adaptation::kIntensity ||
+            (c.zncc >= 0.8F && refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local));
         if (line) {
             Local held = local;
             held.a = line->corrected(local.a);
             if (sane(held.a) && (held.a - local.a).norm() <= 0.4F * local.a.norm() &&
-                measure(first_, second_, c.x, c.y, r + 1, options_.sigma_min, held) && held.zncc >= local.zncc)
+                measure(first_, second_, c.x, c.y, r + 1, options_.sigma_min, held) &&
+                held.zncc >= local.zncc - 0.001F - 0.1F * (1 - local.zncc)) // the constraint is exact, the fit noisy
                 local = held;
         }
+        return fitted;
     }
 
     const ScaleStack &first_, &second_;
