@@ -27,7 +27,7 @@ void sample_second(const Sampling &s, const Local &at, int r, Patch &out, int ri
         const Eigen::Vector2f start = at.centre + a.col(1) * static_cast<float>(j - r - 1);
         for (int i = 1 - rim; i < 2 * r + 2 + rim; i++) {
             const Eigen::Vector2f p = start + a.col(0) * static_cast<float>(i - r - 1);
-            out.v[j][i] = cubic(*s.second, p.x(), p.y());
+            out.v[j][i] = spline(*s.spline, p.x(), p.y());
         }
         store(&out.v[j][2 * r + 3], Float4{});
     }
@@ -69,7 +69,7 @@ Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const E
 {
     const double scale = std::sqrt(std::abs(static_cast<double>(a.determinant())));
     const int step = scale < 1 ? std::clamp(static_cast<int>(std::lround(1 / scale)), 1, 4) : 1;
-    return {step, &first.for_step(1 / scale), &second.for_step(scale)};
+    return {step, &first.for_step(1 / scale), &second.for_step(scale), &second.spline_for_step(scale)};
 }
 
 bool sane(const Eigen::Matrix2f &a)

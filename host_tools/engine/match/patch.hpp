@@ -12,13 +12,13 @@ namespace pipefish::match
 struct Local {
     Eigen::Vector2f centre;
     Eigen::Matrix2f a;
-    float zncc = -1; // of the patch, sampled by cubic()
+    float zncc = -1; // of the patch, sampled by spline()
 };
 
 // How far apart samples are: `step` pixels in image 1 where image 1 is the finer one, else 1; levels to match.
 struct Sampling {
     int step;
-    const Image *first, *second;
+    const Image *first, *second, *spline; // spline: of second
 };
 Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const Eigen::Matrix2f &a);
 
