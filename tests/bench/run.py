@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import room_calib
+import room_match
 import room_track
 from peers import PEERS
 
@@ -50,7 +51,13 @@ def bench_camera() -> list[dict]:
     return [figure for python in PEERS.values() if python.exists() for figure in run_program(python, script, library)]
 
 
-PYTHON_ROOMS = {"calib": room_calib.measure, "camera": bench_camera, "sim": bench_sim, "track": room_track.measure}
+PYTHON_ROOMS = {
+    "calib": room_calib.measure,
+    "camera": bench_camera,
+    "match": room_match.measure,
+    "sim": bench_sim,
+    "track": room_track.measure,
+}
 
 
 def cpu_name() -> str:
