@@ -22,16 +22,16 @@ constexpr int kRadiusMost = 7; // of the correlation window
 constexpr int kFree = -1, kBarred = -2;
 constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
 
-// Best first, in constant time: 4096 classes of correlation, first in first out within a class.
+// Best first, in constant time: classes of correlation, and within a class last in first out, which keeps to one part
+// of the images and so to the cache.
 class Queue
 {
 public:
     void push(float zncc, int id)
     {
         const int k = std::clamp(static_cast<int>(zncc * kClasses), 0, kClasses - 1);
-        next_.resize(static_cast<size_t>(std::max<int>(id + 1, static_cast<int>(next_.size()))), -1);
-        (tail_[k] < 0 ? head_[k] : next_[static_cast<size_t>(tail_[k])]) = id;
-        tail_[k] = id;
+        next_.push_back(head_[k]); // ids come in order: this is next_[id]
+        head_[k] = id;
         top_ = std::max(top_, k);
     }
 
@@ -44,14 +44,12 @@ public:
             return -1;
         const int id = head_[top_];
         head_[top_] = next_[static_cast<size_t>(id)];
-        if (head_[top_] < 0)
-            tail_[top_] = -1;
         return id;
     }
 
 private:
-    static constexpr int kClasses = 4096;
-    std::vector<int> head_ = std::vector<int>(kClasses, -1), tail_ = head_, next_;
+    static constexpr int kClasses = 1024;
+    std::vector<int> head_ = std::vector<int>(kClasses, -1), next_;
     int top_ = -1;
 };
 
@@ -92,6 +90,24 @@ struct Window {
         const auto count = static_cast<float>(side * side);
         inverse_sigma = 1 / std::sqrt(squares);
         return squares >= static_cast<float>(sigma_min * sigma_min) * count;
+    }
+
+    // The same where mean and norm are known: no sums.
+    void take_known(const float *from, size_t stride, int radius, float mean, float inverse)
+    {
+        side = 2 * radius + 1;
+        vectors = (side + 3) / 4;
+        Float4 last = {};
+        for (int k = 0; k < side - 4 * (vectors - 1); k++)
+            last[k] = 1;
+        for (int j = 0; j < side; j++) {
+            const float *row = from + static_cast<size_t>(j) * stride;
+            float *to = v + j * 4 * vectors;
+            for (int k = 0; k + 1 < vectors; k++)
+                store(to + 4 * k, load(row + 4 * k) - mean);
+            store(to + 4 * vectors - 4, (load(row + 4 * vectors - 4) - mean) * last);
+        }
+        inverse_sigma = inverse;
     }
 
     // Sum of products with the window at `from` (values next to each other).
@@ -148,8 +164,10 @@ public:
         };
         map_1_ = map_of(first);
         map_2_ = map_of(second);
-        if (options.mode == Mode::kTranslation)
-            window_statistics();
+        if (options.mode == Mode::kTranslation) {
+            whole_1_ = statistics_of(first.image());
+            whole_2_ = statistics_of(second.image());
+        }
     }
 
     Growth run(const std::vector<Seed> &seeds)
@@ -416,22 +434,26 @@ private:
 
     // ---- translation: windows of the images themselves, their means and deviations computed once
 
-    void window_statistics()
+    // Of each window: its mean, and 1 / (deviation x side), 0 where flat.
+    struct Statistics {
+        cv::Mat1f mean, inverse;
+    };
+
+    Statistics statistics_of(const Image &image) const
     {
         const int n = 2 * options_.radius + 1;
-        const auto of = [&](const Image &image, cv::Mat1f &inverse) {
-            cv::Mat1f mean, squares;
-            cv::boxFilter(image, mean, CV_32F, {n, n});
-            cv::sqrBoxFilter(image, squares, CV_32F, {n, n});
-            inverse.create(image.size());
-            const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
-            for (int y = 0; y < image.rows; y++)
-                for (int x = 0; x < image.cols; x++) {
-                    const float variance = squares(y, x) - mean(y, x) * mean(y, x);
-                    inverse(y, x) = variance >= floor ? 1 / std::sqrt(variance * static_cast<float>(n * n)) : 0.0F;
-                }
-        };
-        of(second_.image(), inverse_2_);
+        Statistics out;
+        cv::Mat1f squares;
+        cv::boxFilter(image, out.mean, CV_32F, {n, n});
+        cv::sqrBoxFilter(image, squares, CV_32F, {n, n});
+        out.inverse.create(image.size());
+        const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
+        for (int y = 0; y < image.rows; y++)
+            for (int x = 0; x < image.cols; x++) {
+                const float variance = squares(y, x) - out.mean(y, x) * out.mean(y, x);
+                out.inverse(y, x) = variance >= floor ? 1 / (std::sqrt(variance) * static_cast<float>(n)) : 0.0F;
+            }
+        return out;
     }
 
     void look_around_whole(const Match &m, std::vector<Candidate> &found)
@@ -447,15 +469,20 @@ private:
                     y + margin >= map_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= map_2_.cols ||
                     y_2 + margin >= map_2_.rows)
                     continue;
+                if (!any_free_2({static_cast<float>(x_2), static_cast<float>(y_2)}, Eigen::Matrix2f::Identity())) {
+                    out_.taken++;
+                    continue;
+                }
                 out_.tried++;
                 Window window;
                 const Image &one = first_.image(), &two = second_.image();
-                if (!window.take(one[y - r] + x - r, one.step1(), 1, r, options_.sigma_min))
+                if (whole_1_.inverse(y, x) == 0)
                     continue;
+                window.take_known(one[y - r] + x - r, one.step1(), r, whole_1_.mean(y, x), whole_1_.inverse(y, x));
                 float z[3][3];
                 for (int ej = -1; ej <= 1; ej++)
                     for (int ei = -1; ei <= 1; ei++)
-                        z[ej + 1][ei + 1] = inverse_2_(y_2 + ej, x_2 + ei) * window.inverse_sigma *
+                        z[ej + 1][ei + 1] = whole_2_.inverse(y_2 + ej, x_2 + ei) * window.inverse_sigma *
                                             window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
                 const Peak peak(z);
                 if (static_cast<double>(peak.zncc) < options_.zncc_min) {
@@ -502,25 +529,11 @@ private:
     // removed.
     Eigen::Vector2f nudged(const Candidate &c) const
     {
-        const int r = options_.radius, n = (2 * r + 1) * (2 * r + 1);
+        const int r = options_.radius;
         const auto x_2 = static_cast<int>(std::lround(c.centre.x())), y_2 = static_cast<int>(std::lround(c.centre.y()));
         const Image &one = first_.image(), &two = second_.image();
-        float sum[2] = {}, squares[2] = {};
-        const float origin[2] = {one(c.y, c.x), two(y_2, x_2)};
-        for (int j = -r; j <= r; j++)
-            for (int i = -r; i <= r; i++) {
-                const float v[2] = {one[c.y + j][c.x + i] - origin[0], two[y_2 + j][x_2 + i] - origin[1]};
-                for (int k = 0; k < 2; k++) {
-                    sum[k] += v[k];
-                    squares[k] += v[k] * v[k];
-                }
-            }
-        const auto count = static_cast<float>(n);
-        float mean[2], inverse[2];
-        for (int k = 0; k < 2; k++) {
-            mean[k] = sum[k] / count + origin[k];
-            inverse[k] = 1 / std::sqrt(std::max(squares[k] - sum[k] * sum[k] / count, 1e-12F));
-        }
+        const float mean[2] = {whole_1_.mean(c.y, c.x), whole_2_.mean(y_2, x_2)};
+        const float inverse[2] = {whole_1_.inverse(c.y, c.x), whole_2_.inverse(y_2, x_2)};
         float xx = 0, xy = 0, yy = 0, xe = 0, ye = 0;
         for (int j = -r; j <= r; j++) {
             const float *p = one[c.y + j] + c.x, *q = two[y_2 + j] + x_2;
@@ -569,7 +582,7 @@ private:
     const Options &options_;
     const Epipolar *epipolar_;
     cv::Mat1i map_1_, map_2_; // index of the match, kFree or kBarred
-    cv::Mat1f inverse_2_;
+    Statistics whole_1_, whole_2_;
     Queue queue_;
     Growth out_;
     std::vector<float> block_;
