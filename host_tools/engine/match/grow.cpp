@@ -17,9 +17,8 @@ namespace pipefish::match
 namespace
 {
 
-constexpr int kReach = 2;      // new matches within 5 x 5 pixels of their parent
-constexpr int kRadiusMost = 7; // of the correlation window
-constexpr int kFree = -1, kBarred = -2;
+constexpr int kReach = 2;                                            // new matches within 5 x 5 pixels of their parent
+constexpr int kRadiusMost = 7;                                       // of the correlation window
 constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
 
 // Best first, in constant time: classes of correlation, and within a class last in first out, which keeps to one part
@@ -27,6 +26,8 @@ constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of
 class Queue
 {
 public:
+    Queue() { std::fill(std::begin(head_), std::end(head_), -1); }
+
     void push(float zncc, int id)
     {
         const int k = std::clamp(static_cast<int>(zncc * kClasses), 0, kClasses - 1);
@@ -49,7 +50,8 @@ public:
 
 private:
     static constexpr int kClasses = 1024;
-    std::vector<int> head_ = std::vector<int>(kClasses, -1), next_;
+    int head_[kClasses];
+    std::vector<int> next_;
     int top_ = -1;
 };
 
@@ -157,13 +159,8 @@ public:
     Grower(const ScaleStack &first, const ScaleStack &second, const Options &options, const Epipolar *epipolar)
         : first_(first), second_(second), options_(options), epipolar_(epipolar)
     {
-        const auto map_of = [&](const ScaleStack &stack) {
-            cv::Mat1i map(stack.height(), stack.width(), kBarred);
-            map.setTo(kFree, textured(stack.image(), options.texture));
-            return map;
-        };
-        map_1_ = map_of(first);
-        map_2_ = map_of(second);
+        free_1_ = textured(first.image(), options.texture);
+        free_2_ = textured(second.image(), options.texture);
         if (options.mode == Mode::kTranslation) {
             whole_1_ = statistics_of(first.image());
             whole_2_ = statistics_of(second.image());
@@ -191,10 +188,10 @@ public:
     }
 
 private:
-    int *cell_2(const Eigen::Vector2f &at)
+    uint8_t *cell_2(const Eigen::Vector2f &at)
     {
         const auto x = static_cast<int>(std::lround(at.x())), y = static_cast<int>(std::lround(at.y()));
-        return x >= 0 && y >= 0 && x < map_2_.cols && y < map_2_.rows ? &map_2_(y, x) : nullptr;
+        return x >= 0 && y >= 0 && x < free_2_.cols && y < free_2_.rows ? &free_2_(y, x) : nullptr;
     }
 
     // Whether a place in image 2 is free among the nine where a search of steps `a` looks. The search may end up to
@@ -205,8 +202,8 @@ private:
         const int reach = std::abs(a.determinant()) < 1 ? 0 : 1;
         for (int j = -reach; j <= reach; j++)
             for (int i = -reach; i <= reach; i++) {
-                const int *cell = cell_2(at + a * Eigen::Vector2f(static_cast<float>(i), static_cast<float>(j)));
-                if (cell && *cell == kFree)
+                const uint8_t *cell = cell_2(at + a * Eigen::Vector2f(static_cast<float>(i), static_cast<float>(j)));
+                if (cell && *cell)
                     return true;
             }
         return false;
@@ -214,14 +211,14 @@ private:
 
     bool is_free(int x, int y) const
     {
-        return x >= 0 && y >= 0 && x < map_1_.cols && y < map_1_.rows && map_1_(y, x) == kFree;
+        return x >= 0 && y >= 0 && x < free_1_.cols && y < free_1_.rows && free_1_(y, x) != 0;
     }
 
     void commit(const Match &m)
     {
         const int id = static_cast<int>(out_.matches.size());
-        map_1_(m.y, m.x) = id;
-        *cell_2(m.centre) = id;
+        free_1_(m.y, m.x) = 0;
+        *cell_2(m.centre) = 0;
         out_.matches.push_back(m);
         queue_.push(m.zncc, id);
     }
@@ -262,9 +259,9 @@ private:
             const Match &m = ready[k];
             if (static_cast<double>(m.zncc) < options_.seed_zncc_min || !is_free(m.x, m.y))
                 continue;
-            const int *cell = cell_2(m.centre);
+            const uint8_t *cell = cell_2(m.centre);
             const auto line = line_at(m.x, m.y, m.centre);
-            if (!cell || *cell != kFree || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
+            if (!cell || !*cell || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
                 continue;
             commit(m);
             out_.seeds_used++;
@@ -465,9 +462,9 @@ private:
         for (int y = m.y - kReach; y <= m.y + kReach; y++)
             for (int x = m.x - kReach; x <= m.x + kReach; x++, order++) {
                 const int x_2 = x + tx, y_2 = y + ty;
-                if (!is_free(x, y) || x < margin || y < margin || x + margin >= map_1_.cols ||
-                    y + margin >= map_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= map_2_.cols ||
-                    y_2 + margin >= map_2_.rows)
+                if (!is_free(x, y) || x < margin || y < margin || x + margin >= free_1_.cols ||
+                    y + margin >= free_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= free_2_.cols ||
+                    y_2 + margin >= free_2_.rows)
                     continue;
                 if (!any_free_2({static_cast<float>(x_2), static_cast<float>(y_2)}, Eigen::Matrix2f::Identity())) {
                     out_.taken++;
@@ -499,10 +496,10 @@ private:
 
     void accept(const Candidate &c, const Match &parent, int id)
     {
-        if (map_1_(c.y, c.x) != kFree)
+        if (!free_1_(c.y, c.x))
             return;
-        const int *cell = cell_2(c.centre);
-        if (!cell || *cell != kFree) {
+        const uint8_t *cell = cell_2(c.centre);
+        if (!cell || !*cell) {
             out_.taken++;
             return;
         }
@@ -517,7 +514,7 @@ private:
         else if (!adapt(c, line ? &*line : nullptr, local) && c.at_border)
             return; // found at the rim of its search, and no fit confirms it
         cell = cell_2(local.centre);
-        if (!cell || *cell != kFree || static_cast<double>(local.zncc) < options_.zncc_min) {
+        if (!cell || !*cell || static_cast<double>(local.zncc) < options_.zncc_min) {
             out_.taken++;
             return;
         }
@@ -581,7 +578,8 @@ private:
     const ScaleStack &first_, &second_;
     const Options &options_;
     const Epipolar *epipolar_;
-    cv::Mat1i map_1_, map_2_; // index of the match, kFree or kBarred
+    cv::Mat1b free_1_,
+        free_2_; // where a match may be: textured, and without one yet. Bytes: they are all over the cache
     Statistics whole_1_, whole_2_;
     Queue queue_;
     Growth out_;
