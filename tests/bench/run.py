@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import room_calib
+import room_match
 import room_track
 from peers import PEERS
 
@@ -59,6 +60,7 @@ def bench_recon() -> list[dict]:
 PYTHON_ROOMS = {
     "calib": room_calib.measure,
     "camera": bench_camera,
+    "match": room_match.measure,
     "recon": bench_recon,
     "sim": bench_sim,
     "track": room_track.measure,

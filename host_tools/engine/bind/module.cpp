@@ -8,6 +8,7 @@ void bind_camera(nb::module_ &m);
 void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
+void bind_match(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
@@ -21,6 +22,7 @@ NB_MODULE(_engine, m)
     bind_conics(m);
     bind_detect(m);
     bind_link(m);
+    bind_match(m);
     bind_sfm(m);
     bind_sim(m);
     bind_sim_studio(m);

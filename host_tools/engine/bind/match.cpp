@@ -1,0 +1,156 @@
+// Quasi-dense matching for Python: _engine.find_seeds, _engine.grow_matches. pipefish/matching.py is what people use.
+#include "match/seeds.hpp"
+#include "pipefish/profile.h"
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+
+#include <memory>
+
+namespace nb = nanobind;
+using namespace pipefish::match;
+
+void bind_match(nb::module_ &m);
+
+namespace
+{
+
+using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Rows2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Maps = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
+using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+
+// Borrows the array: cv::Mat is not const-correct, ScaleStack does not write level 0.
+Image view(const Picture &image)
+{
+    return Image(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)), const_cast<float *>(image.data()));
+}
+
+template <typename T> nb::ndarray<nb::numpy, T> array(std::initializer_list<size_t> shape, std::unique_ptr<T[]> data)
+{
+    T *raw = data.release();
+    nb::capsule owner(raw, [](void *p) noexcept { delete[] static_cast<T *>(p); });
+    return nb::ndarray<nb::numpy, T>(raw, shape.size(), shape.begin(), owner);
+}
+
+// (S, 8): at, centre, map row by row.
+nb::ndarray<nb::numpy, double> to_python(const std::vector<Seed> &seeds)
+{
+    auto rows = std::make_unique<double[]>(std::max<size_t>(1, 8 * seeds.size()));
+    for (size_t k = 0; k < seeds.size(); k++) {
+        const Seed &s = seeds[k];
+        const double row[8] = {s.at.x(),  s.at.y(),  s.centre.x(), s.centre.y(),
+                               s.a(0, 0), s.a(0, 1), s.a(1, 0),    s.a(1, 1)};
+        std::copy_n(row, 8, rows.get() + 8 * k);
+    }
+    return array<double>({seeds.size(), 8}, std::move(rows));
+}
+
+nb::dict to_python(const Growth &g)
+{
+    const size_t n = g.matches.size(), room = std::max<size_t>(1, n);
+    auto xy1 = std::make_unique<double[]>(2 * room), xy2 = std::make_unique<double[]>(2 * room);
+    auto affine = std::make_unique<double[]>(4 * room), zncc = std::make_unique<double[]>(room);
+    auto parent = std::make_unique<int64_t[]>(room), seed = std::make_unique<int64_t[]>(room);
+    for (size_t k = 0; k < n; k++) {
+        const Match &m = g.matches[k];
+        xy1[2 * k] = m.x;
+        xy1[2 * k + 1] = m.y;
+        xy2[2 * k] = static_cast<double>(m.centre.x());
+        xy2[2 * k + 1] = static_cast<double>(m.centre.y());
+        for (int i = 0; i < 4; i++)
+            affine[4 * k + static_cast<size_t>(i)] = static_cast<double>(m.a(i / 2, i % 2));
+        zncc[k] = static_cast<double>(m.zncc);
+        parent[k] = m.parent;
+        seed[k] = m.seed;
+    }
+    nb::dict out;
+    out["xy1"] = array<double>({n, 2}, std::move(xy1));
+    out["xy2"] = array<double>({n, 2}, std::move(xy2));
+    out["affine"] = array<double>({n, 2, 2}, std::move(affine));
+    out["zncc"] = array<double>({n}, std::move(zncc));
+    out["parent"] = array<int64_t>({n}, std::move(parent));
+    out["seed"] = array<int64_t>({n}, std::move(seed));
+    out["seeds_used"] = g.seeds_used;
+    out["tried"] = g.tried;
+    out["low_zncc"] = g.low_zncc;
+    out["taken"] = g.taken;
+    out["off_line"] = g.off_line;
+    out["at_border"] = g.at_border;
+    return out;
+}
+
+Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at, const Rows2 &centre, const Maps &maps,
+                    const Options &options, const pf_profile *camera_1, const pf_profile *camera_2,
+                    const std::optional<Pose> &pose)
+{
+    std::vector<Seed> seeds(at.shape(0));
+    for (size_t k = 0; k < seeds.size(); k++) {
+        seeds[k] = {{at(k, 0), at(k, 1)}, {centre(k, 0), centre(k, 1)}, {}};
+        seeds[k].a << maps(k, 0, 0), maps(k, 0, 1), maps(k, 1, 0), maps(k, 1, 1);
+    }
+    std::optional<Epipolar> epipolar;
+    if (camera_1 && camera_2 && pose) {
+        using Rows = Eigen::Matrix<double, 3, 4, Eigen::RowMajor>;
+        epipolar.emplace(camera_1->camera, camera_2->camera, Eigen::Map<const Rows>(pose->data()));
+    }
+    const nb::gil_scoped_release release;
+    const ScaleStack one(view(first)), two(view(second));
+    return grow(one, two, seeds, options, epipolar ? &*epipolar : nullptr);
+}
+
+} // namespace
+
+void bind_match(nb::module_ &m)
+{
+    nb::enum_<Mode>(m, "MatchMode")
+        .value("translation", Mode::kTranslation)
+        .value("constant", Mode::kConstant)
+        .value("adaptive", Mode::kAdaptive);
+    nb::enum_<Adaptation>(m, "MatchAdaptation")
+        .value("fit", Adaptation::kFit)
+        .value("gradient", Adaptation::kGradient)
+        .value("intensity", Adaptation::kIntensity);
+    nb::enum_<Turn>(m, "MatchTurn")
+        .value("correlation", Turn::kCorrelation)
+        .value("peak", Turn::kPeak)
+        .value("epipolar", Turn::kEpipolar);
+    nb::class_<Options>(m, "MatchOptions", "How matches grow; pipefish.matching fills it.")
+        .def(nb::init<>())
+        .def_rw("mode", &Options::mode)
+        .def_rw("adaptation", &Options::adaptation)
+        .def_rw("turn", &Options::turn)
+        .def_rw("radius", &Options::radius)
+        .def_rw("zncc_min", &Options::zncc_min)
+        .def_rw("seed_zncc_min", &Options::seed_zncc_min)
+        .def_rw("texture", &Options::texture)
+        .def_rw("sigma_min", &Options::sigma_min)
+        .def_rw("epipolar_px", &Options::epipolar_px)
+        .def_rw("refine_seeds", &Options::refine_seeds)
+        .def_rw("threads", &Options::threads);
+    m.def(
+        "find_seeds",
+        [](const Picture &first, const Picture &second, int most, bool adapt, bool extremal, int threads) {
+            std::vector<Seed> seeds;
+            {
+                const nb::gil_scoped_release release;
+                const ScaleStack one(view(first)), two(view(second));
+                seeds = find_seeds(one, two, {{most, adapt, extremal, threads}});
+            }
+            return to_python(seeds);
+        },
+        nb::arg("image1"), nb::arg("image2"), nb::arg("most"), nb::arg("adapt"), nb::arg("extremal"),
+        nb::arg("threads"), "Two (H,W) float32 of 0..1 -> (S,8): x1, y1, x2, y2, the map row by row.");
+    m.def(
+        "grow_matches",
+        [](const Picture &first, const Picture &second, const Rows2 &at, const Rows2 &centre, const Maps &maps,
+           const Options &options, const pf_profile *camera_1, const pf_profile *camera_2,
+           const std::optional<Pose> &pose) {
+            return to_python(grow_matches(first, second, at, centre, maps, options, camera_1, camera_2, pose));
+        },
+        nb::arg("image1"), nb::arg("image2"), nb::arg("xy1"), nb::arg("xy2"), nb::arg("affine"), nb::arg("options"),
+        nb::arg("camera1").none(), nb::arg("camera2").none(), nb::arg("relative_pose").none(),
+        "Two (H,W) float32 of 0..1, seeds (S,2), (S,2), (S,2,2) -> dict of matches.");
+}

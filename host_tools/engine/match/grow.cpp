@@ -1,0 +1,600 @@
+#include "match/grow.hpp"
+
+#include "match/moments.hpp"
+#include "match/refine.hpp"
+#include "match/vec.hpp"
+#include "parallel.hpp"
+
+#include <Eigen/LU>
+#include <opencv2/imgproc.hpp>
+
+#include <algorithm>
+#include <cmath>
+
+namespace pipefish::match
+{
+
+namespace
+{
+
+constexpr int kReach = 2;                                            // new matches within 5 x 5 pixels of their parent
+constexpr int kRadiusMost = 7;                                       // of the correlation window
+constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
+
+// Best first, in constant time: classes of correlation, and within a class last in first out, which keeps to one part
+// of the images and so to the cache.
+class Queue
+{
+public:
+    Queue() { std::fill(std::begin(head_), std::end(head_), -1); }
+
+    void push(float zncc, int id)
+    {
+        const int k = std::clamp(static_cast<int>(zncc * kClasses), 0, kClasses - 1);
+        next_.push_back(head_[k]); // ids come in order: this is next_[id]
+        head_[k] = id;
+        top_ = std::max(top_, k);
+    }
+
+    // -1 when empty.
+    int pop()
+    {
+        while (top_ >= 0 && head_[top_] < 0)
+            top_--;
+        if (top_ < 0)
+            return -1;
+        const int id = head_[top_];
+        head_[top_] = next_[static_cast<size_t>(id)];
+        return id;
+    }
+
+private:
+    static constexpr int kClasses = 1024;
+    int head_[kClasses];
+    std::vector<int> next_;
+    int top_ = -1;
+};
+
+struct Candidate {
+    int order; // of the neighbour: breaks ties
+    int x, y;
+    Eigen::Vector2f centre;
+    float zncc;
+    bool at_border;
+};
+
+// A window of image 1, mean removed, rows in whole Float4s that end in zeros: a product with any other window then is
+// the sum over the window only.
+struct Window {
+    int side = 0, vectors = 0;
+    alignas(16) float v[(2 * kRadiusMost + 1) * (2 * kRadiusMost + 2)];
+    float inverse_sigma = 0;
+
+    // `from`: top left; values `step` apart. False where flat.
+    bool take(const float *from, size_t stride, int step, int radius, double sigma_min)
+    {
+        side = 2 * radius + 1;
+        vectors = (side + 3) / 4;
+        float sum = 0;
+        for (int j = 0; j < side; j++)
+            for (int i = 0; i < side; i++)
+                sum += from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)];
+        const float mean = sum / static_cast<float>(side * side);
+        float squares = 0;
+        for (int j = 0; j < side; j++) {
+            float *row = v + j * 4 * vectors;
+            store(row + 4 * vectors - 4, Float4{});
+            for (int i = 0; i < side; i++) {
+                row[i] = from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)] - mean;
+                squares += row[i] * row[i];
+            }
+        }
+        const auto count = static_cast<float>(side * side);
+        inverse_sigma = 1 / std::sqrt(squares);
+        return squares >= static_cast<float>(sigma_min * sigma_min) * count;
+    }
+
+    // The same where mean and norm are known: no sums.
+    void take_known(const float *from, size_t stride, int radius, float mean, float inverse)
+    {
+        side = 2 * radius + 1;
+        vectors = (side + 3) / 4;
+        Float4 last = {};
+        for (int k = 0; k < side - 4 * (vectors - 1); k++)
+            last[k] = 1;
+        for (int j = 0; j < side; j++) {
+            const float *row = from + static_cast<size_t>(j) * stride;
+            float *to = v + j * 4 * vectors;
+            for (int k = 0; k + 1 < vectors; k++)
+                store(to + 4 * k, load(row + 4 * k) - mean);
+            store(to + 4 * vectors - 4, (load(row + 4 * vectors - 4) - mean) * last);
+        }
+        inverse_sigma = inverse;
+    }
+
+    // Sum of products with the window at `from` (values next to each other).
+    float dot(const float *from, size_t stride) const
+    {
+        Float4 sum = {};
+        for (int j = 0; j < side; j++)
+            for (int k = 0; k < vectors; k++)
+                sum += load(v + 4 * (j * vectors + k)) * load(from + static_cast<size_t>(j) * stride + 4 * k);
+        return total(sum);
+    }
+};
+
+// Where the maximum of a parabola through three values is, -0.5..0.5.
+float parabola(float left, float middle, float right)
+{
+    const float bend = left - 2 * middle + right;
+    return bend < 0 ? std::clamp(0.5F * (left - right) / bend, -0.5F, 0.5F) : 0.0F;
+}
+
+// Correlations at the 3 x 3 places around a prediction: the best, and the maximum near it.
+struct Peak {
+    float zncc = -1;
+    Eigen::Vector2f at = Eigen::Vector2f::Zero();
+    bool at_border = false;
+
+    explicit Peak(const float (&z)[3][3])
+    {
+        int bi = 1, bj = 1;
+        zncc = z[1][1];
+        for (int j = 0; j < 3; j++)
+            for (int i = 0; i < 3; i++)
+                if (z[j][i] > zncc)
+                    zncc = z[j][i], bi = i, bj = j;
+        at_border = bi != 1 || bj != 1;
+        at = {static_cast<float>(bi - 1), static_cast<float>(bj - 1)};
+        if (bi == 1 && z[bj][0] > -1 && z[bj][2] > -1)
+            at.x() = parabola(z[bj][0], z[bj][1], z[bj][2]);
+        if (bj == 1 && z[0][bi] > -1 && z[2][bi] > -1)
+            at.y() = parabola(z[0][bi], z[1][bi], z[2][bi]);
+    }
+};
+
+class Grower
+{
+public:
+    Grower(const ScaleStack &first, const ScaleStack &second, const Options &options, const Epipolar *epipolar)
+        : first_(first), second_(second), options_(options), epipolar_(epipolar)
+    {
+        free_1_ = textured(first.image(), options.texture);
+        free_2_ = textured(second.image(), options.texture);
+        if (options.mode == Mode::kTranslation) {
+            whole_1_ = statistics_of(first.image());
+            whole_2_ = statistics_of(second.image());
+        }
+    }
+
+    Growth run(const std::vector<Seed> &seeds)
+    {
+        plant(seeds);
+        std::vector<Candidate> found;
+        for (int id = queue_.pop(); id >= 0; id = queue_.pop()) {
+            const Match parent = out_.matches[static_cast<size_t>(id)];
+            found.clear();
+            if (options_.mode == Mode::kTranslation)
+                look_around_whole(parent, found);
+            else
+                look_around(parent, found);
+            std::sort(found.begin(), found.end(), [](const Candidate &p, const Candidate &q) {
+                return p.zncc != q.zncc ? p.zncc > q.zncc : p.order < q.order;
+            });
+            for (const Candidate &c : found)
+                accept(c, parent, id);
+        }
+        return std::move(out_);
+    }
+
+private:
+    uint8_t *cell_2(const Eigen::Vector2f &at)
+    {
+        const auto x = static_cast<int>(std::lround(at.x())), y = static_cast<int>(std::lround(at.y()));
+        return x >= 0 && y >= 0 && x < free_2_.cols && y < free_2_.rows ? &free_2_(y, x) : nullptr;
+    }
+
+    // Whether a place in image 2 is free among the nine where a search of steps `a` looks. The search may end up to
+    // half a step beside them; what is missed so costs a match now and then, what is saved is most of the work where
+    // image 1 is the finer one.
+    bool any_free_2(const Eigen::Vector2f &at, const Eigen::Matrix2f &a)
+    {
+        const int reach = std::abs(a.determinant()) < 1 ? 0 : 1;
+        for (int j = -reach; j <= reach; j++)
+            for (int i = -reach; i <= reach; i++) {
+                const uint8_t *cell = cell_2(at + a * Eigen::Vector2f(static_cast<float>(i), static_cast<float>(j)));
+                if (cell && *cell)
+                    return true;
+            }
+        return false;
+    }
+
+    bool is_free(int x, int y) const
+    {
+        return x >= 0 && y >= 0 && x < free_1_.cols && y < free_1_.rows && free_1_(y, x) != 0;
+    }
+
+    void commit(const Match &m)
+    {
+        const int id = static_cast<int>(out_.matches.size());
+        free_1_(m.y, m.x) = 0;
+        *cell_2(m.centre) = 0;
+        out_.matches.push_back(m);
+        queue_.push(m.zncc, id);
+    }
+
+    // Seeds are fitted on a larger patch first: they come from detectors, to a pixel or two.
+    void plant(const std::vector<Seed> &seeds)
+    {
+        std::vector<Match> ready(seeds.size());
+        parallel_for(static_cast<int>(seeds.size()), options_.threads, [&](int k) {
+            const Seed &s = seeds[static_cast<size_t>(k)];
+            Match &m = ready[static_cast<size_t>(k)];
+            m.x = static_cast<int>(std::lround(s.at.x()));
+            m.y = static_cast<int>(std::lround(s.at.y()));
+            m.seed = k;
+            Local local;
+            local.a = s.a.cast<float>();
+            local.centre = (s.centre + s.a * (Eigen::Vector2d(m.x, m.y) - s.at)).cast<float>();
+            if (!sane(local.a))
+                return;
+            const Local given = local;
+            for (int i = 0; i < (options_.refine_seeds ? 10 : 0); i++)
+                if (!refine(first_, second_, m.x, m.y, kPatchMost, options_.sigma_min, 3.0F, 0.4F, local))
+                    break;
+            if ((local.centre - given.centre).norm() > 3 * std::sqrt(std::abs(given.a.determinant())) + 1 ||
+                !measure(first_, second_, m.x, m.y, 7, options_.sigma_min, local))
+                return;
+            if (options_.mode == Mode::kTranslation)
+                local.a.setIdentity();
+            m.centre = local.centre;
+            m.a = local.a;
+            m.zncc = local.zncc;
+        });
+        std::vector<size_t> order(ready.size());
+        for (size_t k = 0; k < order.size(); k++)
+            order[k] = k;
+        std::stable_sort(order.begin(), order.end(), [&](size_t p, size_t q) { return ready[p].zncc > ready[q].zncc; });
+        for (const size_t k : order) {
+            const Match &m = ready[k];
+            if (static_cast<double>(m.zncc) < options_.seed_zncc_min || !is_free(m.x, m.y))
+                continue;
+            const uint8_t *cell = cell_2(m.centre);
+            const auto line = line_at(m.x, m.y, m.centre);
+            if (!cell || !*cell || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
+                continue;
+            commit(m);
+            out_.seeds_used++;
+        }
+    }
+
+    std::optional<EpipolarLine> line_at(int x, int y, const Eigen::Vector2f &centre) const
+    {
+        return epipolar_ ? epipolar_->at({x, y}, centre.cast<double>()) : std::nullopt;
+    }
+
+    // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once: all windows of
+    // all neighbours are then windows of two small pictures. Where image 1 is the finer one, samples are `step` apart.
+    void look_around(const Match &m, std::vector<Candidate> &found)
+    {
+        int free = 0;
+        for (int dy = -kReach; dy <= kReach; dy++)
+            for (int dx = -kReach; dx <= kReach; dx++)
+                free += is_free(m.x + dx, m.y + dy);
+        if (!free)
+            return;
+        const Sampling s = sampling_for(first_, second_, m.a);
+        const int half = kReach + s.step * (options_.radius + 1), side = 2 * half + 1;
+        sample_block(m, s, half, side);
+        int order = 0;
+        for (int dy = -kReach; dy <= kReach; dy++)
+            for (int dx = -kReach; dx <= kReach; dx++, order++)
+                if (is_free(m.x + dx, m.y + dy))
+                    try_neighbour(m, s, half, dx, dy, order, found);
+    }
+
+    void sample_block(const Match &m, const Sampling &s, int half, int side)
+    {
+        stride_ = static_cast<size_t>(side + 4);
+        block_.assign(stride_ * static_cast<size_t>(side + 1), 0.0F);
+        const Eigen::Vector2f start = m.centre - static_cast<float>(half) * (m.a.col(0) + m.a.col(1));
+        const float middle = bilinear(*s.second, m.centre.x(), m.centre.y());
+        for (int j = 0; j < side; j++) {
+            const Eigen::Vector2f row = start + m.a.col(1) * static_cast<float>(j);
+            float *out = block_.data() + static_cast<size_t>(j) * stride_;
+            for (int i = 0; i < side; i++) {
+                const auto t = static_cast<float>(i);
+                out[i] = bilinear(*s.second, row.x() + m.a(0, 0) * t, row.y() + m.a(1, 0) * t) - middle;
+            }
+        }
+        if (s.step == 1)
+            box_sums(side);
+        else
+            std::fill(std::begin(known_), std::end(known_), false);
+    }
+
+    // Sums over all windows of a block of samples one apart, by running sums.
+    void box_sums(int side)
+    {
+        constexpr int kPlaces = 2 * (kReach + 1) + 1;
+        const int n = 2 * options_.radius + 1;
+        float sums[kBlockMost][kPlaces], squares[kBlockMost][kPlaces];
+        for (int j = 0; j < side; j++) {
+            const float *row = block_.data() + static_cast<size_t>(j) * stride_;
+            float sum = 0, square = 0;
+            for (int i = 0; i < n; i++) {
+                sum += row[i];
+                square += row[i] * row[i];
+            }
+            for (int i = 0; i < kPlaces; i++) {
+                sums[j][i] = sum;
+                squares[j][i] = square;
+                sum += row[i + n] - row[i];
+                square += row[i + n] * row[i + n] - row[i] * row[i];
+            }
+        }
+        for (int j = 0; j < kPlaces; j++) {
+            float sum[kPlaces] = {}, square[kPlaces] = {};
+            for (int v = j; v < j + n; v++)
+                for (int i = 0; i < kPlaces; i++) {
+                    sum[i] += sums[v][i];
+                    square[i] += squares[v][i];
+                }
+            for (int i = 0; i < kPlaces; i++)
+                keep(j, i, sum[i], square[i]);
+        }
+    }
+
+    void keep(int j, int i, float sum, float squares)
+    {
+        const auto key = static_cast<size_t>(j * (2 * (kReach + 4) + 1) + i);
+        const auto count = static_cast<float>((2 * options_.radius + 1) * (2 * options_.radius + 1));
+        const float variance = squares - sum * sum / count;
+        const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
+        inverse_[key] = variance >= floor * count ? 1 / std::sqrt(variance) : 0;
+        known_[key] = true;
+    }
+
+    // Mean-free norm of the window of the block whose top left is (i, j): kept, up to nine neighbours ask for it. 0 if
+    // flat.
+    float inverse_sigma_at(int i, int j, int step)
+    {
+        const auto key = static_cast<size_t>(j * (2 * (kReach + 4) + 1) + i);
+        if (!known_[key]) {
+            const int n = 2 * options_.radius + 1;
+            float sum = 0, squares = 0;
+            for (int v = 0; v < n; v++) {
+                const float *row = block_.data() + static_cast<size_t>(j + v * step) * stride_ + i;
+                for (int u = 0; u < n; u++) {
+                    sum += row[u * step];
+                    squares += row[u * step] * row[u * step];
+                }
+            }
+            keep(j, i, sum, squares);
+        }
+        return inverse_[key];
+    }
+
+    void try_neighbour(const Match &m, const Sampling &s, int half, int dx, int dy, int order,
+                       std::vector<Candidate> &found)
+    {
+        const int r = options_.radius, k = s.step, x = m.x + dx, y = m.y + dy;
+        const int reach = (r + 2) * k; // of the patch that is fitted next, with its rim
+        if (x < reach || y < reach || x + reach >= first_.width() || y + reach >= first_.height())
+            return;
+        if (!any_free_2(m.centre + m.a * Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)),
+                        m.a * static_cast<float>(k))) {
+            out_.taken++;
+            return;
+        }
+        out_.tried++;
+        Window window;
+        if (!window.take((*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))
+            return;
+        float z[3][3];
+        for (int ej = -1; ej <= 1; ej++)
+            for (int ei = -1; ei <= 1; ei++) {
+                const int i = half + dx + (ei - r) * k, j = half + dy + (ej - r) * k;
+                const Eigen::Vector2f offset(static_cast<float>(dx + ei * k), static_cast<float>(dy + ej * k));
+                float &out = z[ej + 1][ei + 1];
+                out = -1;
+                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(reach)))
+                    continue;
+                const float scale = inverse_sigma_at(i, j, k);
+                if (scale > 0)
+                    out = scale * window.inverse_sigma * product(window, i, j, k);
+            }
+        if (z[1][1] <= -1)
+            return; // where it should be is not in image 2: what is beside it is not it
+        const Peak peak(z);
+        if (static_cast<double>(peak.zncc) < options_.zncc_min) {
+            out_.low_zncc++;
+            return;
+        }
+        const Eigen::Vector2f offset =
+            Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)) + peak.at * static_cast<float>(k);
+        found.push_back({order, x, y, m.centre + m.a * offset, peak.zncc, peak.at_border});
+    }
+
+    float product(const Window &window, int i, int j, int step)
+    {
+        const float *from = block_.data() + static_cast<size_t>(j) * stride_ + i;
+        if (step == 1)
+            return window.dot(from, stride_);
+        float sum = 0;
+        for (int v = 0; v < window.side; v++)
+            for (int u = 0; u < window.side; u++)
+                sum += window.v[v * 4 * window.vectors + u] *
+                       from[static_cast<size_t>(v * step) * stride_ + static_cast<size_t>(u * step)];
+        return sum;
+    }
+
+    // ---- translation: windows of the images themselves, their means and deviations computed once
+
+    // Of each window: its mean, and 1 / (deviation x side), 0 where flat.
+    struct Statistics {
+        cv::Mat1f mean, inverse;
+    };
+
+    Statistics statistics_of(const Image &image) const
+    {
+        const int n = 2 * options_.radius + 1;
+        Statistics out;
+        cv::Mat1f squares;
+        cv::boxFilter(image, out.mean, CV_32F, {n, n});
+        cv::sqrBoxFilter(image, squares, CV_32F, {n, n});
+        out.inverse.create(image.size());
+        const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
+        for (int y = 0; y < image.rows; y++)
+            for (int x = 0; x < image.cols; x++) {
+                const float variance = squares(y, x) - out.mean(y, x) * out.mean(y, x);
+                out.inverse(y, x) = variance >= floor ? 1 / (std::sqrt(variance) * static_cast<float>(n)) : 0.0F;
+            }
+        return out;
+    }
+
+    void look_around_whole(const Match &m, std::vector<Candidate> &found)
+    {
+        const int r = options_.radius, margin = r + 4;
+        const int tx = static_cast<int>(std::lround(m.centre.x())) - m.x,
+                  ty = static_cast<int>(std::lround(m.centre.y())) - m.y;
+        int order = 0;
+        for (int y = m.y - kReach; y <= m.y + kReach; y++)
+            for (int x = m.x - kReach; x <= m.x + kReach; x++, order++) {
+                const int x_2 = x + tx, y_2 = y + ty;
+                if (!is_free(x, y) || x < margin || y < margin || x + margin >= free_1_.cols ||
+                    y + margin >= free_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= free_2_.cols ||
+                    y_2 + margin >= free_2_.rows)
+                    continue;
+                if (!any_free_2({static_cast<float>(x_2), static_cast<float>(y_2)}, Eigen::Matrix2f::Identity())) {
+                    out_.taken++;
+                    continue;
+                }
+                out_.tried++;
+                Window window;
+                const Image &one = first_.image(), &two = second_.image();
+                if (whole_1_.inverse(y, x) == 0)
+                    continue;
+                window.take_known(one[y - r] + x - r, one.step1(), r, whole_1_.mean(y, x), whole_1_.inverse(y, x));
+                float z[3][3];
+                for (int ej = -1; ej <= 1; ej++)
+                    for (int ei = -1; ei <= 1; ei++)
+                        z[ej + 1][ei + 1] = whole_2_.inverse(y_2 + ej, x_2 + ei) * window.inverse_sigma *
+                                            window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
+                const Peak peak(z);
+                if (static_cast<double>(peak.zncc) < options_.zncc_min) {
+                    out_.low_zncc++;
+                    continue;
+                }
+                found.push_back({order, x, y,
+                                 Eigen::Vector2f(static_cast<float>(x_2), static_cast<float>(y_2)) + peak.at, peak.zncc,
+                                 peak.at_border});
+            }
+    }
+
+    // ---- taking a candidate
+
+    void accept(const Candidate &c, const Match &parent, int id)
+    {
+        if (!free_1_(c.y, c.x))
+            return;
+        const uint8_t *cell = cell_2(c.centre);
+        if (!cell || !*cell) {
+            out_.taken++;
+            return;
+        }
+        const auto line = line_at(c.x, c.y, c.centre);
+        if (epipolar_ && (!line || line->distance() > options_.epipolar_px)) {
+            out_.off_line++;
+            return;
+        }
+        Local local{c.centre, parent.a, c.zncc};
+        if (options_.mode == Mode::kTranslation)
+            local.centre = nudged(c);
+        else if (!adapt(c, line ? &*line : nullptr, local) && c.at_border)
+            return; // found at the rim of its search, and no fit confirms it
+        cell = cell_2(local.centre);
+        if (!cell || !*cell || static_cast<double>(local.zncc) < options_.zncc_min) {
+            out_.taken++;
+            return;
+        }
+        out_.at_border += c.at_border;
+        commit({c.x, c.y, local.centre, local.a, std::min(local.zncc, 1.0F), id, parent.seed}); // 1 but for rounding
+    }
+
+    // One Gauss-Newton step of the place alone, in whole windows with the mean gradient of both, gain and offset
+    // removed.
+    Eigen::Vector2f nudged(const Candidate &c) const
+    {
+        const int r = options_.radius;
+        const auto x_2 = static_cast<int>(std::lround(c.centre.x())), y_2 = static_cast<int>(std::lround(c.centre.y()));
+        const Image &one = first_.image(), &two = second_.image();
+        const float mean[2] = {whole_1_.mean(c.y, c.x), whole_2_.mean(y_2, x_2)};
+        const float inverse[2] = {whole_1_.inverse(c.y, c.x), whole_2_.inverse(y_2, x_2)};
+        float xx = 0, xy = 0, yy = 0, xe = 0, ye = 0;
+        for (int j = -r; j <= r; j++) {
+            const float *p = one[c.y + j] + c.x, *q = two[y_2 + j] + x_2;
+            const float *p0 = one[c.y + j - 1] + c.x, *p1 = one[c.y + j + 1] + c.x;
+            const float *q0 = two[y_2 + j - 1] + x_2, *q1 = two[y_2 + j + 1] + x_2;
+            for (int i = -r; i <= r; i++) {
+                const float gx = 0.25F * ((p[i + 1] - p[i - 1]) * inverse[0] + (q[i + 1] - q[i - 1]) * inverse[1]);
+                const float gy = 0.25F * ((p1[i] - p0[i]) * inverse[0] + (q1[i] - q0[i]) * inverse[1]);
+                const float e = (p[i] - mean[0]) * inverse[0] - (q[i] - mean[1]) * inverse[1];
+                xx += gx * gx;
+                xy += gx * gy;
+                yy += gy * gy;
+                xe += gx * e;
+                ye += gy * e;
+            }
+        }
+        const float ridge = 1e-3F * (xx + yy), det = (xx + ridge) * (yy + ridge) - xy * xy;
+        const Eigen::Vector2f t = Eigen::Vector2f((yy + ridge) * xe - xy * ye, (xx + ridge) * ye - xy * xe) / det;
+        const Eigen::Vector2f whole(static_cast<float>(x_2), static_cast<float>(y_2));
+        return t.cwiseAbs().maxCoeff() <= 0.75F ? Eigen::Vector2f(whole + t) : c.centre;
+    }
+
+    // Whether a fit was taken.
+    bool adapt(const Candidate &c, const EpipolarLine *line, Local &local)
+    {
+        const int r = options_.radius;
+        if (options_.mode == Mode::kConstant)
+            return refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.0F, local);
+        if (options_.adaptation != Adaptation::kFit)
+            adapt_by_moments(first_, second_, c.x, c.y, options_, line, local);
+        const bool fitted =
+            options_.adaptation == Adaptation::kIntensity ||
+            (c.zncc >= 0.8F && refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local));
+        if (line) {
+            Local held = local;
+            held.a = line->corrected(local.a);
+            if (sane(held.a) && (held.a - local.a).norm() <= 0.4F * local.a.norm() &&
+                measure(first_, second_, c.x, c.y, r + 1, options_.sigma_min, held) &&
+                held.zncc >= local.zncc - 0.001F - 0.1F * (1 - local.zncc)) // the constraint is exact, the fit noisy
+                local = held;
+        }
+        return fitted;
+    }
+
+    const ScaleStack &first_, &second_;
+    const Options &options_;
+    const Epipolar *epipolar_;
+    cv::Mat1b free_1_,
+        free_2_; // where a match may be: textured, and without one yet. Bytes: they are all over the cache
+    Statistics whole_1_, whole_2_;
+    Queue queue_;
+    Growth out_;
+    std::vector<float> block_;
+    size_t stride_ = 0;
+    bool known_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
+    float inverse_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
+};
+
+} // namespace
+
+Growth grow(const ScaleStack &first, const ScaleStack &second, const std::vector<Seed> &seeds, const Options &options,
+            const Epipolar *epipolar)
+{
+    return Grower(first, second, options, epipolar).run(seeds);
+}
+
+} // namespace pipefish::match

@@ -1,0 +1,99 @@
+#include "match/patch.hpp"
+
+#include "match/vec.hpp"
+
+#include <Eigen/LU>
+
+#include <algorithm>
+#include <cmath>
+
+namespace pipefish::match
+{
+
+void sample_first(const Sampling &s, int x, int y, int r, Patch &out)
+{
+    for (int j = 0; j < 2 * r + 3; j++) {
+        const float *row = (*s.first)[y + (j - r - 1) * s.step] + x - (r + 1) * s.step;
+        for (int i = 0; i < 2 * r + 3; i++)
+            out.v[j][i] = row[i * s.step];
+        store(&out.v[j][2 * r + 3], Float4{}); // read by sum_row, with weight 0
+    }
+}
+
+void sample_second(const Sampling &s, const Local &at, int r, Patch &out, int rim)
+{
+    const Eigen::Matrix2f a = at.a * static_cast<float>(s.step);
+    for (int j = 1 - rim; j < 2 * r + 2 + rim; j++) {
+        const Eigen::Vector2f start = at.centre + a.col(1) * static_cast<float>(j - r - 1);
+        for (int i = 1 - rim; i < 2 * r + 2 + rim; i++) {
+            const Eigen::Vector2f p = start + a.col(0) * static_cast<float>(i - r - 1);
+            out.v[j][i] = spline(*s.spline, p.x(), p.y());
+        }
+        store(&out.v[j][2 * r + 3], Float4{});
+    }
+}
+
+bool fits(const Sampling &s, int x, int y, int r, const Local &at)
+{
+    const int reach = (r + 1) * s.step;
+    return x >= reach && y >= reach && x + reach < s.first->cols && y + reach < s.first->rows &&
+           inside(*s.second, at.centre, at.a, static_cast<float>(reach));
+}
+
+Level level_of(const Patch &p, int r)
+{
+    const int n = 2 * r + 1;
+    const float origin = p.v[r + 1][r + 1];
+    float sum = 0, squares = 0;
+    for (int j = 1; j <= n; j++)
+        for (int i = 1; i <= n; i++) {
+            const float d = p.v[j][i] - origin;
+            sum += d;
+            squares += d * d;
+        }
+    const auto count = static_cast<float>(n * n);
+    const float mean = sum / count;
+    return {mean + origin, std::sqrt(std::max(0.0F, squares / count - mean * mean))};
+}
+
+float correlate(const Patch &p, Level lp, const Patch &q, Level lq, int r)
+{
+    float sum = 0;
+    for (int j = 1; j <= 2 * r + 1; j++)
+        for (int i = 1; i <= 2 * r + 1; i++)
+            sum += (p.v[j][i] - lp.mean) * (q.v[j][i] - lq.mean);
+    return sum / (lp.sigma * lq.sigma * static_cast<float>((2 * r + 1) * (2 * r + 1)));
+}
+
+Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const Eigen::Matrix2f &a)
+{
+    const double scale = std::sqrt(std::abs(static_cast<double>(a.determinant())));
+    const int step = scale < 1 ? std::clamp(static_cast<int>(std::lround(1 / scale)), 1, 4) : 1;
+    return {step, &first.for_step(1 / scale), &second.for_step(scale), &second.spline_for_step(scale)};
+}
+
+bool sane(const Eigen::Matrix2f &a)
+{
+    const float det = std::abs(a.determinant()), sum = a.squaredNorm();
+    // singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = sum
+    const float both = std::sqrt(std::max(0.0F, sum * sum - 4 * det * det));
+    const float most = 0.5F * (sum + both), least = 0.5F * (sum - both);
+    return det > 1.0F / 36 && det < 36 && most <= 36 * least;
+}
+
+bool measure(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local)
+{
+    const Sampling s = sampling_for(first, second, local.a);
+    if (!fits(s, x, y, r, local))
+        return false;
+    Patch p, q;
+    sample_first(s, x, y, r, p);
+    sample_second(s, local, r, q);
+    const Level lp = level_of(p, r), lq = level_of(q, r);
+    if (static_cast<double>(std::min(lp.sigma, lq.sigma)) < sigma_min)
+        return false;
+    local.zncc = correlate(p, lp, q, lq, r);
+    return true;
+}
+
+} // namespace pipefish::match

@@ -1,0 +1,19 @@
+// Seeds without help: affine-covariant regions of both images matched by their descriptors.
+#pragma once
+
+#include "match/grow.hpp"
+#include "match/region.hpp"
+
+namespace pipefish::match
+{
+
+struct SeedOptions {
+    RegionOptions regions;
+    double ratio = 0.85; // the best match's distance against the next best that is elsewhere
+    int most = 2000;     // best first
+};
+
+// Regions that choose each other, with the map between them. Many are wrong: growth sorts that out.
+std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, const SeedOptions &options);
+
+} // namespace pipefish::match

@@ -1,0 +1,371 @@
+"""Quasi-dense matching on images whose truth is exact: a sum of waves, warped by evaluating it elsewhere.
+
+Accuracies are those that a prototype of the same method reached on such images, with a margin for the texture.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+import pipefish as pf
+from pipefish.cli import main
+
+Floats = NDArray[np.float64]
+Map = Callable[[Floats], Floats]
+W, H = 200, 160
+CENTRE = np.array([(W - 1) / 2, (H - 1) / 2])
+
+
+def waves(xy: Floats, seed: int = 1, waves_: int = 90) -> Floats:
+    """A texture, band-limited: wavelengths 4.5 to 40 pixels, (..., 2) -> (...) of 0..1."""
+    rng = np.random.default_rng(seed)
+    length = 4.5 * (40 / 4.5) ** rng.random(waves_)
+    turn, phase = rng.random((2, waves_)) * 2 * np.pi
+    k = 2 * np.pi / length[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    flat = xy.reshape(-1, 2).astype(np.float32)
+    value = np.cos(flat @ k.T.astype(np.float32) + phase.astype(np.float32)).sum(axis=1) / np.sqrt(waves_ / 2)
+    return (0.5 + 0.14 * value).reshape(xy.shape[:-1]).clip(0, 1)
+
+
+def grid(width: int = W, height: int = H) -> Floats:
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+
+
+def noisy(image: Floats, seed: int) -> NDArray[np.float32]:
+    return (image + np.random.default_rng(seed).normal(0, 0.01, image.shape)).clip(0, 1).astype(np.float32)
+
+
+def pair(back: Map, noise: bool = True) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Image 1 and what it becomes; back: pixels of image 2 -> pixels of image 1."""
+    one, two = waves(grid()), waves(back(grid()))
+    return (noisy(one, 5), noisy(two, 6)) if noise else (one.astype(np.float32), two.astype(np.float32))
+
+
+def errors(m: pf.Matches, there: Map) -> Floats:
+    return np.linalg.norm(m.xy2 - there(m.xy1), axis=1)
+
+
+def common(there: Map, margin: int) -> int:
+    """Cells of image 2 for pixels of image 1, both at least `margin` from the rim: as many matches as can be."""
+    xy = grid().reshape(-1, 2)
+    to = there(xy)
+    keep = (np.minimum(xy, [W - 1, H - 1] - xy).min(axis=1) >= margin) & (
+        np.minimum(to, [W - 1, H - 1] - to).min(axis=1) >= margin
+    )
+    return len(np.unique(np.rint(to[keep]), axis=0))
+
+
+def affine(a: Floats, shift: tuple[float, float] = (0, 0)) -> tuple[Map, Map]:
+    """there and back of x -> a (x - centre) + centre + shift."""
+    t = np.asarray(shift)
+    return (lambda x: (x - CENTRE) @ a.T + CENTRE + t), (lambda y: (y - CENTRE - t) @ np.linalg.inv(a).T + CENTRE)
+
+
+def one_seed(there: Map, a: Floats, off: float = 0.0) -> pf.Seeds:
+    """At the centre; its map wrong by `off` in each entry."""
+    at = np.rint(CENTRE)[None]
+    return pf.Seeds(at, there(at), (a + off * np.array([[1, -1], [1, 1]]))[None])
+
+
+def check_invariants(m: pf.Matches) -> None:
+    """One-to-one in both images, chains of parents that end in seeds, correlation above the bound."""
+    for xy in (m.xy1, np.floor(m.xy2 + 0.5)):
+        assert len(np.unique(xy, axis=0)) == len(m)
+    k = np.arange(len(m))
+    assert (m.parent < k).all() and (m.parent >= -1).all()
+    grown = m.parent >= 0
+    assert np.array_equal(m.seed[grown], m.seed[m.parent[grown]])
+    assert np.abs(m.xy1[grown] - m.xy1[m.parent[grown]]).max() <= 2
+    assert m.zncc.min() >= 0.8 and m.zncc.max() <= 1 + 1e-5
+    assert (np.linalg.det(m.affine) > 0).all()
+
+
+@pytest.mark.parametrize(("mode", "median"), [("adaptive", 0.05), ("constant", 0.05), ("translation", 0.12)])
+def test_the_same_image_twice_matches_everywhere(mode: str, median: float) -> None:
+    there, back = affine(np.eye(2))
+    one, two = pair(back, noise=False)
+    m = pf.match_quasi_dense(one, two, one_seed(there, np.eye(2)), mode=mode)
+    check_invariants(m)
+    assert m.status == "ok"
+    assert len(m) >= 0.98 * common(there, 12)
+    e = errors(m, there)
+    assert np.abs(m.xy2 - m.xy1).max() <= 0.5 and np.median(e) <= median
+
+
+def test_a_shift_by_part_of_a_pixel_is_measured_without_bias() -> None:
+    there, back = affine(np.eye(2), (20.3, 10.45))
+    m = pf.match_quasi_dense(*pair(back), one_seed(there, np.eye(2)))
+    assert len(m) >= 0.85 * common(there, 8)
+    assert np.median(errors(m, there)) <= 0.06
+    assert np.abs((m.xy2 - there(m.xy1)).mean(axis=0)).max() <= 0.01
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.7, 1.0, 1.5])
+def test_an_affine_map_is_covered_and_recovered(scale: float) -> None:
+    a = scale * np.array([[0.95, -0.25], [0.3, 1.05]])
+    there, back = affine(a)
+    m = pf.match_quasi_dense(*pair(back), one_seed(there, a, 0.05))
+    check_invariants(m)
+    e = errors(m, there)
+    assert len(m) >= 0.9 * common(there, 14)
+    assert np.median(e) <= 0.08 and np.mean(e < 1) >= 0.99
+    assert np.median(np.linalg.norm(m.affine - a, axis=(1, 2))) <= 0.04 * max(1, scale)
+
+
+def bend(x: Floats) -> Floats:
+    """A smooth map that no affine one is like: local maps differ by 0.5 across the image."""
+    u = (x - CENTRE) / 40
+    return x + 3.5 * np.stack([np.sin(u[..., 1]) + 0.5 * u[..., 0] ** 2, np.sin(1.3 * u[..., 0])], axis=-1)
+
+
+def unbend(y: Floats) -> Floats:
+    x = y.copy()
+    for _ in range(60):
+        x += y - bend(x)
+    return x
+
+
+def bend_slope() -> Floats:
+    at, h = np.rint(CENTRE), 1e-3
+    return np.stack([(bend(at + h * d) - bend(at - h * d)) / (2 * h) for d in np.eye(2)], axis=1)
+
+
+def test_an_adaptive_map_follows_a_bend_that_a_constant_one_leaves() -> None:
+    one, two = pair(unbend)
+    seed = one_seed(bend, bend_slope())
+    area = common(bend, 10)
+    found = {mode: pf.match_quasi_dense(one, two, seed, mode=mode, radius=5) for mode in ("adaptive", "constant")}
+    e = {mode: errors(m, bend) for mode, m in found.items()}
+    assert len(found["adaptive"]) >= 0.9 * area
+    assert len(found["adaptive"]) > len(found["constant"])
+    assert np.median(e["adaptive"]) <= 0.1 and np.mean(e["adaptive"] < 0.5) >= 0.99
+    assert np.median(e["adaptive"]) < np.median(e["constant"])
+
+
+@pytest.mark.parametrize("adaptation", ["gradient", "intensity"])
+@pytest.mark.parametrize("turn", ["correlation", "peak"])
+def test_the_moments_of_the_papers_grow_too(adaptation: str, turn: str) -> None:
+    m = pf.match_quasi_dense(*pair(unbend), one_seed(bend, bend_slope()), adaptation=adaptation, turn=turn)
+    check_invariants(m)
+    assert len(m) >= 0.75 * common(bend, 10)
+    assert np.mean(errors(m, bend) < 1) >= 0.97
+
+
+def test_brightness_does_not_count() -> None:
+    there, back = affine(np.array([[1.1, 0.1], [-0.1, 0.95]]))
+    one, two = pair(back)
+    seed = one_seed(there, np.array([[1.1, 0.1], [-0.1, 0.95]]))
+    plain, changed = (pf.match_quasi_dense(one, b, seed, texture=0.004) for b in (two, 0.5 * two + 0.2))
+    both = (plain.map1() >= 0) & (changed.map1() >= 0)
+    assert both.sum() >= 0.97 * len(plain)
+
+
+def test_images_with_nothing_in_common_do_not_match() -> None:
+    rng = np.random.default_rng(3)
+    one, two = noisy(waves(grid()), 1), noisy(waves(grid(), seed=2), 2)
+    places = rng.uniform(20, 140, (200, 4))
+    m = pf.match_quasi_dense(one, two, places)
+    assert m.status in ("no seeds", "no growth")
+    assert len(m) <= 0.001 * W * H
+    assert pf.match_quasi_dense(one, two).status in ("no seeds", "no growth")
+
+
+def test_a_flat_image_has_no_seeds() -> None:
+    flat = np.full((H, W), 128, np.uint8)
+    m = pf.match_quasi_dense(flat, flat)
+    assert m.status == "no seeds" and len(m) == 0 and m.xy1.shape == (0, 2) and m.affine.shape == (0, 2, 2)
+
+
+def test_threads_do_not_change_the_result() -> None:
+    a = np.array([[0.9, -0.2], [0.25, 1.0]])
+    one, two = pair(affine(a)[1])
+    first, second = (pf.match_quasi_dense(one, two, threads=n) for n in (1, 8))
+    assert len(first) > 1000
+    for name in ("xy1", "xy2", "affine", "zncc", "parent", "seed"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+
+
+@pytest.mark.parametrize("degrees", [0, 60])
+def test_seeds_are_found_with_their_maps(degrees: float) -> None:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    a = np.array([[c, -s], [s, c]]) @ np.diag([1.0, 0.6])
+    there, back = affine(a)
+    one, two = pair(back)
+    seeds = pf.find_seeds(one, two)
+    good = np.linalg.norm(seeds.xy2 - there(seeds.xy1), axis=1) < 2
+    assert good.sum() >= 20 and good.mean() >= 0.7
+    off = np.linalg.norm(seeds.affine[good] - a, axis=(1, 2))
+    assert np.median(off) <= 0.25
+    m = pf.match_quasi_dense(one, two)
+    assert m.status == "ok" and np.mean(errors(m, there) < 1) >= 0.99
+
+
+# ---- two views of a plane by a fisheye camera
+
+
+FISHEYE = pf.Camera(width=W, height=H, f_u=70.0, f_v=70.0, c_u=99.5, c_v=79.5, theta_max=2.0)
+POSE = np.hstack([np.array([[0.98, 0, 0.199], [0, 1, 0], [-0.199, 0, 0.98]]), [[0.25], [0.05], [0.1]]])
+POSE[:, :3] = np.linalg.svd(POSE[:, :3])[0] @ np.linalg.svd(POSE[:, :3])[2]
+
+
+def seen(pixels: Floats, pose: Floats) -> Floats:
+    """Where pixels' rays meet the plane z = 1 of the first camera's frame; pose is cam_from_first."""
+    rays, ok = FISHEYE.unproject(pixels.reshape(-1, 2))
+    centre = -pose[:, :3].T @ pose[:, 3]
+    d = rays @ pose[:, :3]
+    far = np.where(d[:, 2] > 0.2, (1 - centre[2]) / np.maximum(d[:, 2], 0.2), np.nan)
+    xyz = centre + far[:, None] * d
+    xyz[~ok] = np.nan
+    return xyz.reshape(*pixels.shape[:-1], 3)
+
+
+def rendered(pose: Floats) -> NDArray[np.float32]:
+    xyz = seen(grid(), pose)
+    value = waves(np.nan_to_num(xyz[..., :2]) * 110)
+    return np.where(np.isfinite(xyz[..., 0]), value, 0.5).astype(np.float32)
+
+
+def fisheye_truth(pixels: Floats) -> Floats:
+    xyz = seen(pixels, np.eye(3, 4))
+    return FISHEYE.project(xyz @ POSE[:, :3].T + POSE[:, 3])[0]
+
+
+def fisheye_seed() -> pf.Seeds:
+    at, h = np.rint(CENTRE), 0.01
+    slope = np.stack([fisheye_truth((at + h * d)[None])[0] - fisheye_truth((at - h * d)[None])[0] for d in np.eye(2)])
+    return pf.Seeds(at[None], fisheye_truth(at[None]), slope.T[None] / (2 * h))
+
+
+def test_fisheye_images_match_as_they_are_and_geometry_holds_the_maps() -> None:
+    one, two = rendered(np.eye(3, 4)), rendered(POSE)
+    plain = pf.match_quasi_dense(one, two, fisheye_seed())
+    held = pf.match_quasi_dense(one, two, fisheye_seed(), FISHEYE, POSE)
+    wrong = pf.match_quasi_dense(one, two, fisheye_seed(), FISHEYE, np.hstack([POSE[:, :3], -POSE[[1, 2, 0], 3:]]))
+    for m in (plain, held):
+        check_invariants(m)
+        e = errors(m, fisheye_truth)
+        assert len(m) > 8000 and np.median(e) <= 0.06 and np.mean(e < 1) >= 0.99
+    assert len(wrong) < 0.5 * len(held)
+
+    def residual(m: pf.Matches) -> float:
+        """Median of |A^T n' + n| / |n|, the epipolar constraint on the map; n and n' by differences."""
+        t = POSE[:, 3]
+        e = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ POSE[:, :3]
+        off = [np.zeros(2), np.array([1e-4, 0]), np.array([0, 1e-4])]
+        f = [FISHEYE.unproject(m.xy1 + d)[0] for d in off]
+        g = [FISHEYE.unproject(m.xy2 + d)[0] for d in off]
+        base = np.einsum("ki,ij,kj->k", g[0], e, f[0])
+        n = np.stack([np.einsum("ki,ij,kj->k", g[0], e, f[d]) - base for d in (1, 2)], axis=1)
+        n2 = np.stack([np.einsum("ki,ij,kj->k", g[d], e, f[0]) - base for d in (1, 2)], axis=1)
+        r = np.einsum("kji,kj->ki", m.affine, n2) + n
+        return float(np.median(np.linalg.norm(r, axis=1) / np.linalg.norm(n, axis=1)))
+
+    assert residual(held) < 0.5 * residual(plain)
+
+
+def test_turns_by_epipolar_lines() -> None:
+    one, two = rendered(np.eye(3, 4)), rendered(POSE)
+    m = pf.match_quasi_dense(one, two, fisheye_seed(), FISHEYE, POSE, adaptation="gradient", turn="epipolar")
+    assert len(m) > 8000 and np.mean(errors(m, fisheye_truth) < 1) >= 0.98
+
+
+# ---- what is wrong is refused
+
+PLAIN = np.zeros((64, 64), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "what"),
+    [
+        ((PLAIN[0], PLAIN), {}, "image1: shape"),
+        ((PLAIN, PLAIN[:8]), {}, "image2: 64x8"),
+        ((PLAIN, PLAIN.astype(int)), {}, "image2: int64"),
+        ((PLAIN, np.full((64, 64), np.nan)), {}, "image2: floating-point"),
+        ((PLAIN, PLAIN, np.zeros((3, 5))), {}, "seeds: shape"),
+        ((PLAIN, PLAIN, (np.zeros((3, 2)), np.zeros((2, 2)))), {}, "seeds: 3 xy1, 2 xy2"),
+        ((PLAIN, PLAIN), {"mode": "fast"}, "mode: 'fast'"),
+        ((PLAIN, PLAIN), {"radius": 9}, "radius: 9"),
+        ((PLAIN, PLAIN), {"zncc_min": float("nan")}, "zncc_min: nan"),
+        ((PLAIN, PLAIN), {"turn": "epipolar"}, "turn: 'epipolar' needs"),
+        ((PLAIN, PLAIN), {"cameras": FISHEYE}, "needs both"),
+        ((PLAIN, PLAIN), {"cameras": FISHEYE, "relative_pose": POSE}, "cameras: 200x160 is not the size of image1"),
+        ((PLAIN, PLAIN), {"cameras": FISHEYE, "relative_pose": 2 * POSE}, "relative_pose: its first three"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: tuple, options: dict, what: str) -> None:
+    with pytest.raises(pf.ArgumentError, match=what.replace("(", r"\(")):
+        pf.match_quasi_dense(*arguments, **options)
+
+
+# ---- the command
+
+
+def saved(tmp_path: Path) -> tuple[Path, Path]:
+    paths = tmp_path / "a.png", tmp_path / "b.png"
+    for path, image in zip(paths, pair(affine(np.array([[0.9, -0.2], [0.25, 1.0]]))[1]), strict=True):
+        Image.fromarray((255 * image).astype(np.uint8)).save(path)
+    return paths
+
+
+def test_the_command_writes_matches_pictures_and_statistics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    one, two = saved(tmp_path)
+    out = tmp_path / "out"
+    assert main(["match", str(one), str(two), "-o", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    packed = np.load(out / "matches.npz")
+    rows = np.loadtxt(out / "matches.csv", delimiter=",", skiprows=1)
+    assert document["matches"] == len(rows) == len(packed["xy1"]) > 5000
+    assert np.abs(rows[:, 2:4] - packed["xy2"]).max() < 1e-3
+    assert Image.open(out / "matches.png").size == (2 * W + 4, H)
+    warped = np.asarray(Image.open(out / "warped.png")).astype(int)
+    x, y = packed["xy1"].astype(int).T
+    assert np.abs(warped[y, x, 0] - warped[y, x, 1]).mean() < 6  # noise of both, and the interpolation
+    assert json.loads((out / "statistics.json").read_text())["status"] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "option", "what"),
+    [
+        ("b.png", b"not a picture", None, "b.png: not a picture"),
+        ("seeds.csv", b"x1,y1,x2,y2\n1,2,3\n", "--seeds", "seeds.csv: line 2: 3 numbers"),
+        ("seeds.csv", b"x1,y1,x2,y2\n", "--seeds", "seeds.csv: no seeds"),
+        ("pose.txt", b"1 2 3", "--pose", "--profile and --pose"),
+    ],
+)
+def test_the_command_names_a_bad_file(
+    name: str, content: bytes, option: str | None, what: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    one, two = saved(tmp_path)
+    (tmp_path / name).write_bytes(content)
+    extra = [option, str(tmp_path / name)] if option else []
+    assert main(["match", str(one), str(two), "-o", str(tmp_path / "out"), *extra]) == 1
+    assert what in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+# ---- real pictures
+
+
+def homography(path: Path) -> Floats:
+    text = path.read_text()
+    return np.array(text[text.index("<data>") + 6 : text.index("</data>")].split(), float).reshape(3, 3)
+
+
+def test_a_wall_seen_from_40_degrees_aside(real_data: Callable[[str], Path]) -> None:
+    """graf 1-3. Its homography is that of the wall; what lies below the kerb is another plane."""
+    folder = real_data("homography/graf")
+    one, two = (np.asarray(Image.open(folder / f"img{k}.png").convert("L")) for k in (1, 3))
+    h = homography(folder / "H1to3p.xml")
+    m = pf.match_quasi_dense(one, two)
+    wall = m.xy1[:, 1] < 530 - 30 * m.xy1[:, 0] / 800
+    p = np.c_[m.xy1, np.ones(len(m))] @ h.T
+    e = np.linalg.norm(p[:, :2] / p[:, 2:] - m.xy2, axis=1)
+    assert wall.sum() >= 150_000
+    assert np.mean(e[wall] < 3) >= 0.93
