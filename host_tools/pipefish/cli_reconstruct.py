@@ -106,7 +106,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
-    from pipefish.report import events_text, length_text, percent_text
+    from pipefish.measured_texts import events_text, length_text, percent_text
 
     s = document["summary"]
     unit = s["unit"]
@@ -160,7 +160,8 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
 
 def run_report(args: argparse.Namespace) -> Result:
     """Runs the command."""
-    from pipefish.report import LIMITS, write_report
+    from pipefish.measured_texts import LIMITS
+    from pipefish.report import write_report
 
     unknown = [name for name, _ in args.limit if name not in LIMITS]
     if unknown:

@@ -321,7 +321,7 @@ def test_the_report_renders_in_a_browser(out, tmp_path):
 
 
 def test_limits_hold_the_interval_against_the_bound(out):
-    from pipefish.report import read_measured, verdict
+    from pipefish.measured_texts import read_measured, verdict
 
     document = read_measured(out)
     worst = max(v for v in document["stations"]["d_max"] if v is not None) * 1000

@@ -196,7 +196,7 @@ Grid grow_blobs(const std::vector<Blob> &blobs, int seed, const std::array<int, 
     const auto put = [&](const Site &site, int k) {
         Point p;
         p.at = blobs[size_t(k)].at;
-        p.code = k; // for now: whose it is
+        p.code = k; // which blob, until the grid is chosen
         grid[site] = p;
         used.insert(k);
     };
