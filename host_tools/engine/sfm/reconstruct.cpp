@@ -324,23 +324,6 @@ void normalise(Submap &map)
     transform(map, s);
 }
 
-// Frames over which sections of the wall are correlated: those that see points of one section as long as the view.
-int section_reach(const Submap &map, const TrackTable &table)
-{
-    int longest = 0;
-    for (const int track : map.tracks) {
-        int first = map.end(), last = map.first;
-        for (const Observation &o : table.of_track(track)) {
-            if (map.has(o.frame)) {
-                first = std::min(first, o.frame);
-                last = std::max(last, o.frame);
-            }
-        }
-        longest = std::max(longest, last - first);
-    }
-    return 2 * longest + 5;
-}
-
 void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
@@ -382,7 +365,6 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
             break;
         }
     }
-    settings.reach = section_reach(map, table);
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
