@@ -425,7 +425,10 @@ private:
             MatrixE h = h_ee_[e];
             damp(h, lambda);
             const Eigen::LLT<MatrixE> llt(h);
-            if (llt.info() != Eigen::Success || !(llt.rcond() > 1e-15)) {
+            // A pivot that lost all its digits belongs to a direction that nothing determines.
+            const MatrixE pivots = llt.matrixLLT();
+            if (llt.info() != Eigen::Success ||
+                !(pivots.diagonal().cwiseAbs2().array() > 1e-15 * h.diagonal().array()).all()) {
                 return false;
             }
             inverse_e_[e] = llt.solve(MatrixE::Identity());
