@@ -225,17 +225,18 @@ def run_status(args: argparse.Namespace) -> Result:
 
 
 def run_evaluate(args: argparse.Namespace) -> Result:
-    from pipefish.evaluate import compare_with_opencv, evaluate, verdict
+    from pipefish.evaluate import compare_with_opencv, evaluate, frames_of, verdict
     from pipefish.simulate import Scene
     from pipefish.survey import Survey
 
     stem = Path(args.recording)
     truth = Scene.from_truth(stem.with_name(stem.name + ".truth.json"))
     survey = Survey.open(args.survey)
-    ours = evaluate(survey, truth)
+    frames = frames_of(survey, stem.with_name(stem.name + ".y4m"))
+    ours = evaluate(survey, truth, frames)
     if ours is None:
         raise PipefishError(f"{survey.path}: no track was seen in two keyframes")
-    peer = compare_with_opencv(survey, truth, stem.with_name(stem.name + ".y4m")) if args.opencv else None
+    peer = compare_with_opencv(survey, truth, frames) if args.opencv else None
     bars = verdict(ours, peer, smooth=args.smooth)
     rows: list[tuple[str, object]] = [("", "device" + (", OpenCV's recipe" if peer else ""))]
     for name, what in (
@@ -261,7 +262,8 @@ def run_simulate(args: argparse.Namespace) -> Result:
         room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
         return {"files": [args.contact_sheet]}, table([("written", args.contact_sheet)])
     if args.picture:
-        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set))
+        width = {} if args.width is None else {"width": args.width}
+        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set), **width)
         return {"files": [args.picture]}, table([("written", args.picture)])
     document = room.simulate(
         args.scene,
@@ -449,6 +451,8 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, help="of all that is random [the scene's]")
     p.add_argument("--frame", type=int, metavar="N", help="which, for --picture [at three quarters of the drive]")
 
+    p.add_argument("--width", type=positive, metavar="PIXELS", help="--picture is shrunk to [480]")
+
     def scene_is_named(args: argparse.Namespace, refuse: Callable[[str], None] = p.error) -> None:
         if args.scene is None and not (args.list or args.contact_sheet):
             refuse("which SCENE? `pipefish simulate --list` tells what there is")
@@ -456,8 +460,8 @@ def build_parser() -> argparse.ArgumentParser:
             refuse("--frames and --seed are for a recording: -o STEM")
         if args.set and not (args.output or args.picture):
             refuse("--set is for -o and --picture")
-        if args.frame is not None and not args.picture:
-            refuse("--frame is for --picture")
+        if not args.picture and (args.frame is not None or args.width is not None):
+            refuse("--frame and --width are for --picture")
 
     p.set_defaults(check=scene_is_named)
 
@@ -517,9 +521,23 @@ def build_parser() -> argparse.ArgumentParser:
         "--timeout", type=not_negative, default=5.0, metavar="S", help="give up after S seconds [5]; 0: wait for ever"
     )
 
-    from pipefish.cli_profile import add_profile, add_profile_input  # they need what stands above
+    from pipefish.cli_calibrate import add_calibrate  # they need what stands above
+    from pipefish.cli_homography import add_homography
+    from pipefish.cli_profile import add_profile, add_profile_input
+    from pipefish.cli_target import add_target
 
     add_profile(commands)
+    add_target(commands)
+    add_calibrate(commands)
+    add_homography(commands)
+
+    from pipefish.cli_tube import add_tube
+
+    add_tube(commands)
+
+    from pipefish.cli_reconstruct import add_reconstruct
+
+    add_reconstruct(commands)
 
     p = add_command(
         commands,

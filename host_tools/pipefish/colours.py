@@ -45,3 +45,14 @@ def age_colours(age: np.ndarray) -> np.ndarray:
 def quality_position(quality: np.ndarray) -> np.ndarray:
     """(N,) similarities with the frame before -> (N,) positions on the scale: from QUALITY_LOW, least violet, to 1."""
     return np.clip((np.asarray(quality, dtype=float) - QUALITY_LOW) / (1 - QUALITY_LOW), 0.0, 1.0)
+
+
+# Deviations: blue inside, grey on, orange outside; both ends equally far from grey in lightness.
+DIVERGING = np.array([(28, 88, 168), (98, 152, 208), (206, 208, 210), (236, 154, 82), (188, 76, 16)], dtype=float)
+
+
+def diverging(value: np.ndarray) -> np.ndarray:
+    """(N,) values -1..1 -> (N,3) uint8 RGB."""
+    x = (np.clip(np.asarray(value, dtype=float), -1, 1) + 1) / 2 * (len(DIVERGING) - 1)
+    channels = [np.interp(x, np.arange(len(DIVERGING)), DIVERGING[:, c]) for c in range(3)]
+    return np.stack(channels, axis=-1).round().astype(np.uint8)

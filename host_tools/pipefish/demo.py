@@ -1,4 +1,5 @@
-"""`pipefish demo`: a whole survey on this machine: simulated pipe, daemon, emulated serial cable, reception, page."""
+"""`pipefish demo`: a whole survey on this machine: simulated pipe, daemon, emulated serial cable, reception, the pipe
+measured, pages."""
 
 from __future__ import annotations
 
@@ -192,6 +193,28 @@ def link_goodput(bench: Path | None, quiet: bool) -> dict[str, float]:
     return {names[f["name"]]: f["value"] for f in figures if f["name"] in names}
 
 
+def measured_extra(summary: dict[str, Any]) -> dict[str, Any]:
+    """What the demo's page says about the measured pipe, with the link to the report."""
+    if summary["report"] is None:
+        return {"measured_rows": [("measured", f"not: {summary['measured_why']}")]}
+    m = summary["measured"]
+    rows = [
+        ("mean diameter", f"{1000 * m['d_mean']:.1f} mm"),
+        ("  repeatability, 95 %", f"± {1960 * m['d_mean_sigma']:.2f} mm"),
+        ("  systematic, 95 %", f"± {1960 * m['d_mean_systematic']:.2f} mm"),
+        ("stations measured", f"{m['stations_measured']} of {m['stations']}"),
+    ]
+    texts = (
+        ("diameter_rms_pct", "diameter against the truth, rms", "{:.2f} %"),
+        ("diameter_scatter_pct", "  without the mean error", "{:.2f} %"),
+        ("ovality_rms_points", "ovality against the truth, rms", "{:.2f} points"),
+        ("encoder_pct", "error of the simulated encoder's scale", "{:+.2f} %"),
+        ("bend_degrees", "angle of the bend, error", "{:.2f} degrees"),
+    )
+    rows += [(words, form.format(summary[key])) for key, words, form in texts if summary.get(key) is not None]
+    return {"measured_rows": rows, "report": Path(summary["report"]).name}
+
+
 def link_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """The page's table about the link."""
     link, cable = summary["received"]["link"], summary["received"]["cable"]
@@ -215,6 +238,39 @@ def link_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         if key in summary:
             rows.append((f"goodput in virtual time, {what}", f"{100 * summary[key]:.1f} % of the line"))
     return rows
+
+
+LIMITS = [("ovality", 5.0), ("d_min", 285.0)]  # of the demo's report; the pipe is 4 % oval, DN300
+
+
+def measured(survey: Any, truth: Any, out: Path, quiet: bool) -> dict[str, Any]:
+    """Measures the survey, writes its files and the report, and compares with the truth. The summary's part of it:
+    "report" is None, with "measured_why", where nothing could be measured."""
+    from pipefish.measure import measure
+    from pipefish.measured_files import write_measurement
+    from pipefish.measuretruth import against_truth
+    from pipefish.progress import Progress
+    from pipefish.report import write_report
+
+    say("measuring the pipe", quiet)
+    started = time.monotonic()
+    try:
+        with Progress("reconstruct", 100, quiet) as bar:
+            result = measure(survey, tell=lambda done, word: bar.update(round(100 * done), word))
+            document, _ = write_measurement(result, out / "pipe")
+    except PipefishError as error:
+        return {"report": None, "measured_why": str(error)}
+    report = out / "report.html"
+    verdicts = write_report(out / "pipe", report, limits=LIMITS, title="Demo pipe, measured")
+    figures_of = document["summary"]
+    names = ("d_mean", "d_mean_sigma", "d_mean_systematic", "ovality_mean", "ovality_most", "path_length", "points")
+    return {
+        **{key: value for key, value in (against_truth(result, truth) or {}).items() if not key.startswith("stations")},
+        "measured": {name: figures_of.get(name) for name in (*names, "stations", "stations_measured", "events")},
+        "limits": {v["name"]: v["state"] for v in verdicts},
+        "report": str(report),
+        "measure_seconds": round(time.monotonic() - started, 1),
+    }
 
 
 def demo(
@@ -242,7 +298,8 @@ def demo(
     received = survey_over_the_line(programs, recording, out / "run", quiet)
     survey = Survey.open(received["file"])
     say("evaluation against the truth", quiet)
-    evaluation = evaluate(survey, Scene.from_truth(recording.truth))
+    truth = Scene.from_truth(recording.truth)
+    evaluation = evaluate(survey, truth)
     info, status, link = survey.info, survey.last_status, received["link"]
     summary: dict[str, Any] = {
         "frames": info["frames"],
@@ -259,6 +316,7 @@ def demo(
         "evaluation": evaluation,
         **link_goodput(programs.bench_link, quiet),
         "length_m": info["length_m"],
+        **measured(survey, truth, out, quiet),
         "received": received,
     }
     say("page", quiet)
@@ -270,7 +328,11 @@ def demo(
         f"emulated serial line of {BAUD / 1e6:g} Mbaud into one survey file. The simulator knows the truth, so every "
         "track is checked."
     )
-    extra = {"goodput_bytes_per_s": link["goodput_bytes_per_s"], "link_rows": link_rows(summary)}
+    extra = {
+        "goodput_bytes_per_s": link["goodput_bytes_per_s"],
+        "link_rows": link_rows(summary),
+        **measured_extra(summary),
+    }
     write_page(survey, page, title="Demo pipe", lead=lead, evaluation=evaluation, extra=extra, quiet=quiet)
     summary["seconds"] = round(time.monotonic() - start, 1)
     summary["page"] = str(page)
@@ -288,6 +350,9 @@ def figures(summary: dict[str, Any]) -> str:
     def camera_frames(name: str) -> str | None:
         return f"{summary[name]:.0f} camera frames" if summary.get(name) is not None else None
 
+    def number(name: str, unit: str) -> str | None:
+        return f"{summary[name]:.2f} {unit}" if summary.get(name) is not None else None
+
     return table(
         [
             ("frames", summary["frames"]),
@@ -300,6 +365,10 @@ def figures(summary: dict[str, Any]) -> str:
             ("track length, 90th percentile", camera_frames("track_length_p90")),
             ("tracked points within 1 px of the truth", percent("within_1px")),
             ("followed to the next keyframe, of those possible", percent("survival")),
+            ("diameter against the truth, rms", number("diameter_rms_pct", "%")),
+            ("ovality against the truth, rms", number("ovality_rms_points", "points")),
+            ("the pipe", summary.get("measured_why")),
+            ("report", summary["report"]),
             ("link goodput, clean", percent("link_goodput_clean")),
             ("link goodput, 1 % of frames lost", percent("link_goodput_1pct")),
         ]

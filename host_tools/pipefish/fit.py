@@ -110,11 +110,13 @@ def _asymmetric_start(profile: Any, points: Array, residual: Array) -> None:
     powers = np.stack([(theta / scale) ** n for n in (1, 3, 5)], axis=1)
     waves = np.stack([np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi)], axis=1)
     design = (powers[:, :, None] * waves[:, None, :]).reshape(len(theta), 12)
+    normal = np.einsum("ni,nj->ij", design, design)  # einsum: see _step
+    normal += 1e-12 * np.trace(normal) * np.eye(12)
     for key, part in (
         ("asym_radial", x * np.cos(phi) + y * np.sin(phi)),
         ("asym_tangential", y * np.cos(phi) - x * np.sin(phi)),
     ):
-        solved = np.linalg.lstsq(design, part, rcond=None)[0].reshape(3, 4)
+        solved = np.linalg.solve(normal, np.einsum("ni,n->i", design, part)).reshape(3, 4)
         left, sizes, right = np.linalg.svd(solved)
         size = max(sizes[0], 1e-9)  # never the saddle itself
         setattr(profile, f"{key}_theta", (left[:, 0] * size / scale ** np.array([1, 3, 5])).tolist())

@@ -320,14 +320,16 @@ class Page:
                 ("frames dropped by the camera", str(status.frames_dropped)),
                 ("keyframes that could not be stored", str(status.keyframes_dropped)),
             ]
-        tables = [("Survey", survey), ("Link", link), ("Gaps and breaks", breaks)]
+        measured = [(name, str(value)) for name, value in self.extra.get("measured_rows", [])]
+        tables = [("The pipe, measured", measured), ("Survey", survey), ("Link", link), ("Gaps and breaks", breaks)]
         if start is not None and start.config:
             settings = [tuple(part.strip() for part in line.partition("=")[::2]) for line in start.config]
             tables.append(("Settings of the device", settings))
         return [(heading, rows) for heading, rows in tables if rows]
 
 
-def _table(heading: str, rows: list[tuple[str, str]], folded: bool) -> str:
+def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False) -> str:
+    """A table of two columns under its heading; folded: a click opens it."""
     body = "".join(f"<tr><th scope='row'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows)
     table = f"<table>{body}</table>"
     if folded:
@@ -335,7 +337,8 @@ def _table(heading: str, rows: list[tuple[str, str]], folded: bool) -> str:
     return f"<section class='card'><h3>{html.escape(heading)}</h3>{table}</section>"
 
 
-def _chart(chart: Chart) -> str:
+def chart_html(chart: Chart) -> str:
+    """The place of a chart, with its title and text."""
     return (
         f"<figure class='card chart'><figcaption><h3>{html.escape(chart['title'])}</h3>"
         f"<p>{html.escape(chart['text'])}</p></figcaption>"
@@ -351,23 +354,11 @@ def _for_script(value: Any) -> str:
 
 def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
     """The whole page as text."""
-    from plotly.offline import get_plotlyjs
-
     gallery = page.gallery()
     moving = animation(page.painter, ".webp", HERO_LIMIT, HERO_WIDTH, legend=False, quiet=quiet)
     tracks, device = page.charts_tracks(), page.charts_device()
-    tiles = "".join(
-        f"<div class='tile'><span class='figure'>{html.escape(f)}<small>{html.escape(u)}</small></span>"
-        f"<span class='what'>{html.escape(w)}</span></div>"
-        for f, u, w in page.tiles()
-    )
-    tables = "".join(_table(heading, rows, len(rows) > 14) for heading, rows in page.tables())
-    stops = ", ".join("rgb({}, {}, {})".format(*c) for c in scale_colours(np.linspace(0, 1, 9)))
+    tables = "".join(table_html(heading, rows, len(rows) > 14) for heading, rows in page.tables())
     values = {
-        "title": html.escape(title),
-        "lead": html.escape(lead),
-        "css": (ASSETS / "page.css").read_text(encoding="utf-8").replace("/*ramp*/", stops),
-        "tiles": tiles,
         "still": gallery[len(gallery) // 2]["src"],
         "moving": data_uri(moving, "image/webp"),
         "age_max": str(AGE_MAX),
@@ -375,18 +366,51 @@ def render(page: Page, title: str, lead: str, quiet: bool = True) -> str:
         "middle": str(len(gallery) // 2),
         "first_text": html.escape(gallery[len(gallery) // 2]["text"]),
         "last": str(len(gallery) - 1),
-        "tracks": "".join(map(_chart, tracks)),
-        "device": "".join(map(_chart, device)),
+        "tracks": "".join(map(chart_html, tracks)),
+        "device": "".join(map(chart_html, device)),
         "tables": tables,
+    }
+    main = fill("page.html", values)
+    if page.extra.get("report"):
+        main = fill("report_link.html", {"address": html.escape(page.extra["report"], quote=True)}) + main
+    return whole_page("Pipefish survey", title, lead, main, [*tracks, *device], page.tiles(), gallery=gallery)
+
+
+def whole_page(
+    brand: str,
+    title: str,
+    lead: str,
+    main: str,
+    charts: list[Chart],
+    tiles: Iterable[tuple[str, str, str]] = (),
+    **data: Any,
+) -> str:
+    """A page as text: head with `tiles` (figure, unit, what), `main` as HTML, the charts that it has places for. data:
+    more for the page's script."""
+    from plotly.offline import get_plotlyjs
+
+    tile_row = "".join(
+        f"<div class='tile'><span class='figure'>{html.escape(f)}<small>{html.escape(u)}</small></span>"
+        f"<span class='what'>{html.escape(w)}</span></div>"
+        for f, u, w in tiles
+    )
+    stops = ", ".join("rgb({}, {}, {})".format(*c) for c in scale_colours(np.linspace(0, 1, 9)))
+    values = {
+        "brand": html.escape(brand),
+        "title": html.escape(title),
+        "lead": html.escape(lead),
+        "css": (ASSETS / "page.css").read_text(encoding="utf-8").replace("/*ramp*/", stops),
+        "tiles": f"<div class='tiles'>{tile_row}</div>" if tile_row else "",
+        "main": main,
         "version": __version__,
         "plotly": get_plotlyjs(),
-        "data": _for_script({"gallery": gallery, "charts": [*tracks, *device]}),
+        "data": _for_script({**data, "charts": charts}),
         "script": (ASSETS / "page.js").read_text(encoding="utf-8"),
     }
-    return _fill("page.html", values)
+    return fill("base.html", values)
 
 
-def _fill(template: str, values: dict[str, str]) -> str:
+def fill(template: str, values: dict[str, str]) -> str:
     """A template of page_assets with its {{names}} replaced."""
     parts = (ASSETS / template).read_text(encoding="utf-8").split("{{")
     text = [parts[0]]
@@ -400,24 +424,14 @@ def write_statistics(survey: Survey, out: Path) -> int:
     """Writes a page with the track statistics along a survey; returns its size in bytes.
 
     Raises PipefishError if the device counted nothing; OSError."""
-    from plotly.offline import get_plotlyjs
-
     _, along, title = along_of(survey)
     charts = statistics_charts(survey, along, title)
     if not charts:
         raise PipefishError(f"{survey.path}: no track statistics: recorded by an older device, or no keyframes")
+    main = fill("stats.html", {"tracks": "".join(map(chart_html, charts))})
+    lead = f"What became of the tracks, over {len(survey.keyframes)} keyframes."
     name = survey.info["name"] or survey.info["survey_id"]
-    values = {
-        "title": html.escape(name),
-        "lead": html.escape(f"What became of the tracks, over {len(survey.keyframes)} keyframes."),
-        "css": (ASSETS / "page.css").read_text(encoding="utf-8"),
-        "tracks": "".join(map(_chart, charts)),
-        "version": __version__,
-        "plotly": get_plotlyjs(),
-        "data": _for_script({"charts": charts}),
-        "script": (ASSETS / "page.js").read_text(encoding="utf-8"),
-    }
-    data = _fill("stats.html", values).encode()
+    data = whole_page("Pipefish tracks", name, lead, main, charts).encode()
     write_atomically(out, data)
     return len(data)
 
@@ -435,7 +449,8 @@ def write_page(
     """Writes the page atomically; returns its size in bytes.
 
     evaluation  of pipefish.evaluate, where the truth is known
-    extra       goodput_bytes_per_s, link_rows: list of (name, value)
+    extra       goodput_bytes_per_s; link_rows, measured_rows: lists of (name, value); report: address of a report that
+                is linked to, relative to this page
     Raises PipefishError if the survey has no keyframes; OSError.
     """
     data = render(Page(survey, evaluation, extra or {}), title, lead, quiet).encode()

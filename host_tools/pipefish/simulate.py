@@ -60,18 +60,20 @@ def studio_scenarios() -> dict[str, str]:
     return {name: read_scene(path)[1] for name, path in known().items()}
 
 
-def studio_scene(scene: str | os.PathLike[str] | dict[str, Any]) -> tuple[dict[str, Any], Path | None] | None:
-    """A scene that is no pipe (it has a `kind`) and its file, by name, file or description; None if it is a pipe or not
-    there. Raises FormatError, OSError."""
+def studio_scene(
+    scene: str | os.PathLike[str] | dict[str, Any], changes: dict[str, Any] | None = None
+) -> tuple[dict[str, Any], Path | None] | None:
+    """A scene that is no pipe (it has a `kind`), with other values as described() takes them, and its file, by name,
+    file or description; None if it is a pipe or not there. Raises FormatError, OSError."""
     from pipefish.studio_files import scenarios as known
 
     if isinstance(scene, dict):
-        return (scene, None) if "kind" in scene else None
+        return (_changed(copy.deepcopy(scene), None, changes), None) if "kind" in scene else None
     path = known().get(str(scene), Path(scene))
     if (SCENARIOS / f"{scene}.toml").exists() or not path.is_file():
         return None
-    described = read_scene(path)[0]
-    return (described, path) if "kind" in described else None
+    made = read_scene(path)[0]
+    return (_changed(made, path, changes), path) if "kind" in made else None
 
 
 def read_json(path: Path) -> Any:
@@ -130,6 +132,10 @@ def described(
                 f"there is no scene '{scene}': a file, or one of {', '.join([*scenarios(), *studio_scenarios()])}"
             )
         made = read_scene(source)[0]
+    return _changed(made, source, changes), source
+
+
+def _changed(made: dict[str, Any], source: Path | None, changes: dict[str, Any] | None) -> dict[str, Any]:
     for key, value in (changes or {}).items():
         *parts, last = key.split(".")
         place = made
@@ -138,7 +144,9 @@ def described(
             if not isinstance(place, dict):
                 raise FormatError(source, ".".join(parts[: depth + 1]), f"has no key '{last}' of its own")
         place[last] = value
-    return made, source
+    if isinstance(profile := (changes or {}).get("lens.profile"), str):
+        made["lens"] = with_profile(made["lens"], Path(profile), source)
+    return made
 
 
 def with_profile(lens: dict[str, Any], profile: Path, source: Path | None = None) -> dict[str, Any]:
@@ -191,10 +199,16 @@ class Scene:
         self._middle_row = (self.spec["lens"]["height"] - 1) / 2
 
     @staticmethod
-    def load(name_or_path: str | os.PathLike[str], changes: dict[str, Any] | None = None) -> Scene:
-        """A built-in scene by name, or a TOML or JSON file, with other values: changes = {"motion.speed": 0.2}. Raises
-        FormatError, OSError, PipefishError."""
-        return Scene(*described(name_or_path, changes))
+    def load(name_or_path: str | os.PathLike[str] | dict[str, Any], changes: dict[str, Any] | None = None) -> Scene:
+        """A built-in scene by name, a TOML or JSON file, or a description, with other values: changes =
+        {"motion.speed": 0.2}. Raises FormatError, OSError, PipefishError."""
+        made, source = described(name_or_path, changes)
+        try:
+            return Scene(made, source)
+        except FormatError as error:
+            if error.position in (changes or {}):  # not the file's fault
+                raise FormatError(None, error.position, error.reason) from None
+            raise
 
     @staticmethod
     def from_truth(path: str | os.PathLike[str]) -> Scene:
@@ -473,11 +487,9 @@ def simulate(
     takes them. frames: stop after so many. seed: of all that is random but the shapes of what is in the pipe. Returns
     what was written. Raises FormatError, PipefishError, OSError.
     """
-    if (studio := studio_scene(scene)) is not None:
+    if (studio := studio_scene(scene, changes)) is not None:
         from pipefish.studio_files import simulate_studio
 
-        if changes:
-            raise PipefishError("a scene that is no pipe takes no changed values: edit its file")
         more = {"count": frames, "seed": seed, "threads": threads, "quiet": quiet}
         return simulate_studio(studio[0], Path(stem), path=studio[1], **more)
     changes = dict(changes or {})
@@ -485,7 +497,7 @@ def simulate(
         changes["motion.frames"] = frames
     if seed is not None:
         changes |= {f"{part}.seed": seed for part in SEEDED}
-    made = Scene(*described(scene, changes))
+    made = Scene.load(scene, changes)
     stem = Path(stem)
     stem.parent.mkdir(parents=True, exist_ok=True)
     files = {kind: stem.with_name(stem.name + kind) for kind in (".y4m", ".csv", ".truth.json", ".profile.json")}
@@ -545,9 +557,9 @@ def picture(
     width: int = 480,
     changes: dict[str, Any] | None = None,
 ) -> None:
-    """Writes one frame of a scene [at three quarters of the drive] as a small picture; what kind, the name's end says.
-    Raises FormatError, PipefishError, OSError."""
-    if (studio := studio_scene(scene)) is not None:
+    """Writes one frame of a scene [at three quarters of the drive], shrunk to `width` pixels if it is wider; what kind
+    of picture, the name's end says. Raises FormatError, PipefishError, OSError."""
+    if (studio := studio_scene(scene, changes)) is not None:
         from pipefish.studio_files import thumbnail
 
         _save(_shrunk(thumbnail(*studio, frame or 0), width), Path(path))

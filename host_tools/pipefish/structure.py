@@ -298,6 +298,7 @@ def _result(
         factor = s["variance_factor"]
         covariances.append(factor * (r @ s["random"].point @ r.T))
         pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
+        pose_covariances[-1][0] = 0.0  # held; the engine has the unit matrix there
         if s["total"] is not None:
             systematic.append(r @ (s["total"].point - s["random"].point) @ r.T)
             pose_systematic.append(spin @ (s["total"].pose - s["random"].pose) @ spin.T)

@@ -7,14 +7,20 @@ and Y the place along the pipe.
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipefish.errors import ArgumentError
+from pipefish.errors import ArgumentError, FormatError
+from pipefish.files import write_atomically
+
+FORMAT = "pipefish-target"
 
 KINDS = ("checkerboard", "circles", "asymmetric-circles", "charuco", "sleeve")
 WHITE, BLACK = 0.85, 0.05  # albedo of paper and of toner
@@ -99,6 +105,28 @@ class Target:
         """All fields by name."""
         return asdict(self)
 
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Target:
+        """Reads what save() wrote. Raises FormatError with the file and the field."""
+        try:
+            data = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise FormatError(path, None, f"not JSON: {error}") from None
+        if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
+            raise FormatError(path, "format", f"not a target: must be {FORMAT!r}")
+        if data.pop("version", None) != 1:
+            raise FormatError(path, "version", "must be 1")
+        try:
+            return Target.from_dict(data)
+        except ArgumentError as error:
+            key, _, reason = str(error).partition(": ")
+            raise FormatError(path, key, reason) from None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the target as JSON, whole or not at all. Raises OSError."""
+        data = {"format": FORMAT, "version": 1, **self.to_dict()}
+        write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
+
     @property
     def has_circles(self) -> bool:
         """Whether its points are centres of discs; else they are corners."""
@@ -138,6 +166,28 @@ class Target:
             return np.column_stack([(col - (self.cols - 1) / 2) * step, (row - (self.rows - 1) / 2) * step])
         row, col = np.mgrid[1 : self.rows, 1 : self.cols].reshape(2, -1).astype(float)
         return np.column_stack([(col - self.cols / 2) * step, (row - self.rows / 2) * step])
+
+    @property
+    def points_shape(self) -> tuple[int, int]:
+        """How many points a row has, and how many rows there are."""
+        return (self.cols, self.rows) if self.has_circles else (self.cols - 1, self.rows - 1)
+
+    def lattice(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (N, 2) of the points, in their order, on the lattice that nearest neighbours span, whole numbers; and
+        the lattice's steps (2, 2), metres on the sheet: row 0 by one along the first number, row 1 along the second. On
+        asymmetric circles the steps go to the lower right and to the lower left."""
+        cols, rows = self.points_shape
+        row, col = np.mgrid[:rows, :cols].reshape(2, -1)
+        if self.kind == "asymmetric-circles":
+            half, twice = self.spacing_m / 2, 2 * col + row % 2
+            return np.column_stack([(row + twice) // 2, (row - twice) // 2]), np.array([[half, half], [-half, half]])
+        return np.column_stack([col, row]), np.diag([self.spacing_x, self.spacing_m])
+
+    def marker_middles(self) -> np.ndarray:
+        """(K, 2) middles of a ChArUco board's markers on the sheet, in the order of their numbers."""
+        row, col = np.mgrid[: self.rows, : self.cols].reshape(2, -1)
+        at = np.column_stack([col - (self.cols - 1) / 2, row - (self.rows - 1) / 2]) * self.spacing_m
+        return at[(row + col) % 2 == 1]
 
     def points(self) -> np.ndarray:
         """Corners or centres (N, 3), row by row. A sleeve's in the pipe's frame: Z along it, X to the right, Y down,

@@ -91,6 +91,11 @@ def cube_rays(edge: int) -> tuple[Array, dict[str, tuple[int, int]]]:
     return rays, corners
 
 
+def cube_faces() -> dict[str, Array]:
+    """Turns (3, 3) from each face's frame, z through its middle, to the camera's."""
+    return {name: rotation(yaw, pitch, 0) for name, (_, _, yaw, pitch) in _FACES.items()}
+
+
 def vertical_fov(kind: str, width: int, height: int, fov: float) -> float | None:
     """Degrees from the top to the bottom edge of a view, in its middle column; None for the cube's cross."""
     half = math.radians(fov) / 2

@@ -17,7 +17,14 @@
  * that the texture does not determine where they were, and every entry of the inverse below 2^10. */
 #define RIDGE      1024
 #define RIDGE_WARP 16384
-#define COV_MOST   ((int64_t)1 << 40)
+/* The warp is expected to be that at which a fit begins, but for 2 % each (0.02 of slope): (2 sigma^2 / 0.02^2) in the
+ * unit of the normal matrix, Q6, with noise of sigma 2 in both patches. Texture that determines the warp has a hundred
+ * times that; where there is little of it, an arbitrary warp would move the point by tenths of a pixel a frame. */
+#define PRIOR        1280000
+#define SEARCH_REACH 2 /* steps */
+#define SEARCH_STEP  (2 << 16)
+#define EXCESS_MOST  (16 << 8)
+#define COV_MOST     ((int64_t)1 << 40)
 
 static int32_t magnitude(int32_t v)
 {
@@ -100,6 +107,7 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     anchor->offset = (pf_point_q16){at.x - ix * 65536, at.y - iy * 65536};
     anchor->a[0] = anchor->a[3] = 65536;
     anchor->a[1] = anchor->a[2] = 0;
+    anchor->excess_q8 = 256;
     for (int32_t r = 0; r < w; r++)
         memcpy(pixels + r * w, image->data + (size_t)(iy - half - 1 + r) * image->stride + (ix - half - 1), (size_t)w);
     const pf_gradients images = gradients(klt);
@@ -124,6 +132,8 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
     for (int32_t a = 0; a < 6; a++)
         if (s.h[a][a] < 0)
             s.h[a][a] = 0;
+    for (int32_t a = 2; a < 6; a++)
+        s.h[a][a] += PRIOR;
     factor(anchor, s.h);
 }
 
@@ -251,6 +261,17 @@ static pf_point_q16 warped_offset(const pf_anchor *anchor)
                           (int32_t)((anchor->a[2] * x + anchor->a[3] * y) >> 16)};
 }
 
+/* How much more is left than the noise of both patches would leave, Q8, at least 1: relief in another light, an edge in
+ * front of something. */
+static int32_t excess(const pf_klt *klt, const pf_rhs *rhs)
+{
+    const int64_t left = rhs->var - rhs->cov * rhs->gain_q14 / GAIN_ONE;
+    const int64_t gain2 = rhs->gain_q14 * rhs->gain_q14 / GAIN_ONE;
+    const int64_t noise = (int64_t)klt->window * klt->window * klt->noise_var_q8 * (GAIN_ONE + gain2) / GAIN_ONE;
+    const int64_t ratio = noise > 0 ? left * 256 / noise : EXCESS_MOST;
+    return ratio < 256 ? 256 : ratio > EXCESS_MOST ? EXCESS_MOST : (int32_t)ratio;
+}
+
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at)
 {
     pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
@@ -259,7 +280,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
     pf_reference reference;
     take_reference(klt, anchor, pixels, centre, &reference);
-    int32_t moved = 0;
+    int32_t moved = 0, gone[6] = {0}; /* from the warp at the beginning */
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
@@ -271,8 +292,12 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
             return fit;
         }
         int32_t d[6], warp = 0;
+        for (int32_t k = 2; k < 6; k++)
+            rhs.b[k] += (((int64_t)PRIOR * gone[k]) >> 15) * rhs.gain_q14 / GAIN_ONE;
         solve(anchor, &rhs, d);
         compose(anchor, d, &centre);
+        for (int32_t k = 2; k < 6; k++)
+            gone[k] -= d[k];
         for (int32_t k = 2; k < 6; k++)
             warp = magnitude(d[k]) > warp ? magnitude(d[k]) : warp;
         for (int32_t k = 0; k < 4; k++)
@@ -286,11 +311,36 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = pf_zncc(rhs.cov, reference.var, rhs.var);
+    fit.zncc_q15 = pf_likeness(klt, rhs.cov, reference.var, rhs.var, (int64_t)klt->window * klt->window);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
+    anchor->excess_q8 = excess(klt, &rhs);
     if (moved > NOT_SETTLED)
         fit.reason = PF_TRACK_DIVERGED;
     return fit;
+}
+
+pf_point_q16 pf_anchor_search(pf_klt *klt, const pf_image *image, const pf_anchor *anchor, const uint8_t *pixels,
+                              pf_point_q16 at)
+{
+    const pf_point_q16 offset = warped_offset(anchor), centre = {at.x - offset.x, at.y - offset.y};
+    pf_point_q16 best = at;
+    int32_t most = -32768;
+    pf_reference reference;
+    take_reference(klt, anchor, pixels, centre, &reference);
+    for (int32_t y = -SEARCH_REACH; y <= SEARCH_REACH; y++)
+        for (int32_t x = -SEARCH_REACH; x <= SEARCH_REACH; x++) {
+            const pf_point_q16 moved = {centre.x + x * SEARCH_STEP, centre.y + y * SEARCH_STEP};
+            pf_rhs rhs;
+            if (!sample_warped(klt, image, moved, anchor->a))
+                continue;
+            right_hand_side(klt, anchor, &reference, &rhs);
+            const int32_t like = pf_zncc(rhs.cov, reference.var, rhs.var);
+            if (like > most) {
+                most = like;
+                best = (pf_point_q16){at.x + x * SEARCH_STEP, at.y + y * SEARCH_STEP};
+            }
+        }
+    return best;
 }
 
 /* Entry (i, j) of the template's covariance times `factor_q8` (below 2^15), Q20 px^2, to nearest. */
@@ -327,7 +377,7 @@ static void whole_covariance(const pf_anchor *anchor, uint32_t noise_q8, int64_t
 
 void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried[3])
 {
-    whole_covariance(anchor, noise_q8, 256, carried);
+    whole_covariance(anchor, noise_q8, anchor->excess_q8, carried);
     for (int32_t i = 0; i < 3; i++)
         carried[i] = carried[i] > COV_MOST ? COV_MOST : carried[i] < -COV_MOST ? -COV_MOST : carried[i];
 }
@@ -336,7 +386,7 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
 {
     const int64_t gain2 = ((int64_t)gain_q14 * gain_q14) >> 14; /* Q14 */
     int64_t cov[3];
-    whole_covariance(anchor, noise_q8, 256 + ((int64_t)256 << 14) / gain2, cov);
+    whole_covariance(anchor, noise_q8, ((256 + ((int64_t)256 << 14) / gain2) * anchor->excess_q8) >> 8, cov);
     const int64_t xx = cov[0] + PF_TRACK_COV_FLOOR_Q20, xy = cov[1], yy = cov[2] + PF_TRACK_COV_FLOOR_Q20;
     track->cov_xx_q20 = xx > UINT32_MAX ? UINT32_MAX : (uint32_t)xx;
     track->cov_yy_q20 = yy > UINT32_MAX ? UINT32_MAX : (uint32_t)yy;

@@ -22,7 +22,10 @@
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
-#define CLIP_CHANGE  20u /* a twentieth of the window: with it the worst is at 5 sigma */
+/* px^2, Q20: beyond 0.3 px of standard deviation (root of the sum of both variances) it is no longer known well enough
+ * that this is the point first seen. Covariances leave out what light does to relief: then errors are twice as large */
+#define VAGUE       94372u
+#define CLIP_CHANGE 20u /* a twentieth of the window: with it the worst is at 5 sigma */
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
 {
@@ -30,16 +33,18 @@ static int32_t median3(int32_t a, int32_t b, int32_t c)
     return c < low ? low : c > high ? high : c;
 }
 
-/* Median displacement of the nearest tracks already found in this frame; false with fewer than three. */
-static bool neighbours_move(const pf_tracker *t, pf_point_q16 at, pf_point_q16 *move)
+/* Medians over the nearest tracks already found in this frame: of their displacements, and of how far they lay from
+ * where they were expected (0, 0 where one of them was not expected anywhere). False with fewer than three. */
+static bool look_around(const pf_tracker *t, pf_point_q16 at, pf_point_q16 *move, pf_point_q16 *miss)
 {
     int64_t distance[NEIGHBOURS];
-    pf_point_q16 near[NEIGHBOURS];
+    const pf_slot *near[NEIGHBOURS];
     uint32_t n = 0;
     for (uint32_t i = 0; i < t->n; i++) {
         if (t->table[i].status != PF_TRACK_TRACKED)
             continue;
-        const pf_point_q16 m = t->slots[t->slot_of[i]].move, p = t->table[i].pos;
+        const pf_slot *s = &t->slots[t->slot_of[i]];
+        const pf_point_q16 m = s->move, p = t->table[i].pos;
         const int64_t dx = (int64_t)p.x - m.x - at.x, dy = (int64_t)p.y - m.y - at.y, d = dx * dx + dy * dy;
         uint32_t k = n < NEIGHBOURS ? n++ : NEIGHBOURS;
         if (k == NEIGHBOURS && d >= distance[NEIGHBOURS - 1])
@@ -49,11 +54,14 @@ static bool neighbours_move(const pf_tracker *t, pf_point_q16 at, pf_point_q16 *
             near[k] = near[k - 1];
         }
         distance[k] = d;
-        near[k] = m;
+        near[k] = s;
     }
     if (n < NEIGHBOURS)
         return false;
-    *move = (pf_point_q16){median3(near[0].x, near[1].x, near[2].x), median3(near[0].y, near[1].y, near[2].y)};
+    *move = (pf_point_q16){median3(near[0]->move.x, near[1]->move.x, near[2]->move.x),
+                           median3(near[0]->move.y, near[1]->move.y, near[2]->move.y)};
+    *miss = (pf_point_q16){median3(near[0]->miss.x, near[1]->miss.x, near[2]->miss.x),
+                           median3(near[0]->miss.y, near[1]->miss.y, near[2]->miss.y)};
     return true;
 }
 
@@ -102,15 +110,16 @@ static int32_t coarse_likeness(const pf_tracker *t, pf_point_q16 from, pf_point_
     return pf_zncc(32 * (n * sab - sa * sb), 32 * (n * saa - sa * sa), 32 * (n * sbb - sb * sb));
 }
 
-/* The starts for a track, best first: its own last move (its neighbours' if it is new), what the caller expects, and
- * none at all. A start must look better by a margin to go before one earlier in this list. Returns how many. */
-static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf_slot *slot, pf_point_q16 start[STARTS])
+/* The starts for a track, best first: its own last move (`around`, its neighbours', if it is new), what is expected,
+ * and none at all. A start must look better by a margin to go before one earlier in this list. Returns how many. */
+static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf_slot *slot, pf_point_q16 around,
+                            pf_point_q16 start[STARTS])
 {
     const pf_point_q16 at = track->pos, none = {0, 0};
     pf_point_q16 move = slot->move, given = {0, 0};
     uint32_t n = 0;
     if (track->age == 0 && slot->expected.at.x == PF_NO_GUESS)
-        (void)neighbours_move(t, at, &move);
+        move = around;
     start[n++] = move;
     if (slot->expected.at.x != PF_NO_GUESS) {
         given = (pf_point_q16){pf_clamp_i64((int64_t)slot->expected.at.x - at.x, GUESS_MOST),
@@ -235,16 +244,23 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
     return reason;
 }
 
+/* The anchor with its warp taken on by `warp`. */
+static pf_anchor warped_by(const pf_anchor *before, const int32_t warp[4])
+{
+    pf_anchor a = *before;
+    for (int32_t i = 0; i < 2; i++)
+        for (int32_t j = 0; j < 2; j++)
+            a.a[2 * i + j] = pf_clamp_i64(
+                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, WARP_MOST);
+    return a;
+}
+
 /* The template's fit from `start` with its warp taken on by `warp`. */
 static pf_fit fit_warped(pf_tracker *t, uint16_t slot, const pf_anchor *before, const int32_t warp[4],
                          pf_point_q16 *start)
 {
     pf_anchor *a = &t->slots[slot].anchor;
-    *a = *before;
-    for (int32_t i = 0; i < 2; i++)
-        for (int32_t j = 0; j < 2; j++)
-            a->a[2 * i + j] = pf_clamp_i64(
-                ((int64_t)warp[2 * i] * before->a[j] + (int64_t)warp[2 * i + 1] * before->a[2 + j]) >> 16, WARP_MOST);
+    *a = warped_by(before, warp);
     return pf_anchor_fit(&t->klt, &t->pyramid[t->now].level[0], a, t->pixels + (size_t)slot * t->patch_bytes, start);
 }
 
@@ -371,7 +387,7 @@ static void drop_stuck(pf_tracker *t)
 static bool worth_another(pf_track_reason reason)
 {
     return reason == PF_TRACK_LEFT || reason == PF_TRACK_DIVERGED || reason == PF_TRACK_RESIDUAL ||
-           reason == PF_TRACK_BACKWARD;
+           reason == PF_TRACK_BACKWARD || reason == PF_TRACK_DRIFT || reason == PF_TRACK_FLAT;
 }
 
 static bool has_warp(const pf_expected *e)
@@ -389,38 +405,75 @@ static bool may_try(pf_tracker *t)
     return true;
 }
 
-static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
+/* The same from where around its expected place the warped template looks most like the picture: a mark of a few pixels
+ * on bare plastic pulls from no farther than its own size, and at 40 cm/s in 150 mm every tenth is expected 1.4 px off.
+ */
+static bool attempt_searched(pf_tracker *t, pf_track *track, uint16_t slot, const pf_expected *expected)
 {
-    pf_slot *s = &t->slots[slot];
-    const pf_expected expected = s->expected;
-    pf_point_q16 start[STARTS], near, reached, other;
-    const uint32_t n = rank_starts(t, track, s, start);
-    const uint32_t top = t->config.levels - 1u;
+    if (!may_try(t))
+        return false;
+    const pf_anchor warped = warped_by(&t->slots[slot].anchor, expected->warp_q16);
+    const pf_point_q16 at = pf_anchor_search(&t->klt, &t->pyramid[t->now].level[0], &warped,
+                                             t->pixels + (size_t)slot * t->patch_bytes, expected->at);
+    return farther(at, expected->at, 0) && attempt_warped(t, track, slot, expected->warp_q16, at) == PF_TRACK_OK;
+}
+
+/* Attempts at one track, each only if those before it failed: by its template, warped as is expected, from where it is
+ * expected and from where around it looks most like it; from half resolution or the top of the pyramid, without a warp;
+ * by its warped template from where that came to; from the other starts; from where its neighbours went. */
+static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const pf_point_q16 *around)
+{
+    const pf_expected expected = t->slots[slot].expected;
+    const bool warped = has_warp(&expected);
+    pf_point_q16 start[STARTS], reached, other;
     pf_track_reason reason;
-    s->expected.at.x = PF_NO_GUESS;
-    if (s->sure && top > 1u) { /* half resolution will do; if not, from the top as others */
+    if (warped && attempt_warped(t, track, slot, expected.warp_q16, expected.at) == PF_TRACK_OK)
+        return PF_TRACK_OK;
+    if (warped && attempt_searched(t, track, slot, &expected))
+        return PF_TRACK_OK;
+    const uint32_t n = rank_starts(t, track, &t->slots[slot], around ? *around : (pf_point_q16){0, 0}, start);
+    const uint32_t top = t->config.levels - 1u;
+    if (t->slots[slot].sure && top > 1u) { /* half resolution will do; if not, from the top as others */
         reason = attempt(t, track, slot, start[0], 1, 1, &reached);
         if (!worth_another(reason))
             return reason;
     }
     reason = attempt(t, track, slot, start[0], top, 0, &reached);
-    if (worth_another(reason) && has_warp(&expected) && may_try(t)) {
-        const pf_track_reason first = reason;
-        reason = attempt_warped(t, track, slot, expected.warp_q16, reached);
-        if (reason != PF_TRACK_OK && farther(reached, expected.at, SAME_START / 2) && may_try(t))
-            reason = attempt_warped(t, track, slot, expected.warp_q16, expected.at);
-        if (reason == PF_TRACK_OK)
-            return reason;
-        reason = first;
-    }
+    if (worth_another(reason) && warped && farther(reached, expected.at, SAME_START / 2) && may_try(t) &&
+        attempt_warped(t, track, slot, expected.warp_q16, reached) == PF_TRACK_OK)
+        return PF_TRACK_OK;
     for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
-    if (!worth_another(reason) || !neighbours_move(t, track->pos, &near))
+    pf_point_q16 near = around ? *around : (pf_point_q16){0, 0}, miss;
+    if (!worth_another(reason) || (!around && !look_around(t, track->pos, &near, &miss)))
         return reason;
     for (uint32_t i = 0; i < n; i++)
         if (!farther(near, start[i], SAME_START))
             return reason;
     return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
+}
+
+/* Finds one track. What is expected of it is first put right by how far its neighbours were from where they were
+ * expected: the camera's turning cannot be foreseen, but it is nearly the same for those near one another. */
+static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
+{
+    pf_slot *s = &t->slots[slot];
+    pf_expected *e = &s->expected;
+    const pf_point_q16 given = e->at;
+    const bool is_expected = given.x != PF_NO_GUESS;
+    pf_point_q16 around, miss;
+    const bool has_near = (is_expected || track->age == 0) && look_around(t, track->pos, &around, &miss);
+    if (is_expected && has_near)
+        e->at = (pf_point_q16){pf_guess_clamp((int64_t)given.x + miss.x, t->config.width),
+                               pf_guess_clamp((int64_t)given.y + miss.y, t->config.height)};
+    pf_track_reason reason = seek(t, track, slot, has_near ? &around : NULL);
+    if (reason == PF_TRACK_OK && (uint64_t)track->cov_xx_q20 + track->cov_yy_q20 > VAGUE)
+        reason = PF_TRACK_DRIFT;
+    e->at.x = PF_NO_GUESS;
+    s->miss = (pf_point_q16){0, 0};
+    if (is_expected && reason == PF_TRACK_OK)
+        s->miss = (pf_point_q16){track->pos.x - given.x, track->pos.y - given.y};
+    return reason;
 }
 
 void pf_tracks_follow(pf_tracker *t)

@@ -42,13 +42,14 @@ bool pf_klt_inside(const pf_klt *klt, const pf_image *image, pf_point_q16 at)
     return in_circle(klt, (dx < 0 ? -dx : dx) + reach, (dy < 0 ? -dy : dy) + reach);
 }
 
-void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen)
+void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen, uint32_t noise_q8)
 {
     klt->window = (int32_t)window;
     klt->half = klt->window / 2;
     klt->groups = (klt->window + 7) / 8;
     klt->iterations = (int32_t)iterations;
     klt->min_eigen = (int32_t)min_eigen;
+    klt->noise_var_q8 = (int32_t)((noise_q8 * noise_q8) >> 8);
     for (int32_t r = 0; r < klt->window; r++)
         for (int32_t i = 0; i < 8 * klt->groups; i++)
             klt->whole[r * PATCH_ROW + i] = (int16_t) - (i < klt->window);
@@ -185,6 +186,12 @@ int32_t pf_zncc(int64_t cov, int64_t var_a, int64_t var_b)
     return norm ? pf_clamp_i64((cov >> 5) * 32768 / norm, 32767) : 0;
 }
 
+int32_t pf_likeness(const pf_klt *klt, int64_t cov, int64_t var_a, int64_t var_b, int64_t count)
+{
+    const int64_t noise = count * klt->noise_var_q8, a = var_a - noise, b = var_b - noise;
+    return pf_zncc(cov, a > var_a / 8 ? a : var_a / 8, b > var_b / 8 ? b : var_b / 8);
+}
+
 /* One step at `at`: moves it, and reports gain, similarity and the step's length (larger component). False when the
  * gain is out of range. */
 static bool step(pf_klt *klt, const pf_image *to, const pf_template *s, pf_point_q16 *at, pf_fit *fit, pf_like *like,
@@ -252,7 +259,8 @@ static pf_fit align_level(pf_klt *klt, const pf_image *from, const pf_image *to,
         else if (moved < settled)
             break;
     }
-    fit.zncc_q15 = pf_zncc(like.cov, sums.var, like.var);
+    fit.zncc_q15 =
+        level ? pf_zncc(like.cov, sums.var, like.var) : pf_likeness(klt, like.cov, sums.var, like.var, count);
     if (fit.reason == PF_TRACK_OK && moved > NOT_SETTLED && level == 0)
         fit.reason = PF_TRACK_DIVERGED;
     if (fit.reason != PF_TRACK_OK || (level && fit.zncc_q15 < LEVEL_TRUSTED))

@@ -3,18 +3,19 @@
  * track carries its own fall a frame, and the encoder says how much of it comes next. */
 #include "track_private.h"
 
-#define ONE       ((int64_t)1 << 30)
-#define STEEP     (ONE / 16) /* sine of the polar angle below which the cotangent says nothing: 3.6 degrees */
-#define COT_MOST  (64 << 16)
-#define SIDE      (6 << 16) /* cotangent above which a track is too deep to measure the common fall: 9.5 degrees */
-#define LEAST     8u
-#define STIRS     65 /* Q16: a thousandth of the radius; from less no ratio is taken */
-#define RATIO_MAX (8 << 16)
-#define FAST      (65536 / 25) /* of the radius a frame: patches then grow by 4 % and more */
-#define TILT      64           /* 1/64 rad */
-#define FRAMES    16           /* after more dropped frames nothing is found again anyway */
-#define LEAP      (4 << 16)    /* radii a frame: no crawler drives so, a reading that says so is wrong */
-#define ROLL_JUMP 20000        /* urad: below, the last frame's own rotation is better than an inclinometer */
+#define ONE          ((int64_t)1 << 30)
+#define STEEP        (ONE / 16) /* sine of the polar angle below which the cotangent says nothing: 3.6 degrees */
+#define COT_MOST     (64 << 16)
+#define SIDE         (6 << 16) /* cotangent above which a track is too deep to measure the common fall: 9.5 degrees */
+#define LEAST        8u
+#define BESIDE_LEAST 5u
+#define STIRS        65 /* Q16: a thousandth of the radius; from less no ratio is taken */
+#define RATIO_MAX    (8 << 16)
+#define FAST         (65536 / 25) /* of the radius a frame: patches then grow by 4 % and more */
+#define TILT         64           /* 1/64 rad */
+#define FRAMES       16           /* after more dropped frames nothing is found again anyway */
+#define LEAP         (4 << 16)    /* radii a frame: no crawler drives so, a reading that says so is wrong */
+#define ROLL_JUMP    20000        /* urad: below, the last frame's own rotation is better than an inclinometer */
 
 static int64_t sine_of(const pf_ray_q30 *v)
 {
@@ -284,6 +285,23 @@ static void warp_of(const pf_drive *d, const pf_ray_q30 *ray, pf_ray_project pro
     warp[3] = pf_clamp_i64((ny2 * ox1 - ny1 * ox2) / det, 2 << 16);
 }
 
+/* The fall of a track that has none of its own yet: the median of those on its side of the pipe, within 30 degrees. Low
+ * above the invert the crown's is much less. */
+static int32_t fall_beside(const pf_predictor *p, const pf_ray_q30 *rays, uint32_t n, const pf_ray_q30 *at)
+{
+    const int64_t x = at->x >> 15, y = at->y >> 15;
+    uint32_t count = 0;
+    for (uint32_t i = 0; i < n && i < 2u * p->max_tracks && count < p->max_tracks; i++) {
+        const int64_t along = x * (rays[i].x >> 15) + y * (rays[i].y >> 15);
+        if (p->fall[i] == PF_FALL_UNKNOWN || along <= 0)
+            continue;
+        const int64_t across = x * (rays[i].y >> 15) - y * (rays[i].x >> 15);
+        if (across * 7 < along * 4 && -across * 7 < along * 4) /* tan 30 degrees = 0.577 */
+            p->value[count++] = (uint32_t)((int64_t)p->fall[i] + ((int64_t)1 << 31));
+    }
+    return count < BESIDE_LEAST ? p->forward : median_signed(p->value, count);
+}
+
 void pf_predictor_guess(const pf_predictor *p, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected)
 {
@@ -298,7 +316,7 @@ void pf_predictor_guess(const pf_predictor *p, const pf_track *tracks, const pf_
         if (tracks[i].status == PF_TRACK_LOST || !pf_ray_valid(&rays[i]))
             continue;
         const bool has_own = i < 2u * p->max_tracks && p->fall[i] != PF_FALL_UNKNOWN && is_moving;
-        d.fall = has_own ? (p->fall[i] * ratio) >> 16 : forward;
+        d.fall = !is_moving ? forward : ((has_own ? p->fall[i] : fall_beside(p, rays, n, &rays[i])) * ratio) >> 16;
         const pf_ray_q30 driven = drive(&d, &rays[i]);
         if (!project(camera, &driven, &e->at))
             e->at.x = PF_NO_GUESS;

@@ -22,7 +22,8 @@ typedef struct pf_klt {
     int32_t window, half;
     int32_t groups; /* of 8 columns, that hold the window; the surplus columns are masked */
     int32_t iterations;
-    int32_t min_eigen; /* grey^2, mean over the window; below this a patch is flat */
+    int32_t min_eigen;    /* grey^2, mean over the window; below this a patch is flat */
+    int32_t noise_var_q8; /* variance of the image's noise, grey^2 */
     pf_point_q16 circle;
     int32_t radius_q16;       /* 0 = no circle */
     const int16_t *counted;   /* the mask in use: `whole` or `mask` */
@@ -50,6 +51,7 @@ typedef struct pf_anchor {
     int32_t inverse[21]; /* Q12.20, of the scaled 6x6 normal matrix, lower triangle; order dx dy, the warp by rows */
     int32_t scale[6];    /* log2 of each parameter's scale */
     int32_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
+    int32_t excess_q8;   /* of the last fit: what was left over what noise leaves, at least 1, at most 16 */
     int64_t carried[3];  /* covariance (xx, xy, yy) with which it was put there, Q20 px^2: zero at first sight */
 } pf_anchor;
 
@@ -69,8 +71,13 @@ static inline int32_t pf_clamp_i64(int64_t v, int32_t limit)
 /* Q0.15 correlation of two patches from their sums of centred products (Q8, below 2^37). */
 int32_t pf_zncc(int64_t cov, int64_t var_a, int64_t var_b);
 
-/* Sets the parameters but the circle, which is the caller's. */
-void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen);
+/* The same less what noise takes from it: noise adds to the variances of both patches (of `count` pixels), and a small
+ * mark on a bare wall is found as surely as brick though most of its window is noise. At least an eighth of each must
+ * be more. */
+int32_t pf_likeness(const pf_klt *klt, int64_t cov, int64_t var_a, int64_t var_b, int64_t count);
+
+/* Sets the parameters but the circle, which is the caller's. `noise_q8`: sigma. */
+void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen, uint32_t noise_q8);
 
 /* Bytes of a template's pixels. */
 static inline uint32_t pf_anchor_bytes(uint32_t window)
@@ -93,6 +100,10 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
 /* Aligns the template with `image` by an affine warp, gain and bias, starting at *at and the anchor's last warp;
  * updates both. */
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at);
+
+/* Where around `at`, within 4 px, the template, warped as the anchor says, looks most like the image. */
+pf_point_q16 pf_anchor_search(pf_klt *klt, const pf_image *image, const pf_anchor *anchor, const uint8_t *pixels,
+                              pf_point_q16 at);
 
 /* What a template taken where this one was last fitted carries: what this one does and the noise of its own picture.
  * That of the picture in which they meet is in the new one's; it would count twice. */

@@ -14,6 +14,7 @@
 typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */
     bool sure;            /* which its start met within CERTAIN */
+    pf_point_q16 miss;    /* how far it was from where the caller expected it; 0, 0 where it did not */
     pf_point_q16 own;     /* its moves summed with forgetting; */
     int32_t radial, flow; /* what of them is radial, and the same of those around: see follow.c */
     pf_expected expected; /* by the caller, of the next frame */

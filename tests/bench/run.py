@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+import room_calib
 import room_track
 from peers import PEERS
 
@@ -57,7 +58,13 @@ def bench_recon() -> list[dict]:
     return figures + (run_program(ceres) if ceres.exists() else [])
 
 
-PYTHON_ROOMS = {"camera": bench_camera, "recon": bench_recon, "sim": bench_sim, "track": room_track.measure}
+PYTHON_ROOMS = {
+    "calib": room_calib.measure,
+    "camera": bench_camera,
+    "recon": bench_recon,
+    "sim": bench_sim,
+    "track": room_track.measure,
+}
 
 
 def cpu_name() -> str:

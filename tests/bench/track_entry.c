@@ -58,7 +58,7 @@ entry *entry_new(uint32_t width, uint32_t height, uint32_t max_tracks, uint32_t 
     }
     e->width = width;
     e->height = height;
-    pf_klt_init(&e->klt, 21, 10, 1);
+    pf_klt_init(&e->klt, 21, 10, 1, noise_q8 ? noise_q8 : 512);
     return e;
 }
 

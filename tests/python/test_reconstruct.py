@@ -48,8 +48,8 @@ def test_exact_tracks_give_the_exact_structure(method: str) -> None:
 
 
 def test_errors_are_those_that_the_covariance_predicts() -> None:
-    """40 draws of noise on one drive: mean of e^T C^-1 e over centres and points against their coordinates, and the
-    same for the mean radius of a ring of points.
+    """40 draws of noise on one drive: mean of e^T C^-1 e over centres and points against their coordinates, and
+    the same for the mean radius of a ring of points.
 
     All points share the errors of the poses, so the draws are what counts: 3 coordinates each at least."""
     draws = 40

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipefish.cli import main
 from pipefish.errors import FormatError
@@ -285,6 +286,15 @@ def test_everything_random_follows_the_seed() -> None:
         ({"telemetry": {"drop_longest": 0}}, "telemetry.drop_longest: must be within"),
         ({"telemetry": {"slips": [{"metres": "x"}]}}, r"telemetry.slips\[0\].metres: must be a number"),
         ({"motion": {"encoder_slip": 0}}, "motion.encoder_slip: unknown"),
+        ({"water": [{"depth": 0.001}, {"depth": 0.15}]}, r"water\[1\]: at frame 0 the camera would be under it"),
+        (
+            {"deposits": [{"s": 0.5, "height": 0.07, "extent": 3.0}], "motion": {"below_axis": 0.04}},
+            r"(motion|lamp): at frame \d+ .* would be in the wall",
+        ),
+        (
+            {"lamp": {"ring_radius": 0.05}, "motion": {"below_axis": 0.07, "wobble_m": 0, "wobble_rad": 0}},
+            r"lamp: at frame 0 lamp \d would be in the wall",
+        ),
     ],
 )
 def test_a_bad_drive_is_refused_with_the_key(change: dict, where: str) -> None:
@@ -356,11 +366,35 @@ def test_the_command_lists_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "diametre" in capsys.readouterr().err
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--set", "diameter.d=0.1"]) == 1
     assert "diameter" in capsys.readouterr().err
+    assert main(["simulate", "tiny", "-o", str(tmp_path / "a"), "--set", "lens.widht=3"]) == 1
+    assert capsys.readouterr().err.startswith("pipefish: lens.widht: unknown")  # no file is to blame
+    assert main(["simulate", "two-views", "-o", str(tmp_path / "a"), "--set", "layer=3"]) == 1
+    assert "layer: unknown" in capsys.readouterr().err
     assert main(["simulate", "-o", str(tmp_path / "a")]) == 2
+    assert main(["simulate", "tiny", "-o", str(tmp_path / "a"), "--width", "3"]) == 2
     assert main(["simulate", "tiny"]) == 2
     assert main(["simulate", "tiny", "--picture", str(tmp_path / "a.png"), "--seed", "3"]) == 2
     assert main(["simulate", "tiny", "-o", str(tmp_path / "a"), "--frame", "3"]) == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_is_as_wide_as_asked_and_set_reaches_scenes_that_are_no_pipes(tmp_path: Path) -> None:
+    file = tmp_path / "a.png"
+    small = ["--set", "lens.width=200", "--set", "lens.height=150", "--set", "samples=34"]
+    assert main(["simulate", "two-views", "--picture", str(file), *small]) == 0
+    assert Image.open(file).size == (400, 150)
+    assert main(["simulate", "tiny", "--picture", str(file), "--width", "100"]) == 0
+    assert Image.open(file).size == (100, 75)
+    assert main(["simulate", "tiny", "--picture", str(file), "--width", "1000"]) == 0
+    assert Image.open(file).size == (320, 240)
+
+
+def test_a_lens_profile_can_be_put_in(tmp_path: Path) -> None:
+    simulate("tiny", tmp_path / "a", frames=1, quiet=True)
+    profile = tmp_path / "a.profile.json"
+    command = ["simulate", "straight", "--picture", str(tmp_path / "b.png"), "--set", f"lens.profile={profile}"]
+    assert main(command) == 0
+    assert Image.open(tmp_path / "b.png").size == (320, 240)
 
 
 def test_set_changes_the_scene_before_it_is_checked(tmp_path: Path) -> None:

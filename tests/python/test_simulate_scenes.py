@@ -241,6 +241,69 @@ def test_corners_are_where_edges_cross(samples: int, rms: float) -> None:
     assert np.linalg.norm(np.mean(errors, axis=0)) < 0.3 * rms  # unbiased
 
 
+@pytest.mark.parametrize("preset", ["fisheye-185", "fisheye-220"])
+def test_corners_are_where_edges_cross_through_lenses_that_bend_lines(preset: str) -> None:
+    # As above, with the edges fitted in the board's plane, where they are straight: a pixel's place there is where its
+    # ray meets it, from the lens's inverse; the truth comes from projection. The blur is round in pixels.
+    target = Target("checkerboard", 6, 8, 0.03)
+    lens = {**EVEN, **VGA, "preset": preset}
+    studio = Studio(lens, CLEAN)
+    poses = target_poses(target, studio, 3, seed=5, tilt=0.3)
+    views, _ = simulate_target_views(
+        target, lens, poses, sensor={**CLEAN, "blur_px": 0.8}, light={"lamps": []}, clutter=False, samples=610
+    )
+    erf = np.vectorize(math.erf)
+    errors = []
+    for view in views:
+
+        def look(pixels: np.ndarray, shown: Picture = view.picture) -> tuple[np.ndarray, np.ndarray]:
+            """Where pixels (N, 2) meet the board, (N, 2) metres; the derivatives by the pixel, (N, 2, 2)."""
+            at, *beside = (studio.look(shown, pixels + step).at
+                           for step in ((0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)))  # fmt: skip
+            return at, np.stack([beside[0] - beside[1], beside[2] - beside[3]], -1) / 0.02
+
+        grid = view.pixels.reshape(5, 7, 2)
+        for (row, col), ok in np.ndenumerate(view.visible.reshape(5, 7)):
+            px = grid[row, col]
+            near = [grid[r, c] for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1))
+                    if 0 <= r < 5 and 0 <= c < 7]  # fmt: skip
+            if not ok or not ((px > 8) & (px < [631, 471])).all() or min(np.linalg.norm(near - px, axis=1)) < 14:
+                continue
+            middle = np.round(px).astype(int)
+            v, u = np.mgrid[middle[1] - 4 : middle[1] + 5, middle[0] - 4 : middle[0] + 5].reshape(2, -1)
+            pixels = np.column_stack([u, v]).astype(float)
+            at, by = look(pixels)
+            if not np.isfinite(by).all():
+                continue
+            away, grey = at - target.flat_points().reshape(5, 7, 2)[row, col], view.image[v, u].astype(float)
+            # Pixels from either edge: over the mean of the gradients there and here, which leaves a third order.
+            wide = np.linalg.norm(by, axis=2)
+            for k in (0, 1):
+                foot = pixels - (away[:, k] / wide[:, k] ** 2)[:, None] * by[:, k]
+                wide[:, k] = (wide[:, k] + np.linalg.norm(look(foot)[1][:, k], axis=1)) / 2
+
+            def model(p: np.ndarray, away: np.ndarray = away, wide: np.ndarray = wide) -> np.ndarray:
+                across = (away - p[:2]) / wide / p[2]
+                return p[3] + p[4] * erf(across[:, 0]) * erf(across[:, 1])
+
+            p = np.array([0, 0, 1.2, 0, 1])
+            shape = model(p)
+            p[4] = ((grey - grey.mean()) @ shape) / (shape @ shape)
+            p[3] = grey.mean() - p[4] * shape.mean()
+            steps = np.diag([1e-8, 1e-8, 1e-6, 1e-6, 1e-6])
+            for _ in range(6):
+                base = model(p)
+                slopes = np.stack([(model(p + s) - base) / s.max() for s in steps], 1)
+                p = p + np.linalg.lstsq(slopes, grey - base, rcond=None)[0]
+            errors.append(np.linalg.solve(look(px[None])[1][0], p[:2]))
+    assert len(errors) > 20, len(errors)
+    # What is left is the fit's: where both edges are curved, blur moves their crossing by about its variance over their
+    # radius: 0.8^2 / 150 px near the rim, and more where they meet at a sharp angle.
+    assert np.sqrt(np.mean(np.square(errors))) < 0.007
+    assert np.abs(errors).max() < 0.03  # where edges cross at a sharp angle
+    assert np.linalg.norm(np.mean(errors, axis=0)) < 0.002  # unbiased
+
+
 def test_a_warped_board_moves_its_corners_as_it_says() -> None:
     target = Target("checkerboard", 6, 8, 0.03)
     stretch = {"powers": [{"i": 1, "j": 0, "metres": 1e-4}]}

@@ -419,6 +419,47 @@ static void test_tracks_that_run_together_are_thinned(void)
     TEST_ASSERT_GREATER_THAN_UINT32(0, crowded);
 }
 
+/* Dots of standard deviation 1.5 px, 40 px apart, `left` grey levels high in the left half, `right` in the right. */
+static void render_dots(uint8_t *out, double left, double right)
+{
+    for (int y = 0; y < HEIGHT; y++)
+        for (int x = 0; x < WIDTH; x++) {
+            const double dx = (x + 20) % 40 - 19.7, dy = (y + 20) % 40 - 20.2;
+            const double v = 100 + (x < WIDTH / 2 ? left : right) * exp((dx * dx + dy * dy) / -4.5) + normal();
+            out[y * STRIDE + x] = (uint8_t)lrint(v);
+        }
+}
+
+/* Proves: a mark whose place would be known to 0.12 px only makes no track, though its corner is strong enough; one
+ * four times as high does. */
+static void test_faint_marks_make_no_tracks(void)
+{
+    uint32_t n;
+    pf_tracker *t = start(NULL);
+    render_dots(frame[0], 18, 70);
+    feed(t, frame[0]);
+    const pf_track *now = pf_tracker_tracks(t, &n);
+    for (uint32_t i = 0; i < n; i++)
+        TEST_ASSERT_GREATER_THAN_INT32((WIDTH / 2 - 8) * 65536, now[i].pos.x);
+    TEST_ASSERT_GREATER_THAN_UINT32(8, n);
+}
+
+/* Proves: with an image circle nothing begins in its outer eighth, where the lamp's mirror images are; but up to there.
+ */
+static void test_nothing_begins_at_the_rim(void)
+{
+    const pf_tracker_config c = {.circle = {WIDTH << 15, HEIGHT << 15}, .circle_radius_q16 = 112u << 16};
+    double farthest = 0;
+    uint32_t n;
+    pf_tracker *t = start(&c);
+    render(frame[0], &still, 1, 0);
+    feed(t, frame[0]);
+    const pf_track *now = pf_tracker_tracks(t, &n);
+    for (uint32_t i = 0; i < n; i++)
+        farthest = fmax(farthest, hypot(now[i].pos.x / 65536.0 - WIDTH / 2, now[i].pos.y / 65536.0 - HEIGHT / 2));
+    TEST_ASSERT_TRUE(farthest <= 98 && farthest > 90);
+}
+
 /* Proves: black, saturated and evenly grey frames give no tracks and no crash; noise gives tracks that do not live. */
 static void test_frames_without_a_scene_give_nothing(void)
 {
@@ -568,6 +609,8 @@ int main(void)
     RUN_TEST(test_absurd_expectations_do_no_harm);
     RUN_TEST(test_covariances_are_positive_definite);
     RUN_TEST(test_tracks_that_run_together_are_thinned);
+    RUN_TEST(test_faint_marks_make_no_tracks);
+    RUN_TEST(test_nothing_begins_at_the_rim);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);
     RUN_TEST(test_covariance_holds_over_turns_and_renewals);

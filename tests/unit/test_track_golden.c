@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x3E5AB81Eu
+#define GOLDEN 0xA8528CBAu
 
 void setUp(void) {}
 void tearDown(void) {}

@@ -244,7 +244,7 @@ public:
             }
             if (j_g) {
                 piece_->b_g.noalias() += weight * (jg.transpose() * residual);
-                piece_->h_gg.noalias() += weight * (jg.transpose() * jg);
+                piece_->h_gg.template selfadjointView<Eigen::Lower>().rankUpdate(jg.transpose(), weight);
             }
         }
 
@@ -443,7 +443,7 @@ private:
                 }
             }
             if (border_ > 0) {
-                s_gg_.noalias() -= h_eg_[e].transpose() * (inverse_e_[e] * h_eg_[e]);
+                s_gg_.template triangularView<Eigen::Lower>() -= h_eg_[e].transpose() * (inverse_e_[e] * h_eg_[e]);
             }
         }
         return factor_band() && factor_border();
@@ -490,7 +490,7 @@ private:
         }
         forward(s_fg_);
         for (size_t i = 0; i < count_f_; i++) {
-            s_gg_.noalias() -= s_fg_[i].transpose() * s_fg_[i];
+            s_gg_.template selfadjointView<Eigen::Lower>().rankUpdate(s_fg_[i].transpose(), -1.0);
         }
         // Scaled to unit diagonal before factoring, so that "singular" does not depend on units.
         scale_g_ = common_.h_gg.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
@@ -603,12 +603,12 @@ private:
         return 0.5 * sum;
     }
 
-    // With the factor of the undamped matrix: inside the band by Takahashi's recursion, from the last block backwards.
-    Covariance inverse() const
+    // S_ff^-1 inside the band, z[i][d] between i and i - d, with the factor of the undamped matrix: Takahashi's
+    // recursion, from the last block backwards.
+    std::vector<MatrixF> banded_inverse() const
     {
-        Covariance out;
-        std::vector<MatrixF> z(count_f_ * (band_ + 1), MatrixF::Zero()); // z[i][d]: S_ff^-1 between i and i - d
-        const auto at = [&](size_t i, size_t j) -> MatrixF {             // either order, within the band
+        std::vector<MatrixF> z(count_f_ * (band_ + 1), MatrixF::Zero());
+        const auto at = [&](size_t i, size_t j) -> MatrixF { // either order, within the band
             return i >= j ? z[banded_at(i, i - j)] : MatrixF(z[banded_at(j, j - i)].transpose());
         };
         for (size_t j = count_f_; j-- > 0;) {
@@ -618,9 +618,7 @@ private:
             for (size_t i = last; i > j; i--) {
                 MatrixF sum = MatrixF::Zero();
                 for (size_t k = j + 1; k <= last; k++) {
-                    if ((k > i ? k - i : i - k) <= band_) {
-                        sum.noalias() -= at(i, k) * s_ff_[banded_at(k, k - j)];
-                    }
+                    sum.noalias() -= at(i, k) * s_ff_[banded_at(k, k - j)];
                 }
                 z[banded_at(i, i - j)] = sum * inverse;
             }
@@ -632,6 +630,14 @@ private:
             const MatrixF block = inverse.transpose() * sum;
             z[banded_at(j, 0)] = 0.5 * (block + block.transpose());
         }
+        return z;
+    }
+
+    // With the factor of the undamped matrix.
+    Covariance inverse() const
+    {
+        Covariance out;
+        const std::vector<MatrixF> z = banded_inverse();
         std::vector<MatrixFG> y = s_fg_; // S_ff^-1 S_fg
         if (border_ > 0) {
             out.g = scale_g_.asDiagonal() * llt_g_.solve(Eigen::MatrixXd::Identity(border_, border_)) *

@@ -13,7 +13,7 @@ namespace pipefish::sim
 namespace
 {
 
-constexpr int NODES = static_cast<int>(Bundle::STRAND);       // cones a strand
+constexpr int NODES = 10;                                     // cones a strand
 constexpr double THINNEST = 0.2;                              // of a strand's diameter, at its end
 constexpr double GRAVITY = 0.12;                              // pull on the direction, a cone
 constexpr double RESTLESS = 0.28;                             // random change of direction, a cone
@@ -39,6 +39,21 @@ bool near_ball(const Ball &ball, const Eigen::Vector3d &o, const Eigen::Vector3d
     return along > -reach && along < t_max + reach && (to - along * d).squaredNorm() < reach * reach;
 }
 
+// The tree over the cones from `from` to `to`, halved where a limb (a first strand and its branches), a strand or a
+// cone ends.
+void plant(Bundle &bundle, size_t from, size_t to, size_t limb)
+{
+    const size_t self = bundle.tree.size(), count = to - from;
+    bundle.tree.push_back({ball_around(bundle.cones, from, to), 0, count == 1 ? static_cast<int>(from) : -1});
+    if (count > 1) {
+        const size_t unit = count > limb ? limb : count > NODES ? static_cast<size_t>(NODES) : 1;
+        const size_t middle = from + (count / unit + 1) / 2 * unit;
+        plant(bundle, from, middle, limb);
+        plant(bundle, middle, to, limb);
+    }
+    bundle.tree[self].skip = bundle.tree.size();
+}
+
 struct Grower {
     const Root &spec;
     const Eigen::Vector3d &down;
@@ -55,11 +70,11 @@ struct Grower {
 
     void strand(Eigen::Vector3d at, Eigen::Vector3d direction, double length, double diameter, int branches)
     {
-        struct Twig {
+        struct Fork {
             Eigen::Vector3d at, direction;
             double diameter;
         };
-        std::vector<Twig> twigs;
+        std::vector<Fork> forks;
         int done = 0;
         for (int i = 0; i < NODES; i++) {
             const auto radius_at = [&](int k) { return 0.5 * diameter * (1.0 - (1.0 - THINNEST) * k / NODES); };
@@ -70,11 +85,11 @@ struct Grower {
             // Branches leave at the cones between a fifth and nine tenths of the strand, spread evenly.
             const int due = branches * std::max(0, i - 1) / (NODES - 2);
             for (; done < due; done++) {
-                twigs.push_back({at, (direction + 0.9 * random_vector()).normalized(), 2.0 * radius_at(i)});
+                forks.push_back({at, (direction + 0.9 * random_vector()).normalized(), 2.0 * radius_at(i)});
             }
         }
-        for (const Twig &twig : twigs) {
-            strand(twig.at, twig.direction, length * BRANCH_LENGTH, twig.diameter * BRANCH_DIAMETER, 0);
+        for (const Fork &fork : forks) {
+            strand(fork.at, fork.direction, length * BRANCH_LENGTH, fork.diameter * BRANCH_DIAMETER, 0);
         }
     }
 };
@@ -133,25 +148,15 @@ Bundle grow_roots(const Root &spec, const Eigen::Vector3d &base, const Eigen::Ve
         const Eigen::Vector3d start = base - spec.diameter * inward + 2.0 * spec.diameter * aside;
         grower.strand(start, (inward + aside).normalized(), spec.length * share, spec.diameter * share, spec.branches);
     }
-    for (size_t i = 0; i < bundle.cones.size(); i += Bundle::STRAND) {
-        bundle.strands.push_back(ball_around(bundle.cones, i, i + Bundle::STRAND));
-    }
-    bundle.limb = Bundle::STRAND * static_cast<size_t>(1 + spec.branches);
-    for (size_t i = 0; i < bundle.cones.size(); i += bundle.limb) {
-        bundle.limbs.push_back(ball_around(bundle.cones, i, i + bundle.limb));
-    }
-    bundle.all = ball_around(bundle.cones, 0, bundle.cones.size());
+    plant(bundle, 0, bundle.cones.size(), static_cast<size_t>(NODES * (1 + spec.branches)));
     return bundle;
 }
 
 Bundle moved(const Bundle &bundle, const Eigen::Matrix3d &rotation, const Eigen::Vector3d &origin)
 {
     Bundle out = bundle;
-    out.all.centre = rotation * (bundle.all.centre - origin);
-    for (std::vector<Ball> *balls : {&out.strands, &out.limbs}) {
-        for (Ball &ball : *balls) {
-            ball.centre = rotation * (ball.centre - origin);
-        }
+    for (Twig &twig : out.tree) {
+        twig.around.centre = rotation * (twig.around.centre - origin);
     }
     for (RoundCone &c : out.cones) {
         c.a = rotation * (c.a - origin);
@@ -161,31 +166,23 @@ Bundle moved(const Bundle &bundle, const Eigen::Matrix3d &rotation, const Eigen:
 }
 
 bool hit_bundle(const Bundle &bundle, const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, double t_max,
-                double grow, double &t, Eigen::Vector3d &normal)
+                double grow, bool any, double &t, Eigen::Vector3d &normal)
 {
-    // Does the ray pass within `reach` of the segment from a to b? Only then a cone is worth its square roots.
-    if (!near_ball(bundle.all, origin, direction, t_max, grow)) {
-        return false;
-    }
     bool found = false;
     double best = t_max;
-    for (size_t i = 0; i < bundle.cones.size(); i++) {
-        if (i % bundle.limb == 0 && !near_ball(bundle.limbs[i / bundle.limb], origin, direction, best, grow)) {
-            i += bundle.limb - 1;
+    for (size_t i = 0; i < bundle.tree.size() && !(any && found);) {
+        const Twig &twig = bundle.tree[i];
+        if (!near_ball(twig.around, origin, direction, best, grow)) {
+            i = twig.skip;
             continue;
         }
-        if (i % Bundle::STRAND == 0 && !near_ball(bundle.strands[i / Bundle::STRAND], origin, direction, best, grow)) {
-            i += Bundle::STRAND - 1;
-            continue;
+        i++;
+        if (twig.cone >= 0) {
+            const RoundCone &cone = bundle.cones[static_cast<size_t>(twig.cone)];
+            const double more = grow * std::max((twig.around.centre - origin).dot(direction), 0.0);
+            hit_cone({cone.a, cone.b, cone.radius_a + more, cone.radius_b + more}, origin, direction, best, normal,
+                     found);
         }
-        const RoundCone &cone = bundle.cones[i];
-        const Eigen::Vector3d to = 0.5 * (cone.a + cone.b) - origin;
-        const double along = to.dot(direction), more = grow * std::max(along, 0.0);
-        const double thick = std::max(cone.radius_a, cone.radius_b) + more;
-        if ((to - along * direction).squaredNorm() > 0.5 * (cone.b - cone.a).squaredNorm() + 2.0 * thick * thick) {
-            continue; // (half a length + radius)^2 is less
-        }
-        hit_cone({cone.a, cone.b, cone.radius_a + more, cone.radius_b + more}, origin, direction, best, normal, found);
     }
     t = best;
     return found;

@@ -20,12 +20,16 @@ struct Ball { // around something
     double radius;
 };
 
+// A tree over the cones: a node's descendants follow it, up to `skip`.
+struct Twig {
+    Ball around;
+    size_t skip;
+    int cone; // of a leaf, else -1
+};
+
 struct Bundle {
-    static constexpr size_t STRAND = 10; // cones
-    std::vector<RoundCone> cones;        // strand by strand
-    size_t limb;                         // cones of a first strand and its branches
-    std::vector<Ball> strands, limbs;
-    Ball all;
+    std::vector<RoundCone> cones; // strand by strand
+    std::vector<Twig> tree;       // the first one: around all
 };
 
 // Grows a bundle from `base` along the unit vector `inward`, bending towards `down`.
@@ -35,9 +39,9 @@ Bundle grow_roots(const Root &spec, const Eigen::Vector3d &base, const Eigen::Ve
 // The same, moved: out = rotation (p - origin).
 Bundle moved(const Bundle &bundle, const Eigen::Matrix3d &rotation, const Eigen::Vector3d &origin);
 
-// First hit of the ray (unit direction) with t in (0, t_max); every radius is `grow` metres larger a metre of t.
-// False: none. `t` and the outward normal of the hit.
+// First hit (or with `any`, one of them) of the ray (unit direction) with t in (0, t_max); every radius is `grow`
+// metres larger a metre of t. False: none. `t` and the outward normal of the hit.
 bool hit_bundle(const Bundle &bundle, const Eigen::Vector3d &origin, const Eigen::Vector3d &direction, double t_max,
-                double grow, double &t, Eigen::Vector3d &normal);
+                double grow, bool any, double &t, Eigen::Vector3d &normal);
 
 } // namespace pipefish::sim

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <string>
 
 namespace pipefish::sim
 {
@@ -61,6 +62,35 @@ Scene::Scene(const SceneSpec &spec)
 {
     spec_.lens.theta_max = lens_.theta_max();
     spec_.lens.circle_radius = lens_.circle_radius();
+    check_places();
+}
+
+// A camera or a lamp where there is no air would draw black or a dry pipe.
+void Scene::check_places() const
+{
+    const auto in_wall = [&](const Eigen::Vector3d &world) {
+        WallPoint at{};
+        return !tube_.locate(world, at) || !(at.distance < tube_.wall_radius(at.s, at.clock));
+    };
+    const std::vector<Lamp> lamps = make_lamps(spec_.lamp);
+    for (size_t k = 0; k < frames_.size(); k++) {
+        const CameraState &camera = frames_[k];
+        const std::string when = "at frame " + std::to_string(k) + " ";
+        if (in_wall(camera.centre)) {
+            throw SpecError("motion: " + when + "the camera would be in the wall or in what lies on it");
+        }
+        for (size_t i = 0; i < lamps.size(); i++) {
+            const Eigen::Vector3f own(lamps[i].x, lamps[i].y, lamps[i].z);
+            if (in_wall(camera.centre + camera.world_from_cam * own.cast<double>())) {
+                throw SpecError("lamp: " + when + "lamp " + std::to_string(i) +
+                                " would be in the wall or in what lies on it");
+            }
+        }
+        const int water = tube_.water_over(camera.centre);
+        if (water >= 0) {
+            throw SpecError("water[" + std::to_string(water) + "]: " + when + "the camera would be under it");
+        }
+    }
 }
 
 Scene::~Scene() = default;

@@ -113,6 +113,7 @@ private:
         double behind, ahead; // metres of wall that the surface is made for, around the camera
     };
     static Reach lit_reach(const SceneSpec &spec);
+    void check_places() const; // throws SpecError
     bool ray(const double px[2], PixelRay &ray) const;
     bool on_sensor(const double px[2]) const;
     void prepare(); // what only drawing needs, at the first frame

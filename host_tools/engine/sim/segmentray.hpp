@@ -128,12 +128,12 @@ struct Tube::SegmentRay {
         st.vs = segment.bend_radius * (st.u * d.z() - st.z * du) / (st.q * st.q);
     }
 
-    State at(double t) const
+    State at(double t, bool cover = false) const
     {
         State st{};
         place(t, st);
         if (detailed()) {
-            wall_with_reliefs(st, 0.0);
+            wall_with_reliefs(st, 0.0, cover);
         } else {
             ellipse(st);
         }
@@ -161,8 +161,8 @@ struct Tube::SegmentRay {
         }
     }
 
-    // `deeper`: metres by which the surface lies behind the wall.
-    void wall_with_reliefs(State &st, double deeper) const
+    // `deeper`: metres by which the surface lies behind the wall. `cover`: of the reliefs' covers.
+    void wall_with_reliefs(State &st, double deeper, bool cover = false) const
     {
         const double rho2 = st.x * st.x + st.y * st.y, inner = segment.inner;
         st.inner = rho2 < inner * inner * (1.0 - 2e-7);
@@ -175,7 +175,7 @@ struct Tube::SegmentRay {
         st.clock = wrap_clock(std::atan2(st.x, -st.y));
         Height wall;
         const double scale = 2.0 / tube.radius_,
-                     r = tube.radius_at(segment, arc(st), st.clock, st.x / st.rho, st.y / st.rho, wall);
+                     r = tube.radius_at(segment, arc(st), st.clock, st.x / st.rho, st.y / st.rho, wall, cover);
         const double turn = wall.by_phi / rho2;
         st.g = scale * (st.rho - r - deeper);
         st.g_section = {scale * (st.x / st.rho + turn * st.y), scale * (st.y / st.rho - turn * st.x)};
@@ -219,19 +219,27 @@ struct Tube::SegmentRay {
     // like Newton's method. On a straight segment of constant section K is exact and the first step lands on the wall.
     // Reliefs: the same, first up to the cylinder inside which there is no wall, from there with their own bound (that
     // without the deposits as far as the ray cannot reach one), in steps that keep 0.7 of its radius off the axis.
-    // Returns true at the wall.
+    // Where a rough relief has a smoother cover, long steps lead to near it, and only there begin those that the grains
+    // ask for. Returns true at the wall.
     bool to_wall(double &t, double limit, int &steps, State &st) const
     {
         const double inner_bound = detailed() ? ellipse_bound(1.0 / segment.inner, 0.0, 0.0)
                                               : ellipse_bound(segment.inverse_axis, segment.slope, segment.curvature);
         const double bound = detailed() ? relief_bound(segment.bounds) : inner_bound;
         const double calm_bound = detailed() ? relief_bound(segment.calm) : 0.0, longest = 0.3 * segment.inner;
+        const bool covered = detailed() && segment.cover_depth > 0.0;
+        const double cover_bound = covered ? relief_bound(segment.cover) : 0.0;
+        const double close = -0.1 * segment.cover_depth * 2.0 / tube.radius_;
         for (; steps < MAX_STEPS; steps++) {
-            st = at(t);
+            st = at(t, covered);
+            const bool far = covered && st.g < close;
+            if (covered && !st.inner && !far) {
+                st = at(t);
+            }
             if (!st.inner && st.g > -NEAR) {
                 return true;
             }
-            double h = safe_step(st.g, st.rate, st.inner ? inner_bound : bound);
+            double h = safe_step(st.g, st.rate, st.inner ? inner_bound : far ? cover_bound : bound);
             if (detailed() && !st.inner) {
                 h = std::min(std::max(h, std::min(safe_step(st.g, st.rate, calm_bound), clear(st))), longest);
             }

@@ -317,13 +317,13 @@ Tube::View::After Tube::View::leave_crack(Walk &walk) const
     }
 }
 
-bool Tube::View::roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Hit &hit) const
+bool Tube::View::roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, bool any, Hit &hit) const
 {
     bool found = false;
-    for (size_t i = 0; i < bundles_.size(); i++) {
+    for (size_t i = 0; i < bundles_.size() && !(any && found); i++) {
         double t = 0.0;
         Eigen::Vector3d normal;
-        if (hit_bundle(bundles_[i], o, d, hit.t, 0.0, t, normal)) {
+        if (hit_bundle(bundles_[i], o, d, hit.t, 0.0, any, t, normal)) {
             const Root &root = tube_.roots_[i];
             hit = {t, root.s, root.clock, normal, Material::ROOT, static_cast<int>(i), hit.segment};
             found = true;
@@ -354,7 +354,7 @@ bool Tube::View::trace(const Eigen::Vector3d &o, const Eigen::Vector3d &d, int s
         }
     }
     hit = walk.hit;
-    roots_before(o, d, hit);
+    roots_before(o, d, false, hit);
     return true;
 }
 
@@ -416,7 +416,8 @@ bool Tube::View::blocked(const Eigen::Vector3d &from, const Eigen::Vector3d &to,
     const Eigen::Vector3d direction = (to - from) / distance;
     Hit hit{};
     hit.t = most;
-    return roots_only ? roots_before(from, direction, hit) : !trace(from, direction, start_, true, hit) || hit.t < most;
+    return roots_only ? roots_before(from, direction, true, hit)
+                      : !trace(from, direction, start_, true, hit) || hit.t < most;
 }
 
 const Eigen::Vector3d &Tube::View::branch_axis(Material material, int part) const
@@ -428,7 +429,8 @@ const Eigen::Vector3d &Tube::View::branch_axis(Material material, int part) cons
 bool Tube::View::near_roots(const Eigen::Vector3d &point) const
 {
     return std::ranges::any_of(bundles_, [&](const Bundle &bundle) {
-        return (point - bundle.all.centre).squaredNorm() < 4.0 * bundle.all.radius * bundle.all.radius;
+        const Ball &all = bundle.tree.front().around;
+        return (point - all.centre).squaredNorm() < 4.0 * all.radius * all.radius;
     });
 }
 
@@ -438,7 +440,7 @@ bool Tube::View::thin_near(const Eigen::Vector3d &origin, const Eigen::Vector3d 
     for (const Bundle &bundle : bundles_) {
         double t = 0.0;
         Eigen::Vector3d normal;
-        if (hit_bundle(bundle, origin, direction, hit.t, 0.75 * pixel, t, normal)) {
+        if (hit_bundle(bundle, origin, direction, hit.t, 0.75 * pixel, true, t, normal)) {
             return true;
         }
     }

@@ -250,10 +250,12 @@ void Tube::set_radius_bounds(Segment &segment, double largest, double from, doub
     b.by_ss = 0.75 * std::pow(a, 5) * f_s * f_s + 0.5 * a * a * a * f_ss;
     b.by_phiphi = 3.0 * std::pow(a, 5) * k * k + 2.0 * a * a * a * k;
     b.by_sphi = 0.75 * std::pow(a, 5) * f_s * 2.0 * k + 0.5 * a * a * a * 4.0 * l * l * l * segment.slope;
-    segment.calm = b;
+    segment.calm = segment.cover = b;
     for (const Relief *relief : segment.reliefs) {
         const HeightBounds more = relief->bounds(from, to);
         b.add(more);
+        segment.cover.add(relief->cover_bounds(from, to));
+        segment.cover_depth = std::max(segment.cover_depth, relief->cover_depth());
         if (relief->deposit < 0) {
             segment.calm.add(more);
         }
@@ -396,7 +398,8 @@ Frame3 Tube::ride(double s) const
     return frame(s);
 }
 
-double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const
+double Tube::radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum,
+                       bool cover) const
 {
     Section sec = segment.constant;
     if (segment.varying) {
@@ -419,7 +422,7 @@ double Tube::radius_at(const Segment &segment, double s, double clock, double ux
     }
     for (const Relief *relief : segment.reliefs) {
         if (s > relief->from && s < relief->to) {
-            relief->add(s, clock, sum);
+            cover ? relief->add_cover(s, clock, sum) : relief->add(s, clock, sum);
         }
     }
     return sum.h;
@@ -456,6 +459,18 @@ WallPoint Tube::to_section(const Segment &segment, const Eigen::Vector3d &p)
     const double n = segment.bend_radius - std::hypot(u, p.z());
     const double x = n * segment.nx - w * segment.ny, y = n * segment.ny + w * segment.nx;
     return {segment.s0 + segment.bend_radius * std::atan2(p.z(), u), wrap_clock(std::atan2(x, -y)), std::hypot(x, y)};
+}
+
+int Tube::water_over(const Eigen::Vector3d &world) const
+{
+    WallPoint at{};
+    const int index = find(world, at);
+    const int water = index >= 0 ? segments_[static_cast<size_t>(index)].water : -1;
+    if (water < 0) {
+        return -1;
+    }
+    const WaterPlane &plane = planes_[static_cast<size_t>(water)];
+    return plane.normal.dot(world) < plane.level ? water : -1;
 }
 
 int Tube::find(const Eigen::Vector3d &world, WallPoint &out) const

@@ -98,6 +98,8 @@ public:
     // The nearest section through a world point within 1.5 radii of the centreline (or 1.2 of the largest). False when
     // there is none.
     bool locate(const Eigen::Vector3d &world, WallPoint &out) const;
+    // Index of the water that a world point in the pipe lies under, or -1.
+    int water_over(const Eigen::Vector3d &world) const;
 
 private:
     struct Segment;
@@ -155,7 +157,7 @@ public:
         After leave_crack(Walk &walk) const;
         After after(Walk &walk) const;
         double water_ahead(const Walk &walk, const Segment &segment) const;
-        bool roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, Hit &hit) const;
+        bool roots_before(const Eigen::Vector3d &o, const Eigen::Vector3d &d, bool any, Hit &hit) const;
 
         const Tube &tube_;
         std::vector<Local> local_;
@@ -188,6 +190,8 @@ private:
         double inner;
         HeightBounds bounds;       // of the radius
         HeightBounds calm;         // the same without the deposits
+        HeightBounds cover;        // the same of the reliefs' covers
+        double cover_depth;        // metres, of the deepest; 0: no relief has one
         std::vector<int> cracks;   // whose range touches it
         std::vector<int> branches; // the same; laterals first, then holes
         int water;                 // the stretch, or -1
@@ -209,7 +213,9 @@ private:
     int segment_at(double s) const;
     int find(const Eigen::Vector3d &world, WallPoint &out) const; // the segment, or -1
     // The wall's radius and its derivatives at (s, clock); (ux, uy) is the clock's direction.
-    double radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum) const;
+    // `cover`: of the reliefs' covers.
+    double radius_at(const Segment &segment, double s, double clock, double ux, double uy, Height &sum,
+                     bool cover = false) const;
     static Frame3 advance(const Frame3 &frame, const Segment &segment, double along);
     static WallPoint to_section(const Segment &segment, const Eigen::Vector3d &p);
 

@@ -60,7 +60,11 @@ void check_stretch(double start, double end, double ramp, const std::string &whe
 // The smallest turn from `to` to `phi`, in [-pi, pi].
 double turn_between(double phi, double to)
 {
-    return std::remainder(phi - to, TWO_PI);
+    const double turn = phi - to; // of at most a turn, as nearly always
+    if (std::abs(turn) <= PI) {
+        return turn;
+    }
+    return std::abs(turn) <= TWO_PI ? turn - std::copysign(TWO_PI, turn) : std::remainder(turn, TWO_PI);
 }
 
 class EggRelief : public Relief
@@ -160,22 +164,14 @@ public:
         around_ = std::max(4, static_cast<int>(std::lround(TWO_PI * radius / spec.grain)));
     }
 
-    void add(double s, double phi, Height &sum) const override
+    void add(double s, double phi, Height &sum) const override { add_mound(s, phi, false, sum); }
+
+    // All grains at their highest.
+    void add_cover(double s, double phi, Height &sum) const override { add_mound(s, phi, true, sum); }
+    double cover_depth() const override { return 2.0 * spec_.roughness; }
+    HeightBounds cover_bounds(double, double) const override
     {
-        const double x = (s - spec_.s) * 2.0 / spec_.length;
-        const double y = turn_between(phi, spec_.clock) * 2.0 / spec_.extent;
-        if (std::abs(x) >= 1.0 || std::abs(y) >= 1.0) {
-            return;
-        }
-        const double ax = 1.0 - x * x, ay = 1.0 - y * y, bx = ax * ax * ax, by = ay * ay * ay;
-        const double dx = -12.0 * x * ax * ax / spec_.length, dy = -12.0 * y * ay * ay / spec_.extent;
-        Height n{spec_.height, 0.0, 0.0};
-        if (spec_.roughness > 0.0) {
-            grains(s, phi, n);
-        }
-        sum.h -= n.h * bx * by;
-        sum.by_s -= n.by_s * bx * by + n.h * dx * by;
-        sum.by_phi -= n.by_phi * bx * by + n.h * bx * dy;
+        return bounds_with({0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, spec_.height + spec_.roughness);
     }
 
     double outside(double phi) const override
@@ -185,28 +181,52 @@ public:
 
     HeightBounds bounds(double, double) const override
     {
-        // Of (1 - x^2)^3: slope up to 1.7174 (x^2 = 1/5), curvature up to 6 (x = 0).
-        const double slope_s = 1.7174 * 2.0 / spec_.length, slope_p = 1.7174 * 2.0 / spec_.extent;
-        const double curve_s = 24.0 / (spec_.length * spec_.length), curve_p = 24.0 / (spec_.extent * spec_.extent);
         // Of the grains: values in -1..1 at the corners, blended by quintics.
-        const double a = spec_.roughness, g = 1.0 / spec_.grain, q = around_ / TWO_PI, top = spec_.height + a;
-        const double n_s = 2.0 * a * STEP_SLOPE * g, n_p = 2.0 * a * STEP_SLOPE * q;
-        const double n_ss = 2.0 * a * STEP_CURVATURE * g * g, n_pp = 2.0 * a * STEP_CURVATURE * q * q;
-        const double n_sp = 4.0 * a * STEP_SLOPE * STEP_SLOPE * g * q;
-        HeightBounds b;
-        b.least = -top;
-        b.most = std::max(0.0, a - spec_.height);
-        b.by_s = n_s + top * slope_s;
-        b.by_phi = n_p + top * slope_p;
-        b.by_ss = n_ss + 2.0 * n_s * slope_s + top * curve_s;
-        b.by_phiphi = n_pp + 2.0 * n_p * slope_p + top * curve_p;
-        b.by_sphi = n_sp + n_s * slope_p + n_p * slope_s + top * slope_s * slope_p;
-        return b;
+        const double a = spec_.roughness, g = 1.0 / spec_.grain, q = around_ / TWO_PI;
+        return bounds_with({0.0, 0.0, 2.0 * a * STEP_SLOPE * g, 2.0 * a * STEP_SLOPE * q,
+                            2.0 * a * STEP_CURVATURE * g * g, 4.0 * a * STEP_SLOPE * STEP_SLOPE * g * q,
+                            2.0 * a * STEP_CURVATURE * q * q},
+                           spec_.height + a);
     }
 
 private:
     Deposit spec_;
     int around_; // grains on a turn
+
+    void add_mound(double s, double phi, bool cover, Height &sum) const
+    {
+        const double x = (s - spec_.s) * 2.0 / spec_.length;
+        const double y = turn_between(phi, spec_.clock) * 2.0 / spec_.extent;
+        if (std::abs(x) >= 1.0 || std::abs(y) >= 1.0) {
+            return;
+        }
+        const double ax = 1.0 - x * x, ay = 1.0 - y * y, bx = ax * ax * ax, by = ay * ay * ay;
+        const double dx = -12.0 * x * ax * ax / spec_.length, dy = -12.0 * y * ay * ay / spec_.extent;
+        Height n{spec_.height + (cover ? spec_.roughness : 0.0), 0.0, 0.0};
+        if (spec_.roughness > 0.0 && !cover) {
+            grains(s, phi, n);
+        }
+        sum.h -= n.h * bx * by;
+        sum.by_s -= n.by_s * bx * by + n.h * dx * by;
+        sum.by_phi -= n.by_phi * bx * by + n.h * bx * dy;
+    }
+
+    // The mound's share of a height up to `top` with the grains' derivatives `n`.
+    HeightBounds bounds_with(const HeightBounds &n, double top) const
+    {
+        // Of (1 - x^2)^3: slope up to 1.7174 (x^2 = 1/5), curvature up to 6 (x = 0).
+        const double slope_s = 1.7174 * 2.0 / spec_.length, slope_p = 1.7174 * 2.0 / spec_.extent;
+        const double curve_s = 24.0 / (spec_.length * spec_.length), curve_p = 24.0 / (spec_.extent * spec_.extent);
+        HeightBounds b;
+        b.least = -top;
+        b.most = std::max(0.0, spec_.roughness - spec_.height);
+        b.by_s = n.by_s + top * slope_s;
+        b.by_phi = n.by_phi + top * slope_p;
+        b.by_ss = n.by_ss + 2.0 * n.by_s * slope_s + top * curve_s;
+        b.by_phiphi = n.by_phiphi + 2.0 * n.by_phi * slope_p + top * curve_p;
+        b.by_sphi = n.by_sphi + n.by_s * slope_p + n.by_phi * slope_s + top * slope_s * slope_p;
+        return b;
+    }
 
     double corner(int64_t i, int64_t j) const
     {

@@ -141,6 +141,11 @@ public:
     // Adds to `sum` at arc length s and clock angle phi in [0, 2 pi).
     virtual void add(double s, double phi, Height &sum) const = 0;
     virtual HeightBounds bounds(double s_from, double s_to) const = 0;
+    // The same of a smoother wall that never lies further from the axis, and by how much it may lie nearer; 0: there is
+    // none but itself.
+    virtual void add_cover(double s, double phi, Height &sum) const { add(s, phi, sum); }
+    virtual HeightBounds cover_bounds(double s_from, double s_to) const { return bounds(s_from, s_to); }
+    virtual double cover_depth() const { return 0.0; }
     // By how much, radians, a clock angle lies outside the relief's extent; 0 inside and where it has no limits.
     virtual double outside(double) const { return 0.0; }
     virtual std::vector<double> cuts() const { return {from, to}; } // arc lengths where its bounds had better change

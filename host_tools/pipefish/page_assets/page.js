@@ -46,6 +46,15 @@
       for (const key of ["xaxis", "yaxis", "yaxis2"]) {
         if (chart.layout[key]) axes[key] = axis;
       }
+      if (chart.layout.polar) {
+        const ring = { gridcolor: colour("--line"), linecolor: colour("--line"), tickfont: { size: 11 } };
+        axes.polar = { radialaxis: ring, angularaxis: ring };
+      }
+      if (chart.layout.scene) {
+        const side = { gridcolor: colour("--line"), zerolinecolor: colour("--line"), backgroundcolor: "rgba(0,0,0,0)",
+          showspikes: false, tickfont: { size: 11 } };
+        axes.scene = { xaxis: side, yaxis: side, zaxis: side };
+      }
       const whole = merge(merge(layout, axes), chart.layout);
       Plotly.react("plot-" + chart.id, chart.data, whole, { displayModeBar: false, responsive: true });
     }

@@ -1,0 +1,241 @@
+"""`pipefish calibrate --device`: views from a device that runs, with guidance where to hold the target next.
+
+A device sends no stills on request: its keyframes are whole pictures, so they are the views. They are received as
+`pipefish receive` does, into a survey file; what the device had to send anyway is not lost by calibrating.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import math
+import sys
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import pipefish_pb2 as pb
+from .calib_data import CalibrationError, View
+from .calib_input import Target3D
+from .calib_run import one_radius
+from .calib_verdict import verdict
+from .calibration import calibrate
+from .client import STORED
+from .detect import detect_target
+from .errors import PipefishError
+from .receive import Receiver
+from .surveystore import SurveyStore
+from .surveywrite import OBJECT_KEYFRAME, partial_of
+from .transport import Transport, TransportClosed
+
+Array = npt.NDArray[np.float64]
+
+_COLUMNS, _ROWS = 8, 5  # cells of the picture on the terminal
+_FIRST_MODEL = 6  # views before a camera is tried
+_EVERY = 3  # views between trials; each takes about a second
+_ENOUGH_VIEWS, _ENOUGH_SEEN = 15, 0.85  # views, share of the cells: then more tell little
+_SAME = 0.02  # of the picture's width: a target that moved less says nothing new
+_PLACES = (("top", "middle", "bottom"), ("left", "middle", "right"))
+
+
+@dataclasses.dataclass
+class Guide:
+    """What has been seen so far, and what is missing."""
+
+    targets: list[Target3D]
+    size: tuple[int, int] = (0, 0)
+    views: list[View] = dataclasses.field(default_factory=list)
+    names: list[str] = dataclasses.field(default_factory=list)
+    advice: str = ""
+    enough: bool = False
+    seen: float = 0.0
+
+    def add(self, name: str, image: npt.NDArray[np.uint8]) -> str:
+        """Takes a picture; -> one line about it."""
+        self.size = self.size if self.views else (image.shape[1], image.shape[0])
+        found = []
+        reason = ""
+        for board, target in enumerate(self.targets):
+            assert target.target is not None
+            sighting = detect_target(image, target.target)
+            if sighting and len(sighting.ids) >= 4:
+                found.append(View(target.points[sighting.ids], sighting.pixels, board, 0, name))
+            else:
+                reason = reason or sighting.reason
+        if not found:
+            return f"{name}: {reason or 'no target'}"
+        if all(self._as_before(v) for v in found):
+            return f"{name}: as in a view before; move the target"
+        self.views += found
+        self.names.append(name)
+        self._think()
+        points = sum(len(v.pixels) for v in found)
+        of = sum(len(t.points) for t in self.targets)
+        return f"{name}: view {len(self.names)}, {points} of {of} points; {100 * self.seen:.0f} % seen; {self.advice}"
+
+    def _as_before(self, view: View) -> bool:
+        key = {tuple(p): i for i, p in enumerate(np.round(view.board_xyz, 9))}
+        for other in self.views:
+            pairs = [(key[t], j) for j, p in enumerate(np.round(other.board_xyz, 9)) if (t := tuple(p)) in key]
+            if len(pairs) < 4 or other.board != view.board:
+                continue
+            mine, theirs = (list(x) for x in zip(*pairs, strict=True))
+            moved = np.linalg.norm(view.pixels[mine] - other.pixels[theirs], axis=1)
+            if np.median(moved) < _SAME * self.size[0]:
+                return True
+        return False
+
+    def cells(self) -> npt.NDArray[np.int64]:
+        """Points seen in each cell of the picture, (rows, columns)."""
+        pixels = np.concatenate([v.pixels for v in self.views]) if self.views else np.zeros((0, 2))
+        place = (
+            np.floor((pixels + 0.5) / self.size * [_COLUMNS, _ROWS]).astype(int) if len(pixels) else pixels.astype(int)
+        )
+        counts = np.zeros((_ROWS, _COLUMNS), dtype=np.int64)
+        np.add.at(counts, (np.clip(place[:, 1], 0, _ROWS - 1), np.clip(place[:, 0], 0, _COLUMNS - 1)), 1)
+        return counts
+
+    def _think(self) -> None:
+        """Where the next view should be, from a first camera where there is one, and whether it is enough."""
+        cells = self.cells()
+        count = len(self.names)
+        if count < _FIRST_MODEL or (count - _FIRST_MODEL) % _EVERY:
+            if count < _FIRST_MODEL or not self.advice:
+                self.seen = float((cells > 0).mean())
+                row, column = np.unravel_index(int(np.argmin(cells)), cells.shape)
+                self.advice = f"next: {self._place((column + 0.5) / _COLUMNS, (row + 0.5) / _ROWS)}, tilted"
+            return
+        try:
+            result = calibrate(self.views, self.size, "p9", circle_radius=one_radius(self.targets))
+            report = result.report
+        except CalibrationError as error:
+            self.advice = f"next: another place, tilted another way ({error})"
+            return
+        coverage = report["cameras"][0]["coverage"]
+        place = coverage["next_view"]
+        self.seen = float(coverage["share_covered"])
+        if place is not None:
+            u, v = np.array(place["pixel"]) / self.size
+            off = math.degrees(place["theta"])
+            self.advice = f"next: {self._place(u, v)}, {off:.0f} degrees off the axis, tilted"
+        covered = result.camera.theta_covered or 0.0
+        self.enough = count >= _ENOUGH_VIEWS and self.seen >= _ENOUGH_SEEN and verdict(report, None, covered)["usable"]
+
+    @staticmethod
+    def _place(u: float, v: float) -> str:
+        down, across = (names[min(2, max(0, int(3 * x)))] for names, x in zip(_PLACES, (v, u), strict=True))
+        return "the middle of the picture" if down == across == "middle" else f"{down} {across} of the picture"
+
+    def map_text(self) -> str:
+        """The picture's cells as text: empty, few, some, many points."""
+        return "\n".join("".join(" .:#"[min(3, int(math.log(1 + n, 4)))] * 2 for n in row) for row in self.cells())
+
+
+class _Views(Receiver):
+    """Receives a survey and keeps the pictures that have just come."""
+
+    def __init__(self, transport: Transport, store: SurveyStore) -> None:
+        super().__init__(transport, store, quiet=True)
+        self.fresh: deque[tuple[int, bytes]] = deque()
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
+        new = not self.store.has(name)
+        answer = super().on_object(name, kind, data)
+        if answer == STORED and kind == OBJECT_KEYFRAME and new:
+            keyframe = pb.Keyframe.FromString(data)
+            if self.store.primary in (None, keyframe.survey_id):
+                self.fresh.append((keyframe.index, keyframe.jpeg))
+        return answer
+
+
+def collect(
+    transport: Transport,
+    targets: list[Target3D],
+    recording: Path,
+    *,
+    most: int = 60,
+    timeout_s: float = 30.0,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Receives pictures until they suffice, there are `most`, the survey ends, or Ctrl-C. -> file, names of the
+    pictures with a new view, ended, seen.
+
+    Raises PipefishError, also where fewer than three views came; what has arrived stays in the recording."""
+    from PIL import Image
+
+    if any(t.target is None for t in targets):
+        raise PipefishError("--device needs a target that can be found: a JSON file of `pipefish target`")
+    store = SurveyStore(recording)
+    receiver = _Views(transport, store)
+    guide = Guide(targets)
+    screen = Screen(quiet)
+
+    def enough() -> bool:
+        if receiver.fresh and not guide.enough:
+            index, jpeg = receiver.fresh.popleft()
+            with contextlib.suppress(OSError, SyntaxError, ValueError):  # a damaged picture is no view
+                line = guide.add(f"keyframe {index}", np.asarray(Image.open(io.BytesIO(jpeg)).convert("L")))
+                screen.show(line, guide)
+        return guide.enough or len(guide.names) >= most
+
+    ended = "enough has been seen"
+    try:
+        with contextlib.suppress(TransportClosed):  # it may be about to start
+            receiver.client.open()
+        receiver.run(timeout_s, enough)
+        while receiver.fresh and not enough():  # the survey has ended; its last pictures count
+            pass
+        ended = ended if guide.enough else f"{most} views" if len(guide.names) >= most else "the survey ended"
+    except KeyboardInterrupt:
+        ended = "stopped by Ctrl-C"
+    except PipefishError as error:
+        while receiver.fresh and not enough():
+            pass
+        if len(guide.names) < 3:
+            raise
+        ended = str(error)
+    finally:
+        screen.close()
+        receiver.client.close()
+        finished = store.finish_complete({})
+        store.close()
+    file = recording if recording in finished or recording.exists() else partial_of(recording)
+    if len(guide.names) < 3:
+        raise PipefishError(
+            f"{len(guide.names)} views with the target came from the device ({ended}); at least 3 are needed"
+        )
+    return {"file": str(file), "names": guide.names, "ended": ended, "seen": guide.seen}
+
+
+class Screen:
+    """Guidance on stderr: on a terminal a map of the picture that is drawn anew, else a line a view."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
+        self._live: Any = None
+        if not quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(console=Console(stderr=True), auto_refresh=False)
+            self._live.start()
+
+    def show(self, line: str, guide: Guide) -> None:
+        """One picture's line, and the map."""
+        if self._live is not None:
+            from rich.panel import Panel
+            from rich.text import Text
+
+            body = Text(guide.map_text() + f"\n\n{line}\nCtrl-C: calibrate with what has been seen")
+            self._live.update(Panel.fit(body, title="seen in the picture"), refresh=True)
+        elif not self._quiet:
+            print(line, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leaves the last map standing."""
+        if self._live is not None:
+            self._live.stop()

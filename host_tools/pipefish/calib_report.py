@@ -1,0 +1,424 @@
+"""What a calibration is worth: covariance, uncertainty of projections and of pipe diameters, coverage, residuals."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from . import _engine
+from .calib_data import Array, CalibrationError
+from .calib_fit import Fit, angles, handedness
+from .camera import PARAMETERS, Camera
+from .errors import ProfileError
+
+DN = (100, 150, 200, 250, 300, 400, 500, 600, 800, 1000)  # millimetres: pipes that reports speak of
+_AZIMUTHS = 24
+_NEAR, _FAR = math.radians(30), math.radians(80)  # a wall point is seen at both: the spec's pair
+
+
+@dataclasses.dataclass(eq=False)
+class Uncertainty:
+    """Covariance of one camera with the poses that it came from, for the uncertainty of projections.
+
+    border (G, G): covariance of the unknowns of cameras, rig and boards. parameter_slope (41, G): the parameters by
+    them. The frames' poses stand for the world, on average: a small motion (turn, shift) of it in the rig, motion_slope
+    (6, G) by the border's unknowns and motion_own (6, 6), the covariance of the rest. All scaled by the residuals.
+    """
+
+    border: Array
+    parameter_slope: Array
+    free: list[int]
+    rig: Array  #: camera from rig (3, 4)
+    rig_slope: Array  #: its motion by the border's unknowns, (6, G)
+    motion_slope: Array
+    motion_own: Array
+    distance: float  #: metres: of the boards, median
+    scale: float  #: of the residuals to what their noise says
+    camera: Camera | None = None
+
+    def parameters(self) -> Array:
+        """Covariance (n, n) over the free parameters."""
+        slope = self.parameter_slope[self.free]
+        out = slope @ self.border @ slope.T
+        return (out + out.T) / 2
+
+    def _slopes(self, pixels: Array, distance: Array | float | None) -> tuple[Array, Array]:
+        """Of where the points of pixels (N, 2) are seen: by the border's unknowns (N, 2, G), by the world's own motion
+        (N, 2, 6)."""
+        assert self.camera is not None
+        rays, _ = self.camera.unproject(pixels)
+        given = np.broadcast_to(np.asarray(self.distance if distance is None else distance, dtype=float), len(pixels))
+        near = np.isfinite(given)
+        points = rays * np.where(near, given, 1.0)[:, None] + self.camera.origins(pixels)
+        _, _, by_point, by_parameter = self.camera.project_jacobian(np.nan_to_num(points, nan=1.0))
+        by_point = np.where(np.isfinite(rays).all(axis=1)[:, None, None], by_point, np.nan)
+        rotation, shift = self.rig[:, :3], self.rig[:, 3] * near[:, None]
+
+        def moved(x: Array) -> Array:
+            return np.concatenate([-_cross(x), np.eye(3) * near[:, None, None]], axis=2)
+
+        by_motion = by_point @ rotation @ moved((points - shift) @ rotation)
+        by_border = by_parameter @ self.parameter_slope + by_motion @ self.motion_slope
+        return by_border + by_point @ moved(points - shift) @ self.rig_slope, by_motion
+
+    def joint(self, pixels: Array, distance: Array | float | None = None) -> Array:
+        """Covariance (2N, 2N) of where the points of `pixels` (N, 2) at `distance` metres (boards' median, inf: at
+        infinity) are seen, by mrcal's definition: points fixed to the boards' frames, which stand for the world, move
+        with the poses; the camera sees them with its own error. NaN outside the model."""
+        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        m, k = m.reshape(2 * len(m), -1), k.reshape(2 * len(k), 6)
+        return m @ self.border @ m.T + k @ self.motion_own @ k.T
+
+    def covariances(self, pixels: Array, distance: Array | float | None = None) -> Array:
+        """The blocks of `joint` of each pixel, (N, 2, 2)."""
+        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        return m @ self.border @ m.swapaxes(1, 2) + k @ self.motion_own @ k.swapaxes(1, 2)
+
+    def sigma(self, pixels: Array, distance: float | None = None) -> Array:
+        """Standard deviation (N,) in the worst direction, pixels, of where points are seen; see `joint`."""
+        c = self.covariances(pixels, distance)
+        half, difference = (c[:, 0, 0] + c[:, 1, 1]) / 2, (c[:, 0, 0] - c[:, 1, 1]) / 2
+        return np.sqrt(np.maximum(half + np.hypot(difference, c[:, 0, 1]), 0.0))
+
+    def diameter(self, dn_mm: float) -> dict[str, float]:
+        """What the calibration alone leaves open of the mean diameter of a pipe, millimetres, one standard deviation:
+        wall points seen at 30 and at 80 degrees (or as far as the camera was observed) along each azimuth."""
+        assert self.camera is not None
+        camera = self.camera
+        far = min(_FAR, (camera.theta_covered or camera.theta_max) * 0.98)
+        near = min(_NEAR, far * 0.4)
+        phi = 2 * math.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+        radius = dn_mm / 2000
+        pixels, by_theta, reach = [], [], []
+        for theta in (near, far):
+            points = np.stack([np.cos(phi), np.sin(phi), np.full(len(phi), 1 / math.tan(theta))], axis=1) * radius
+            nudged = points * [1, 1, 0] + [0, 0, 1] * (radius / np.tan(theta + 1e-6 * np.ones(len(phi))))[:, None]
+            at, seen = camera.project(points)
+            beside, _ = camera.project(nudged)
+            seen &= camera.in_image(np.nan_to_num(at, nan=-1e9))
+            pixels.append(np.where(seen[:, None], at, np.nan))
+            by_theta.append((beside - at) / 1e-6)
+            reach.append(np.full(len(phi), radius / math.sin(theta)))
+        both = np.isfinite(pixels[0]).all(axis=1) & np.isfinite(pixels[1]).all(axis=1)
+        if both.sum() < 3:
+            return {"dn_mm": dn_mm, "sigma_mm": math.nan}
+        joint = self.joint(
+            np.concatenate([pixels[0][both], pixels[1][both]]), np.concatenate([reach[0][both], reach[1][both]])
+        )
+        base = 1 / math.tan(near) - 1 / math.tan(far)
+        row = []
+        for sign, theta, slope in ((1, near, by_theta[0][both]), (-1, far, by_theta[1][both])):
+            to_theta = -slope / (slope**2).sum(axis=1)[:, None]  # a pixel off is a bearing off, the other way round
+            row.append(sign / math.sin(theta) ** 2 / base * to_theta.reshape(-1) / both.sum())
+        weights = np.concatenate(row)
+        return {"dn_mm": dn_mm, "sigma_mm": float(dn_mm * math.sqrt(max(weights @ joint @ weights, 0.0)))}
+
+
+def _cross(v: Array) -> Array:
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - out.swapaxes(-1, -2)
+
+
+def covariance_of(fit: Fit) -> list[Uncertainty]:
+    """Of every camera, from the state of a fit. Raises CalibrationError where the views leave something open."""
+    data, bundle = fit.data, fit.bundle
+    fit.free(fit.model)
+    bundle.set_used(fit.used)
+    bundle.set_sigma(fit.sigma)
+    bundle.huber = 0.0
+    frames = np.unique(data.frame_of[fit.used_views()])
+    camera_at, pose_at, _, _, _, size = bundle.layout()
+    whitened = fit.errors()[fit.used] / fit.sigma[fit.used]
+    freedom = 2 * int(fit.used.sum()) - size - 6 * len(frames)
+    if freedom <= 0:
+        raise CalibrationError("fewer measurements than unknowns: give more views")
+    square = float((whitened**2).sum()) / freedom
+    try:
+        border, slopes, alone = bundle.uncertainty()
+    except ValueError:
+        raise CalibrationError(
+            "the views do not determine the camera: show the board from different sides, tilted, and near the rim too"
+        ) from None
+    _, points = bundle.predict()
+    out = []
+    for c in range(len(data.cameras)):
+        parameter_slope = np.zeros((len(PARAMETERS), size))
+        own = bundle.parameter_slope(c)
+        if camera_at[c] >= 0:
+            parameter_slope[:, camera_at[c] : camera_at[c] + own.shape[1]] = own
+        rig_slope = np.zeros((6, size))
+        if pose_at[c] >= 0:
+            rig_slope[:, pose_at[c] : pose_at[c] + 6] = np.eye(6)
+        mine = fit.used & (data.camera_of[data.view_of] == c)
+        seen = np.unique(data.frame_of[data.view_of[mine]])
+        # A pose turns about its own origin, which lies off the rig's.
+        arms = np.tile(np.eye(6), (len(seen), 1, 1))
+        arms[:, 3:, :3] = _cross(np.array([bundle.frame(int(f))[:, 3] for f in seen]))
+        out.append(
+            Uncertainty(
+                border=border * square,
+                parameter_slope=parameter_slope,
+                free=fit.model.parameters,
+                rig=bundle.camera_pose(c),
+                rig_slope=rig_slope,
+                motion_slope=(arms @ slopes[seen]).mean(axis=0),
+                motion_own=(arms @ alone[seen] @ arms.swapaxes(1, 2)).sum(axis=0) * square / len(seen) ** 2,
+                distance=float(np.median(np.linalg.norm(points[mine], axis=1))),
+                scale=math.sqrt(square),
+            )
+        )
+        sigma_f = math.sqrt(max(out[-1].parameters()[0, 0], 0.0)) / abs(bundle.camera(c).f_u)
+        if not sigma_f < 0.05:
+            raise CalibrationError(
+                f"the views leave the focal length open by {100 * sigma_f:.0f} %: they show the board in one pose, or "
+                "parallel to the image; tilt it, and show it near the rim too"
+            )
+    return out
+
+
+# ---------------------------------------------------------------------- coverage
+
+_THETA_STEP, _PHI_BINS = math.radians(10), 12
+
+
+def coverage(fit: Fit, index: int, camera: Camera, uncertainty: Uncertainty) -> dict[str, Any]:
+    """Points seen in cells of 10 degrees off the axis by 30 degrees around it, what of the image is empty, and where
+    the next view should put the board: where a view tells most about projections that are uncertain."""
+    data = fit.data
+    mine = fit.used & (data.camera_of[data.view_of] == index)
+    points = fit.bundle.predict()[1][mine]
+    theta, phi = angles(points), np.arctan2(points[:, 1], points[:, 0]) % (2 * math.pi)
+    rings = max(1, math.ceil(camera.theta_max / _THETA_STEP))
+    counts = np.zeros((rings, _PHI_BINS), dtype=int)
+    np.add.at(
+        counts,
+        (
+            np.minimum((theta / _THETA_STEP).astype(int), rings - 1),
+            (phi / (2 * math.pi) * _PHI_BINS).astype(int) % _PHI_BINS,
+        ),
+        1,
+    )
+    middle_theta = np.minimum((np.arange(rings) + 0.5) * _THETA_STEP, camera.theta_max * (1 - 1e-9))
+    middle_phi = (np.arange(_PHI_BINS) + 0.5) * 2 * math.pi / _PHI_BINS
+    t, p = np.meshgrid(middle_theta, middle_phi, indexing="ij")
+    pixels, seen = camera.project(
+        np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1).reshape(-1, 3)
+    )
+    inside = (seen & camera.in_image(np.nan_to_num(pixels, nan=-1e9))).reshape(counts.shape)
+    sigma = np.full(counts.size, np.nan)
+    where = inside.reshape(-1)
+    sigma[where] = uncertainty.sigma(pixels[where])
+    sigma = sigma.reshape(counts.shape)
+    advice = "the whole image was seen"
+    place = None
+    if inside.any() and np.isfinite(sigma).any():
+        worst = np.unravel_index(int(np.nanargmax(np.where(inside, sigma / np.sqrt(1 + counts), np.nan))), counts.shape)
+        u, v = pixels.reshape(*counts.shape, 2)[worst]
+        place = {
+            "theta": float(middle_theta[worst[0]]),
+            "phi": float(middle_phi[worst[1]]),
+            "pixel": [float(u), float(v)],
+            "sigma_px": float(sigma[worst]),
+        }
+        advice = (
+            f"next view: the board near pixel ({u:.0f}, {v:.0f}), {math.degrees(place['theta']):.0f} degrees off the "
+            f"axis, tilted; the calibration is off by {sigma[worst]:.2g} px (1 sigma) there"
+        )
+    return {
+        "theta_step": _THETA_STEP,
+        "phi_bins": _PHI_BINS,
+        "counts": counts.tolist(),
+        "in_image": inside.tolist(),
+        "sigma_px": [[None if math.isnan(s) else float(s) for s in row] for row in sigma],
+        "share_covered": float((counts[inside] > 0).mean()) if inside.any() else 0.0,
+        "next_view": place,
+        "advice": advice,
+    }
+
+
+def uncertainty_map(camera: Camera, uncertainty: Uncertainty, columns: int = 16) -> dict[str, Any]:
+    """Standard deviation of projections in the worst direction over a grid of pixels, at the boards' distance and at
+    infinity; None outside the model."""
+    rows = max(2, round(columns * camera.height / camera.width))
+    u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    out: dict[str, Any] = {"u": u.tolist(), "v": v.tolist(), "distance_m": uncertainty.distance}
+    for key, distance in (("sigma_px", None), ("sigma_infinity_px", math.inf)):
+        sigma = uncertainty.sigma(grid, distance).reshape(rows, columns)
+        out[key] = [[None if math.isnan(s) else float(s) for s in row] for row in sigma]
+    return out
+
+
+# ---------------------------------------------------------------------- two halves
+
+
+def halves_difference(fit: Fit) -> list[dict[str, float]]:
+    """Calibrations from every other frame, compared: their difference after the best rotation, and what their own
+    uncertainties expect of it; a ratio much above 1 is model error. One entry a camera."""
+    data = fit.data
+    frames = np.unique(data.frame_of[fit.used_views()])
+    frame_of_point = data.frame_of[data.view_of]
+    cameras, uncertainties = [], []
+    for half in range(2):
+        part = fit.copy()
+        part.used = fit.used & np.isin(frame_of_point, frames[half::2])
+        part.fit(fit.model, iterations=40, tolerance=1e-8)
+        try:
+            uncertainties.append(covariance_of(part))
+        except CalibrationError:  # half of the views may leave something open
+            return []
+        cameras.append([_bounded(part, c) for c in range(len(data.cameras))])
+    out = []
+    for c in range(len(data.cameras)):
+        mine = fit.used & (data.camera_of[data.view_of] == c)
+        pixels = data.pixels[mine][:: max(1, int(mine.sum()) // 400)]
+        first, second = cameras[0][c], cameras[1][c]
+        rays, ok = first.unproject(np.ascontiguousarray(pixels))
+        rotation = np.eye(3)
+        for _ in range(5):
+            turned = np.ascontiguousarray(np.where(ok[:, None], rays, [0.0, 0.0, 1.0]) @ rotation.T)
+            seen, fine, by_point, _ = second.project_jacobian(turned)
+            use = ok & fine
+            slope = np.einsum("nij,njk->nik", by_point[use], -_cross(turned[use])).reshape(-1, 3)
+            residual = (pixels - seen)[use]
+            step = np.linalg.lstsq(slope, residual.reshape(-1), rcond=None)[0]
+            angle = float(np.linalg.norm(step)) or 1e-300
+            k = _cross(step / angle)
+            rotation = (np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k) @ rotation
+        expected = [_marginal(uncertainties[h][c], cameras[h][c], pixels[use], fit, c) for h in range(2)]
+        difference = float(np.sqrt(np.mean(residual**2)))
+        predicted = float(np.sqrt(np.mean(expected[0] + expected[1])))
+        out.append({"rms_px": difference, "expected_px": predicted, "ratio": difference / predicted})
+    return out
+
+
+def _bounded(fit: Fit, index: int) -> Any:
+    """The camera of a fit, up to where it was observed."""
+    profile = fit.bundle.camera(index)
+    mine = fit.used & (fit.data.camera_of[fit.data.view_of] == index)
+    profile.theta_max = _engine.rising_end(profile, float(fit.theta()[mine].max()))
+    return profile
+
+
+def _marginal(uncertainty: Uncertainty, profile: Any, pixels: Array, fit: Fit, index: int) -> Array:
+    """Variance of projections at infinity along an axis, mean of both, (N,)."""
+    width, height = fit.data.size[index]
+    keys = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1")
+    arrays = ("asym_radial_theta", "asym_radial_phi", "asym_tangential_theta", "asym_tangential_phi", "cpoly")
+    values = {k: getattr(profile, k) for k in keys} | {k: tuple(getattr(profile, k)) for k in arrays}
+    end = profile.theta_max
+    for share in (1.0, 0.97, 0.94, 0.9, 0.8, 0.6):
+        try:
+            uncertainty.camera = Camera(width=width, height=height, theta_max=end * share, **values)
+            break
+        except ProfileError:  # not proved one-to-one
+            continue
+    if uncertainty.camera is None:
+        return np.full(len(pixels), np.nan)
+    variance = np.trace(uncertainty.covariances(pixels, math.inf), axis1=1, axis2=2) / 2
+    return np.array([np.nanmean(variance)])
+
+
+# ---------------------------------------------------------------------- the report
+
+
+def describe(
+    fit: Fit,
+    flat: Fit,
+    table: list[dict[str, Any]],
+    notes: list[str],
+    cameras: dict[int, Camera],
+    uncertainty: list[Uncertainty],
+) -> dict[str, Any]:
+    """Everything that a report of the calibration shows, as plain values."""
+    data = fit.data
+    error, theta = fit.errors(), fit.theta()
+    predicted, _ = fit.bundle.predict()
+    residual = data.pixels - predicted
+    gross = np.flatnonzero(~fit.used & ~np.isin(data.view_of, list(fit.view_reason)))
+    hands = [handedness(data, v) for v in range(len(data.views))]
+    report: dict[str, Any] = {
+        "model": fit.model.name,
+        "rms_px": fit.rms(),
+        "rms_all_px": fit.rms(~np.isin(data.view_of, list(fit.view_reason))),
+        "median_px": float(np.median(error[fit.used])),
+        "flat_board": {
+            "model": flat.model.name,
+            "rms_px": flat.rms(),
+            "median_px": float(np.median(flat.errors()[flat.used])),
+        },
+        "circle_radius_m": data.circle_radius,
+        "points_used": int(fit.used.sum()),
+        "points": len(fit.used),
+        "freedom": {"camera": fit.model.freedom[0], "board": fit.model.freedom[1]},
+        "models": table,
+        "notes": list(notes),
+        "views": [
+            {
+                "view": v,
+                "name": data.views[v].name,
+                "camera": data.views[v].camera,
+                "board": data.views[v].board,
+                "used": v not in fit.view_reason,
+                "reason": fit.view_reason.get(v, ""),
+                "points": int(fit.used[data.of_view(v)].sum()),
+                "rms_px": float(np.sqrt(np.mean(error[data.of_view(v)][fit.used[data.of_view(v)]] ** 2)))
+                if fit.used[data.of_view(v)].any()
+                else None,
+                "theta_max": float(theta[data.of_view(v)].max()),
+                "mirrored": hands[v] < 0,
+            }
+            for v in range(len(data.views))
+        ],
+        "rejected_views": [
+            {"view": v, "name": data.views[v].name, "reason": r} for v, r in sorted(fit.view_reason.items())
+        ],
+        "rejected_points": [
+            {
+                "view": int(data.view_of[i]),
+                "point": int(i - data.first[data.view_of[i]]),
+                "pixel": data.pixels[i].tolist(),
+                "error_px": float(error[i]),
+                "reason": f"{error[i]:.1f} px off where {fit.sigma[i]:.2f} px is the noise",
+            }
+            for i in gross
+        ],
+        "residuals": {
+            "view": data.view_of.tolist(),
+            "pixel": data.pixels.tolist(),
+            "residual": np.round(np.nan_to_num(residual, nan=1e9), 5).tolist(),
+            "theta": np.round(theta, 6).tolist(),
+            "used": fit.used.tolist(),
+        },
+        "boards": [
+            {"board": n, "coefficients": list(fit.bundle.shape(b)), "flat": fit.model.shape == "flat"}
+            for b, n in enumerate(data.board_ids)
+        ],
+        "cameras": [],
+    }
+    if hands and all(h <= 0 for h in hands) and any(h < 0 for h in hands):
+        report["notes"].append(
+            "every view shows the board mirrored: seen through a mirror, or its X and Y are not right and down"
+        )
+    for c, number in enumerate(data.cameras):
+        camera = cameras[number]
+        knots, sigma = fit.noise[c]
+        report["cameras"].append(
+            {
+                "camera": number,
+                "noise": {"theta": knots.tolist(), "sigma_px": sigma.tolist()},
+                "residual_scale": uncertainty[c].scale,
+                "corner_shift_px": list(fit.bundle.corner(c)),
+                "coverage": coverage(fit, c, camera, uncertainty[c]),
+                "uncertainty": uncertainty_map(camera, uncertainty[c]),
+                "pipes": [uncertainty[c].diameter(dn) for dn in DN],
+            }
+        )
+    if table:
+        for entry, halves in zip(report["cameras"], halves_difference(fit), strict=False):
+            entry["halves"] = halves
+    return report

@@ -1,0 +1,229 @@
+"""A whole calibration from pictures: find the target, calibrate, look again with the model for what was missed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .calib_circle import find_image_circle
+from .calib_data import CalibrationError, View
+from .calib_input import Given, Picture, Target3D
+from .calibration import Calibration, calibrate
+from .detect import Detection, detect_target
+
+Tell = Callable[[str, float], None]
+
+_FOLDS = 5
+_ROUNDS = 3  # of looking again; each starts from the model that the one before made better
+_ENOUGH = 0.01  # of the points: fewer new ones are not worth another round
+_BESIDE_PX = 2.0  # a point of the model-guided search that stands so far from one seen before is not the same one
+
+
+@dataclasses.dataclass(eq=False)
+class Sighting:
+    """One target looked for in one picture. added: how many of the points only the model-guided search found."""
+
+    picture: Picture
+    board: int
+    ids: npt.NDArray[np.int64]
+    pixels: npt.NDArray[np.float64]
+    status: str
+    reason: str
+    added: int = 0
+
+    @property
+    def usable(self) -> bool:
+        """Whether a calibration can take it: which points they are is known, and they are enough."""
+        return self.status in ("ok", "partial") and len(self.ids) >= 4
+
+
+@dataclasses.dataclass(eq=False)
+class Session:
+    """A calibration with all that it came from. views: as calibrated; sightings: of pictures, [] for corner files.
+
+    held_out: (pixels rms, views) of views that the camera was not calibrated from, None where there are too few."""
+
+    given: Given
+    sightings: list[Sighting]
+    views: list[View]
+    result: Calibration
+    held_out: tuple[float, int] | None
+
+    @property
+    def unseen(self) -> list[Sighting]:
+        """Pictures in which no target could be used, with the reason."""
+        seen = {s.picture for s in self.sightings if s.usable}
+        first: dict[Picture, Sighting] = {}
+        for s in self.sightings:
+            if s.picture not in seen:
+                first.setdefault(s.picture, s)
+        return list(first.values())
+
+    def picture_of(self, view: int) -> Picture | None:
+        """The picture of a view, where there is one."""
+        v = self.views[view]
+        return next((p for p in self.given.pictures if p.name == v.name and p.camera == v.camera), None)
+
+
+def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool = True, tell: Tell) -> Session:
+    """Calibrates what is given. model, board, noise, robust: of `calibrate`. tell: what is being done, its share.
+
+    Raises CalibrationError, FormatError, OSError."""
+    sightings: list[Sighting] = []
+    options: dict[str, Any] = {
+        "image_size": given.sizes,
+        "board": board,
+        "circle_radius": one_radius(given.targets),
+        "noise": noise,
+        "robust": robust,
+    }
+    views = given.views
+    if not views:
+        brightest: dict[int, npt.NDArray[np.uint8]] = {}
+        sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
+        views = views_of(given, sightings)
+        refuse_too_few(given, sightings)
+        if len(given.cameras) == 1:
+            options["image_circle"] = circle_around(brightest[0], views)
+        for turn in range(_ROUNDS):
+            tell("first model", 0.5 + 0.1 * turn)
+            first = calibrate(views, model="p9", **options)
+            added = look_again(given, sightings, views, first, lambda s, t=turn: tell("missed points", 0.52 + 0.1 * t))
+            views = views_of(given, sightings)
+            if added < _ENOUGH * sum(len(v.pixels) for v in views):
+                break
+    result = calibrate(views, model=model, progress=lambda what, share: tell(what, 0.8 + 0.15 * share), **options)
+    tell("held-out views", 0.96)
+    return Session(given, sightings, views, result, _held_out(views, result, model, options))
+
+
+def one_radius(targets: Sequence[Target3D]) -> float:
+    """The radius of the targets' discs, metres; 0 for corners. Raises CalibrationError where they differ."""
+    radii = sorted({t.radius for t in targets}) or [0.0]
+    if len(radii) > 1:
+        raise CalibrationError("targets of one run must be alike: all of corners, or all of discs of one radius")
+    return radii[0]
+
+
+def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Callable[[float], None]) -> list[Sighting]:
+    """Every target in every picture; `brightest` gets the largest value of each pixel, by camera.
+
+    Raises CalibrationError where pictures of two cameras are mixed."""
+    if not all(t.target for t in given.targets) or not given.targets:
+        raise CalibrationError("pictures need a --target that can be found in them: a JSON file of `pipefish target`")
+    sightings = []
+    for done, picture in enumerate(given.pictures):
+        share(done / len(given.pictures))
+        image = picture.image()
+        size, first = (image.shape[1], image.shape[0]), given.sizes[picture.camera]
+        if size != first:
+            raise CalibrationError(
+                f"{picture.place}: {size[0]} x {size[1]} pixels, the first picture has {first[0]} x {first[1]}: "
+                "images of two cameras, or of two settings of one, are mixed"
+            )
+        brightest[picture.camera] = np.maximum(brightest.get(picture.camera, image), image)
+        for board, target in enumerate(given.targets):
+            assert target.target is not None
+            sightings.append(_sighting(picture, board, detect_target(image, target.target)))
+    return sightings
+
+
+def circle_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> tuple[float, float, float] | None:
+    """The image circle (u, v, radius), px, with all points of the views inside; None where the sensor is lit wholly."""
+    circle = find_image_circle([brightest])
+    if circle is None:
+        return None
+    u, v, radius = circle
+    farthest = max(float(np.linalg.norm(view.pixels - [u, v], axis=1).max()) for view in views)
+    return u, v, max(radius, farthest + 2.0)
+
+
+def _sighting(picture: Picture, board: int, found: Detection) -> Sighting:
+    return Sighting(picture, board, found.ids, found.pixels, found.status, found.reason)
+
+
+def views_of(given: Given, sightings: Sequence[Sighting]) -> list[View]:
+    """The views that sightings make."""
+    return [
+        View(given.targets[s.board].points[s.ids], s.pixels, s.board, s.picture.camera, s.picture.name)
+        for s in sightings
+        if s.usable
+    ]
+
+
+def refuse_too_few(given: Given, sightings: Sequence[Sighting]) -> None:
+    """Raises CalibrationError with what the pictures lack."""
+    for camera, name in enumerate(given.cameras):
+        mine = [s for s in sightings if s.picture.camera == camera]
+        seen = {s.picture for s in mine if s.usable}
+        if len(seen) >= 3:
+            continue
+        pictures = len({s.picture for s in mine})
+        who = f"camera {name}: " if len(given.cameras) > 1 else ""
+        failed = [s for s in mine if not s.usable]
+        reasons = Counter(s.reason or "not found" for s in failed)
+        why = f" ({failed[0].picture.name}: {failed[0].reason})" if failed else ""
+        most = f"; most often: {reasons.most_common(1)[0][0]}" if len(reasons) > 1 else ""
+        ask = ". Is it the target that --target describes?" if pictures >= 3 and not seen else ""
+        raise CalibrationError(
+            f"{who}the target was found in {len(seen)} of {pictures} pictures; at least 3 are needed, better "
+            f"15{why}{most}"
+            f"{ask}"
+        )
+
+
+def look_again(
+    given: Given, sightings: list[Sighting], views: list[View], first: Calibration, share: Callable[[float], None]
+) -> int:
+    """Looks with a first model for the points that a picture alone did not show; -> how many were added."""
+    used = [s for s in sightings if s.usable]
+    added = 0
+    for done, (sighting, pose) in enumerate(zip(used, first.poses, strict=True)):
+        share(done / len(used))
+        target = given.targets[sighting.board]
+        missed = len(target.points) - len(sighting.ids)
+        if not missed or not np.isfinite(pose).all():
+            continue
+        camera = first.cameras[sighting.picture.camera]
+        found = detect_target(sighting.picture.image(), target.target, camera, np.ascontiguousarray(pose))
+        new = ~np.isin(found.ids, sighting.ids)
+        both, ours, theirs = np.intersect1d(sighting.ids, found.ids, return_indices=True)
+        apart = np.linalg.norm(sighting.pixels[ours] - found.pixels[theirs], axis=1)
+        if not new.any() or (len(both) and np.median(apart) > _BESIDE_PX):
+            continue  # the model is not there yet: it finds other points
+        order = np.argsort(np.concatenate([sighting.ids, found.ids[new]]))
+        sighting.ids = np.concatenate([sighting.ids, found.ids[new]])[order]
+        sighting.pixels = np.concatenate([sighting.pixels, found.pixels[new]])[order]
+        sighting.added += int(new.sum())
+        added += int(new.sum())
+    return added
+
+
+def _held_out(views: list[View], result: Calibration, model: str, options: dict[str, Any]) -> tuple[float, int] | None:
+    """RMS over views that the camera was not calibrated from. The choice of a model has measured it already."""
+    report = result.report
+    used = [v["view"] for v in report["views"] if v["used"]]
+    row = next((r for r in reversed(report["models"]) if r["accepted"]), None)
+    if row is not None and row["model"] == report["model"]:
+        return float(row["held_out_rms_px"]), len(used)
+    moments = sorted({views[v].name or str(v) for v in used})
+    if len(moments) < 6 or model == "auto":
+        return None
+    fine = np.array(report["residuals"]["used"])
+    first = np.concatenate([[0], np.cumsum([len(v.pixels) for v in views])])
+    squares: list[npt.NDArray[np.float64]] = []
+    for fold in range(_FOLDS):
+        out = [v for v in used if moments.index(views[v].name or str(v)) % _FOLDS == fold]
+        try:
+            part = calibrate([views[v] for v in used if v not in out], model=model, **options)
+            error, _ = part.residuals([views[v] for v in out])
+        except CalibrationError:  # the rest says too little
+            return None
+        keep = np.concatenate([fine[first[v] : first[v + 1]] for v in out])
+        squares.append((error[keep] ** 2).sum(axis=1))
+    return float(np.sqrt(np.concatenate(squares).mean())), len(used)

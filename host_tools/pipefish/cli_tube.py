@@ -1,0 +1,177 @@
+"""`pipefish tube`: from a point cloud to diameters, ovality, bends, joints and what stands in the pipe."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from pipefish.cli import Result, UsageError, add_command, table
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def add_tube(commands: Any) -> None:
+    """Adds the command."""
+    p = add_command(
+        commands,
+        "tube",
+        run_tube,
+        "Measure a pipe in a point cloud: diameters and ovality along it with intervals, bends, joints, deposits.",
+        "pipefish tube cloud.ply -o out/ --nominal 300",
+    )
+    p.add_argument("cloud", metavar="CLOUD", help=".ply (ASCII or binary), .xyz, .txt, .csv (x y z [sigma]) or .npy")
+    p.add_argument("-o", "--output", metavar="DIR", help="folder for profile.csv, events.csv, tube.ply, tube.json")
+    p.add_argument("--unit", choices=sorted(UNITS), default="m", help="of the cloud and of --path, --sigma [m]")
+    p.add_argument("--sigma", type=float, help="measurement noise of a point [the cloud's column sigma, or unknown]")
+    p.add_argument("--path", metavar="FILE", help="camera centres in order of travel, a file like CLOUD")
+    p.add_argument("--nominal", type=float, metavar="MM", help="nominal diameter in mm")
+    p.add_argument("--up", metavar="X,Y,Z", help="direction against gravity, for twelve o'clock [-y]")
+    p.add_argument(
+        "--scale-sigma", type=float, default=0.0, metavar="R", help="relative sigma of the cloud's scale [0]"
+    )
+    p.add_argument("--spacing", type=float, metavar="MM", help="of the stations along the pipe, mm [d / 4]")
+
+
+def run_tube(args: argparse.Namespace) -> Result:
+    """Runs the command."""
+    from pipefish.cloudfile import read_points
+    from pipefish.errors import PipefishError
+    from pipefish.progress import Progress
+    from pipefish.tube import fit_tube
+
+    unit = UNITS[args.unit]
+    points, sigma = read_points(args.cloud)
+    path = read_points(args.path)[0] * unit if args.path else None
+    sigma = args.sigma if args.sigma is not None else sigma
+    with Progress("tube", 100, args.json) as bar:
+        tube = fit_tube(
+            points * unit,
+            None if sigma is None else sigma * unit,
+            path,
+            nominal=args.nominal / 1000 if args.nominal else None,
+            up=_direction(args.up) if args.up else None,
+            scale_sigma=args.scale_sigma,
+            spacing=args.spacing / 1000 if args.spacing else None,
+            progress=lambda done, word: bar.update(round(100 * done), word),
+        )
+    if tube.status != "ok":
+        raise PipefishError(f"{args.cloud}: {tube.reason} ({tube.status})")
+    document = document_of(tube)
+    files = write_tube(tube, Path(args.output), document) if args.output else []
+    return {**document, "files": files}, _text(tube, files)
+
+
+def _direction(text: str) -> list[float]:
+    try:
+        values = [float(v) for v in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3:
+        raise UsageError(f"--up {text}: not three numbers X,Y,Z")
+    return values
+
+
+def document_of(tube: Any) -> dict[str, Any]:
+    """Everything about a tube for JSON; what was not measured is null."""
+    return _plain(
+        {
+            "status": tube.status,
+            "reason": tube.reason,
+            "nominal": tube.nominal,
+            "clock_zero": tube.clock_zero,
+            "summary": tube.summary,
+            "events": tube.events,
+            "stations": tube.stations,
+        }
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy, whose import would slow down --help
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
+    """Writes profile.csv, events.csv, tube.ply and tube.json; returns their paths."""
+    import numpy as np
+
+    from pipefish.cloudfile import ply_bytes
+    from pipefish.files import write_atomically
+
+    folder.mkdir(parents=True, exist_ok=True)
+    vertices, faces = tube.mesh()
+    columns = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
+    contents = {
+        "profile.csv": _csv(
+            [dict(zip(tube.stations, row, strict=True)) for row in zip(*tube.stations.values(), strict=True)]
+        ),
+        "events.csv": _csv(tube.events or [{"kind": None, "s": None}], bool(tube.events)),
+        "tube.ply": ply_bytes(columns, faces, ("units: metres",)),
+        "tube.json": json.dumps(document).encode(),
+    }
+    for name, data in contents.items():
+        write_atomically(folder / name, data)
+    return [str(folder / name) for name in contents]
+
+
+def _csv(rows: list[dict[str, Any]], with_rows: bool = True) -> bytes:
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(names)
+    for row in rows if with_rows else []:
+        values = (_plain(row.get(name)) for name in names)
+        writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in values])
+    return stream.getvalue().encode()
+
+
+def _text(tube: Any, files: list[str]) -> str:
+    import numpy as np
+
+    s, t = tube.summary, tube.stations
+    oval = np.isfinite(t["ovality"])
+    spread = f", {1000 * np.nanmin(t['d_mean']):.1f} to {1000 * np.nanmax(t['d_mean']):.1f} along the pipe"
+    rows: list[tuple[str, object]] = [
+        ("length", f"{s['length']:.2f} m, {s['measured']} of {s['stations']} stations measured"),
+        ("mean diameter", f"{1000 * s['d_mean']:.2f} +- {1960 * s['d_mean_sigma']:.2f} mm (95 %){spread}"),
+        (
+            "ovality",
+            f"{100 * s['ovality']:.2f} % ((max - min) / mean)" if oval.any() else "not measured: one side only",
+        ),
+        ("roughness", f"{1000 * s['roughness']:.2f} mm"),
+        ("clock", f"zero {tube.clock_zero}"),
+    ]
+    rows += [(e["kind"], event_text(e)) for e in tube.events]
+    return table([*rows, *(("written", f) for f in files)])
+
+
+def event_text(e: dict[str, Any]) -> str:
+    """One line about an event."""
+    parts = [f"at {e['s']:.3f} m"]
+    if e.get("clock") is not None:
+        parts.append(f"{(e['clock'] * 6 / math.pi) % 12:.1f} o'clock")
+    if e["kind"] == "bend":
+        parts.append(f"{math.degrees(e['angle']):.1f} +- {math.degrees(1.96 * e['angle_sigma']):.1f} degrees")
+        parts.append(f"radius {e['radius']:.2f} m" if e["radius"] else "")
+    for name, what in (
+        ("gap", "gap"),
+        ("step", "step"),
+        ("height", "height"),
+        ("length", "length"),
+        ("width", "width"),
+    ):
+        if e.get(name) is not None and e["kind"] != "bend":
+            parts.append(f"{what} {1000 * e[name]:.1f} mm")
+    if e["kind"] == "joint" and e.get("angle") is not None:
+        parts.append(f"angle {math.degrees(e['angle']):.2f} degrees")
+    return ", ".join(p for p in parts if p)

@@ -1,0 +1,608 @@
+"""From a survey to a measured pipe: poses and points, scale, a tube for each stretch. docs/reconstruction.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pipefish.camera import Camera
+from pipefish.errors import ArgumentError, PipefishError
+from pipefish.structure import REASONS, Encoder, Reconstruction, reconstruct
+from pipefish.survey import Survey, Tracks
+from pipefish.tube import Tube, fit_tube
+
+T = TypeVar("T")
+Tell = Callable[[float, str], None]  # fraction done, what is going on
+
+OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are not in the COLMAP model
+THETA_BIN = math.radians(10)
+TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
+BIN_LEAST = 100  # observations, for a bin to be judged
+SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
+ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
+DISAGREE_SIGMA = 3.0
+# A tracker's stated covariance is that of one step's noise. Its errors along a track are a walk: in a simulated
+# concrete pipe 0.07 px after five camera frames, 0.17 after twenty, 0.37 after thirty, with a share that all tracks
+# have in common. A common 0.03 px a keyframe is a drift of the diameter of 10 % in 6 m where the stated 0.05 px
+# outvotes the encoder. Scatter of the diameter along that pipe by what is added: 0.3 px 1.2 %, 0.5 px 0.7 %,
+# 0.8 px 0.4 %, 1.2 px 0.25 %; then the encoder's own noise in short stretches takes over.
+TRACK_FLOOR_PX = 1.0
+DEFAULT_ATTITUDE_SIGMA = 0.01
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where lengths come from.
+
+    source      "encoder", "diameter" (the given one: then no diameter has been measured), "none"
+    unit        "metre", or "diameter": lengths are in mean diameters of their stretch
+    noise       random part of the encoder, metres over a square root of metres: it makes the scale wander
+    sigma       relative, shared by all; 0 for a given diameter and without scale: there it is part of the definition
+    wheel, wheel_sigma   (true distance over the encoder's) - 1 as estimated; None without an encoder
+    check       a given diameter beside an encoder: given, measured, sigma, deviation (in sigmas), consistent
+    """
+
+    source: str
+    unit: str
+    sigma: float
+    noise: float = 0.0
+    wheel: float | None = None
+    wheel_sigma: float | None = None
+    check: dict[str, Any] | None = None
+
+
+@dataclass
+class Stretch:
+    """One segment of the structure, its frames and its tube. chainage = origin + sign * s."""
+
+    segment: int
+    tube: Tube
+    frames: np.ndarray
+    origin: float
+    sign: int
+
+    def chainage(self, s: Any) -> Any:
+        """Along the survey, from s along the tube."""
+        return self.origin + self.sign * np.asarray(s, float)
+
+
+@dataclass
+class Residuals:
+    """Of every observation of a point: position of its frame and of its point in the structure, item of the tracks,
+    (N,2) px, angle from the axis, and size over OUTLIER_SIGMA's unit: the tracker's stated noise times `spread`, the
+    robust spread of the residuals over it."""
+
+    frame: np.ndarray
+    point: np.ndarray
+    item: np.ndarray
+    pixels: np.ndarray
+    theta: np.ndarray
+    whitened: np.ndarray
+    spread: float
+
+    @property
+    def inlier(self) -> np.ndarray:
+        return self.whitened <= OUTLIER_SIGMA
+
+
+@dataclass
+class Measurement:
+    """A measured survey.
+
+    index       (K,) index of each keyframe that is here; frames below and in `structure` count these
+    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
+    structure   in the unit of `scale`
+    camera_sigma   relative systematic sigma of the diameter by the camera's covariance; None: not known
+    remarks     what one should know, in words, most serious first
+    """
+
+    survey: Survey
+    camera: Camera
+    tracks: Tracks
+    index: np.ndarray
+    encoder: np.ndarray | None
+    structure: Reconstruction
+    scale: Scale
+    nominal: float | None
+    stretches: list[Stretch]
+    camera_sigma: float | None
+    residuals: Residuals
+    backwards: bool
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def measured(self) -> list[Stretch]:
+        """Stretches with a tube."""
+        return [s for s in self.stretches if s.tube.status == "ok"]
+
+    @property
+    def systematic(self) -> float:
+        """Relative sigma that all diameters share."""
+        return math.hypot(self.scale.sigma, self.camera_sigma or 0.0)
+
+    def frame_chainage(self) -> np.ndarray:
+        """(F,) chainage of the structure's frames, by the encoder or along the path."""
+        if self.encoder is not None:
+            return self.encoder[self.structure.frames]
+        steps = np.linalg.norm(np.diff(self.structure.centres, axis=0), axis=1)
+        return np.append(0.0, np.cumsum(steps))
+
+
+def camera_of(survey: Survey, given: Camera | None) -> Camera:
+    """The given camera, or that of the survey's profile. Raises PipefishError where there is none that fits."""
+    camera = given
+    if camera is None:
+        if survey.start is None or not survey.start.profile:
+            raise PipefishError(f"{survey.path}: holds no camera profile: give one with --profile")
+        camera = Camera.from_binary(survey.start.profile)
+    frame = survey.keyframes[0]
+    if (camera.width, camera.height) != (frame.width, frame.height):
+        raise PipefishError(
+            f"{survey.path}: the camera profile is for pictures of {camera.width} x {camera.height}, the survey has "
+            f"{frame.width} x {frame.height}: a wrong profile?"
+        )
+    return camera
+
+
+def _encoder(survey: Survey, remarks: list[str]) -> tuple[np.ndarray | None, Encoder]:
+    """Distance at each keyframe, None if it tells nothing, and how good it is."""
+    chainage = survey.chainage()
+    told = survey.start.encoder if survey.start else None
+    count = told.metres_per_count if told else 0.0
+    known = chainage[np.isfinite(chainage)]
+    quality = Encoder(quantum=count)
+    if told is not None and told.noise_m_per_sqrt_m > 0:
+        quality = dataclasses.replace(quality, noise_m_per_sqrt_m=told.noise_m_per_sqrt_m)
+    if told is not None and told.metres_per_count_sigma > 0 and count > 0:
+        quality = dataclasses.replace(quality, scale_sigma=told.metres_per_count_sigma / count)
+    if len(known) < 2:
+        return None, quality
+    if np.abs(np.diff(known)).sum() < max(ENCODER_LEAST_M, 3 * count):
+        remarks.append("The encoder did not move: it tells no scale.")
+        return None, quality
+    if not told or not told.metres_per_count_sigma:
+        remarks.append(
+            f"The device does not say how good its encoder's scale is: {100 * quality.scale_sigma:.1f} % (one "
+            "sigma) is "
+            "assumed."
+        )
+    return chainage, quality
+
+
+def _attitude(survey: Survey) -> tuple[np.ndarray | None, float]:
+    values = np.full((len(survey.keyframes), 2), np.nan)
+    sigmas = []
+    for row, frame in zip(values, survey.keyframes, strict=True):
+        told = frame.telemetry
+        if "roll_rad" in told and "pitch_rad" in told:
+            row[:] = told["roll_rad"], told["pitch_rad"]
+            sigmas.append(told.get("attitude_sigma_rad", 0.0) or DEFAULT_ATTITUDE_SIGMA)
+    return (values, float(np.median(sigmas))) if sigmas else (None, DEFAULT_ATTITUDE_SIGMA)
+
+
+def _while_telling(work: Callable[[], T], tell: Callable[[], None]) -> T:
+    """The work's result; `tell` is called now and then meanwhile."""
+    out: list[T] = []
+    problem: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            out.append(work())
+        except BaseException as error:
+            problem.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        tell()
+        thread.join(0.25)
+    if problem:
+        raise problem[0]
+    return out[0]
+
+
+def measure(
+    survey: Survey,
+    camera: Camera | None = None,
+    *,
+    diameter: float | None = None,
+    nominal: float | None = None,
+    method: str = "hierarchical",
+    threads: int | None = None,
+    tell: Tell | None = None,
+) -> Measurement:
+    """Measures a survey.
+
+    camera     None: the survey's profile
+    diameter   known true inner diameter, metres: the scale where there is no encoder, a check where there is one
+    nominal    nominal diameter, metres [the survey's], for what is defined against it
+    tell       is called with a fraction done and a word
+
+    Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
+    tell = tell or (lambda fraction, word: None)
+    for name, value in (("diameter", diameter), ("nominal", nominal)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ArgumentError(f"{name}: {value} is not a positive length")
+    if len(survey.keyframes) < 3:
+        raise PipefishError(
+            f"{survey.path}: {len(survey.keyframes)} keyframes; three are the least that can be measured"
+        )
+    camera = camera_of(survey, camera)
+    remarks: list[str] = []
+    chainage, quality = _encoder(survey, remarks)
+    attitude, attitude_sigma = _attitude(survey)
+    tracks = survey.tracks()
+    index = np.array([k.index for k in survey.keyframes], dtype=np.int64)
+    tracks = dataclasses.replace(
+        tracks,
+        frame=np.searchsorted(index, tracks.frame),  # missing keyframes take no number
+    )
+    weighed = dataclasses.replace(tracks, covariance=tracks.covariance + TRACK_FLOOR_PX**2 * np.eye(2))
+    structure = _while_telling(
+        lambda: reconstruct(
+            weighed,
+            camera,
+            chainage,
+            encoder=quality,
+            attitude=attitude,
+            attitude_sigma=attitude_sigma,
+            method=method,
+            threads=threads,
+        ),
+        lambda: tell(0.05, "poses and points"),
+    )
+    if structure.status == "failed":
+        raise PipefishError(f"{survey.path}: nothing could be measured: {_why(survey, structure)}")
+    ahead = np.einsum("ni,ni->n", np.diff(structure.centres, axis=0), structure.poses[:-1, 2, :3])
+    m = Measurement(
+        survey=survey,
+        camera=camera,
+        tracks=tracks,
+        index=index,
+        encoder=chainage,
+        structure=structure,
+        scale=Scale("none", "diameter", 0.0),
+        nominal=nominal or (survey.start.nominal_diameter_m if survey.start else 0.0) or None,
+        stretches=[],
+        camera_sigma=None,
+        residuals=_residuals(tracks, structure, camera),
+        backwards=bool(ahead.sum() < 0),
+        remarks=remarks,
+    )
+    _scale(m, quality, diameter, tell)
+    _fit_stretches(m, threads, tell)
+    if not m.measured:
+        reasons = sorted({s.tube.reason for s in m.stretches})
+        raise PipefishError(
+            f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
+            "found, but "
+            f"no pipe around them: {'; '.join(reasons)}"
+        )
+    m.camera_sigma = _camera_sigma(m)
+    _widen(m)
+    _check_diameter(m, diameter)
+    _remark(m, diameter)
+    return m
+
+
+def _why(survey: Survey, structure: Reconstruction) -> str:
+    """Why there is no structure, with what the device said about the scene."""
+    states = survey.info["states"]
+    seen = ", ".join(f"{state} at {count} of {len(survey.keyframes)} keyframes" for state, count in states.items())
+    seen = f"; the device said: {seen}" if seen else ""
+    if not survey.info["tracks"]["observations"]:
+        return f"no keyframe has tracks: a black or covered picture?{seen}"
+    return structure.reason + seen
+
+
+def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Residuals:
+    point = np.full(int(tracks.track.max()) + 1, -1)
+    point[structure.track] = np.arange(len(structure.track))
+    place = np.full(int(tracks.frame.max()) + 1, -1)
+    place[structure.frames] = np.arange(len(structure.frames))
+    j, k = point[tracks.track], place[tracks.frame]
+    item = np.flatnonzero((j >= 0) & (k >= 0))
+    item = item[structure.point_segment[j[item]] == structure.segment[k[item]]]
+    j, k = j[item], k[item]
+    seen = np.einsum("nij,nj->ni", structure.poses[k, :, :3], structure.points[j]) + structure.poses[k, :, 3]
+    pixels, ok = camera.project(seen)
+    item, j, k, seen, pixels = item[ok], j[ok], k[ok], seen[ok], pixels[ok]
+    residual = tracks.pixels[item] - pixels
+    covariance = tracks.covariance[item]  # a survey's tracks have them
+    determinant = np.maximum(np.linalg.det(covariance), 1e-12)
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    square = yy * residual[:, 0] ** 2 - 2 * xy * residual[:, 0] * residual[:, 1] + xx * residual[:, 1] ** 2
+    whitened = np.sqrt(np.maximum(0, square / determinant / 2))
+    spread = float(np.median(whitened)) / math.sqrt(math.log(2))  # the median of a Rayleigh distribution
+    theta = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
+    return Residuals(k, j, item, residual, theta, whitened / max(spread, 0.5), spread)
+
+
+def _segment_path(m: Measurement, segment: int) -> np.ndarray:
+    """Camera centres in the order in which the tube's s grows: the way the camera looks."""
+    centres = m.structure.centres[m.structure.segment == segment]
+    return centres[::-1] if m.backwards else centres
+
+
+def _up(structure: Reconstruction) -> np.ndarray:
+    """Against gravity, or up in the first keyframe."""
+    return -structure.down if structure.down is not None else np.array([0.0, -1.0, 0.0])
+
+
+def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
+    """Brings the structure into metres, or into diameters of each stretch."""
+    if m.structure.unit == "metre":
+        sigma = float(m.structure.scale_sigma or 0.0)
+        noise = quality.noise_m_per_sqrt_m
+        m.scale = Scale("encoder", "metre", sigma, noise, m.structure.wheel, m.structure.wheel_sigma)
+        return
+    m.encoder = None  # of no use: too few of its steps could be used
+    factors = []
+    for segment in range(len(m.structure.sigma)):
+        inside = m.structure.point_segment == segment
+        tube = fit_tube(
+            m.structure.points[inside], m.structure.covariance[inside], _segment_path(m, segment), up=_up(m.structure)
+        )
+        size = tube.summary["d_mean"] if tube.status == "ok" else None
+        factors.append((diameter or 1.0) / size if size else 1.0)
+        tell(0.5, "scale")
+    m.structure = rescaled(m.structure, factors)
+    m.scale = Scale("diameter", "metre", 0.0) if diameter else Scale("none", "diameter", 0.0)
+
+
+def rescaled(structure: Reconstruction, factors: list[float]) -> Reconstruction:
+    """The structure with each segment scaled about its first centre and put where the one before ended."""
+    poses, points = structure.poses.copy(), structure.points.copy()
+    covariance, pose_covariance = structure.covariance.copy(), structure.pose_covariance.copy()
+    systematic = None if structure.systematic is None else structure.systematic.copy()
+    pose_systematic = None if structure.pose_systematic is None else structure.pose_systematic.copy()
+    centres, end = structure.centres, None
+    for segment, factor in enumerate(factors):
+        of_frame, of_point = structure.segment == segment, structure.point_segment == segment
+        start = centres[of_frame][0]
+        place = start if end is None else end
+        moved = place + factor * (centres[of_frame] - start)
+        poses[of_frame, :, 3] = -np.einsum("nij,nj->ni", poses[of_frame, :, :3], moved)
+        points[of_point] = place + factor * (points[of_point] - start)
+        covariance[of_point] *= factor**2
+        stretch = np.diag([1.0] * 3 + [factor] * 3)
+        pose_covariance[of_frame] = stretch @ pose_covariance[of_frame] @ stretch
+        if systematic is not None and pose_systematic is not None:
+            systematic[of_point] *= factor**2
+            pose_systematic[of_frame] = stretch @ pose_systematic[of_frame] @ stretch
+        end = moved[-1]
+    return dataclasses.replace(
+        structure,
+        poses=poses,
+        points=points,
+        covariance=covariance,
+        pose_covariance=pose_covariance,
+        systematic=systematic,
+        pose_systematic=pose_systematic,
+    )
+
+
+def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
+    """A tube for each segment: across a gap nothing joins two of them but odometry, so no surface does."""
+    structure, count = m.structure, len(m.structure.sigma)
+    along = m.frame_chainage()
+    for segment in range(count):
+        inside, here = structure.point_segment == segment, np.flatnonzero(structure.segment == segment)
+        tube = fit_tube(
+            structure.points[inside],
+            structure.covariance[inside],
+            _segment_path(m, segment),
+            nominal=m.nominal if m.scale.unit == "metre" else None,
+            up=_up(structure),
+            threads=threads or 2,
+            progress=lambda f, word, k=segment: tell(0.5 + 0.45 * (k + f) / count, word),
+        )
+        tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
+        origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
+        m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign))
+
+
+def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool) -> tuple[float, int]:
+    """chainage = origin + sign s, exact at the first camera that is beside the tube."""
+    if tube.status != "ok":
+        return 0.0, 1
+    start = tube.frames([0.0])
+    place = tube.project(centres)
+    s = np.where(place["piece"] >= 0, place["s"], (centres - start["centre"][0]) @ start["tangent"][0])
+    known = np.flatnonzero(np.isfinite(along))
+    if not len(known):
+        return float(-s[0]), -1 if backwards else 1
+    beside = known[place["piece"][known] >= 0]
+    first = int(beside[0]) if len(beside) else int(known[0])
+    growing = (along[known[-1]] - along[known[0]]) * (s[known[-1]] - s[known[0]])
+    sign = -1 if growing < 0 else 1
+    return float(along[first] - sign * s[first]), sign
+
+
+def _camera_sigma(m: Measurement) -> float | None:
+    """What the camera's uncertainty does to a diameter, relative: the same error moves all points, so that their radial
+    sigma does not average away. The median over points of that sigma over the radius; an upper bound where it changes
+    sign with the angle."""
+    if m.structure.systematic is None:
+        return None
+    ratios = []
+    for stretch in m.measured:
+        inside = m.structure.point_segment == stretch.segment
+        points, spread = m.structure.points[inside], m.structure.systematic[inside]
+        place = stretch.tube.project(points)
+        on = place["piece"] >= 0
+        axis = stretch.tube.frames(place["s"][on])["centre"]
+        out = points[on] - axis
+        radius = np.linalg.norm(out, axis=1)
+        out /= radius[:, None]
+        ratios.append(np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", out, spread[on], out))) / radius)
+    return float(np.median(np.concatenate(ratios)))
+
+
+def _widen(m: Measurement) -> None:
+    """Adds to the stations' sigmas what the tube, which takes its points' errors as their own, cannot know: the camera
+    (systematic), and the wander of the scale (random): over a diameter it is known as well as the encoder tells it. An
+    upper bound: vision ties a little more than that together."""
+    for stretch in m.measured:
+        stations = stretch.tube.stations
+        local = m.scale.noise / math.sqrt(stretch.tube.summary["d_mean"])
+        for name in ("d_mean", "d_area", "d_max", "d_min", "circumference"):
+            stations[name + "_sigma"] = np.hypot(stations[name + "_sigma"], local * stations[name])
+        if stretch.tube.nominal:
+            stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
+        for name in [n for n in stations if n.endswith("_systematic")]:
+            stations[name] = m.systematic * stations[name.removesuffix("_systematic")]
+
+
+def mean_diameter(m: Measurement) -> tuple[float, float]:
+    """Mean over all that was measured, and its random sigma."""
+    tubes = [s.tube for s in m.measured]
+    weight = np.array([t.summary["measured"] for t in tubes], float)
+    weight /= weight.sum()
+    value = float(sum(w * t.summary["d_mean"] for w, t in zip(weight, tubes, strict=True)))
+    sigma = math.sqrt(sum((w * t.summary["d_mean_sigma"]) ** 2 for w, t in zip(weight, tubes, strict=True)))
+    wander = m.scale.noise / math.sqrt(max(m.structure.length, 1e-3))
+    return value, math.hypot(sigma, wander * value)
+
+
+def _check_diameter(m: Measurement, diameter: float | None) -> None:
+    if diameter is None or m.scale.source != "encoder":
+        return
+    measured, random = mean_diameter(m)
+    sigma = math.hypot(random, m.systematic * measured)
+    deviation = (measured - diameter) / max(sigma, 1e-12)
+    check = {
+        "given": diameter,
+        "measured": measured,
+        "sigma": sigma,
+        "deviation": deviation,
+        "consistent": bool(abs(deviation) <= DISAGREE_SIGMA),
+    }
+    m.scale = dataclasses.replace(m.scale, check=check)
+    if not check["consistent"]:
+        m.remarks.insert(
+            0,
+            f"The encoder gives a mean diameter of {1000 * measured:.1f} mm, the given one is "
+            f"{1000 * diameter:.1f} mm: "
+            f"{abs(deviation):.1f} sigma apart. The values are the encoder's.",
+        )
+
+
+def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str, Any]]:
+    """Residuals of the inliers by angle from the axis: low, high (degrees), count, mean radial and rms, px."""
+    keep = residuals.inlier
+    out = tracks.pixels[residuals.item[keep]] - np.array([camera.c_u, camera.c_v])
+    radial = np.einsum("ni,ni->n", residuals.pixels[keep], out) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
+    number = (residuals.theta[keep] / THETA_BIN).astype(int)
+    rms = np.einsum("ni,ni->n", residuals.pixels[keep], residuals.pixels[keep]) / 2
+    rows = []
+    for k in np.unique(number):
+        inside = number == k
+        rows.append(
+            {
+                "low_deg": 10.0 * int(k),
+                "high_deg": 10.0 * int(k) + 10.0,
+                "count": int(inside.sum()),
+                "mean_radial_px": float(radial[inside].mean()),
+                "rms_px": float(np.sqrt(rms[inside].mean())),
+            }
+        )
+    return rows
+
+
+def _remark(m: Measurement, diameter: float | None) -> None:
+    """What one should know, most serious first."""
+    remarks: list[str] = []
+    if m.scale.source == "none":
+        remarks.append(
+            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
+            "measured. "
+            "--diameter gives a scale."
+        )
+    if m.scale.source == "diameter" and diameter:
+        remarks.append(
+            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
+            "changes along the pipe, ovality and angles were."
+        )
+    worst = m.residuals.spread
+    if worst > SIGMA_MOST:
+        remarks.append(
+            f"Residuals scatter {worst:.1f} times as far as the tracks' own noise: a wrong profile, a lens that "
+            "has moved, or "
+            "a wall that does?"
+        )
+    bins = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
+    bent = max(bins, key=lambda b: abs(b["mean_radial_px"]), default=None)
+    if bent and abs(bent["mean_radial_px"]) > TREND_PX:
+        remarks.append(
+            f"Residuals have a trend: {bent['mean_radial_px']:+.2f} px outwards between {bent['low_deg']:.0f} and "
+            f"{bent['high_deg']:.0f} degrees from the axis. The profile does not quite fit the camera (or its "
+            "pupil moves), "
+            "and diameters may be off by more than their intervals."
+        )
+    if m.camera.covariance is None:
+        remarks.append(
+            "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
+        )
+    if m.structure.down is None:
+        remarks.append("No inclinometer: the clock is relative to the first keyframe.")
+    if m.backwards:
+        remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
+    for b in m.survey.breaks:
+        if b["restart"]:
+            remarks.append(
+                f"The device restarted before keyframe {b['index']}: what it drove meanwhile nobody counted, and the "
+                "chainage goes on as if it were nothing."
+            )
+    if m.structure.repeated:
+        remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
+    m.remarks = remarks + m.remarks
+
+
+def not_measured(m: Measurement) -> list[dict[str, Any]]:
+    """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
+    rows = []
+    along = np.full(len(m.index), np.nan)
+    along[m.structure.frames] = m.frame_chainage()
+    if m.encoder is not None:
+        along = m.encoder
+
+    def at(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
+    for gap in m.structure.gaps:
+        rows.append(
+            {
+                "start": at(along[gap.first]),
+                "end": at(along[gap.last]),
+                "reason": gap.reason,
+                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
+            }
+        )
+    for stretch in m.stretches:
+        if stretch.tube.status != "ok":
+            ends = along[stretch.frames[[0, -1]]]
+            rows.append(
+                {"start": at(ends[0]), "end": at(ends[1]), "reason": stretch.tube.status, "detail": stretch.tube.reason}
+            )
+            continue
+        stations = stretch.tube.stations
+        for good, run in itertools.groupby(range(len(stations["s"])), key=lambda i: stations["status"][i]):
+            if good == "ok":
+                continue
+            inside = list(run)
+            ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
+            what = {
+                "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
+                "one_sided": "nothing: no wall seen over more than 220 degrees",
+                "too_few_points": "nothing: too few points on the wall",
+            }[str(good)]
+            rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
+    return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

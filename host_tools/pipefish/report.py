@@ -1,0 +1,783 @@
+"""`pipefish report`: one self-contained HTML page about a measured pipe, from the folder of `pipefish reconstruct`."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipefish.cloudfile import read_columns
+from pipefish.colours import DIVERGING
+from pipefish.errors import FormatError, PipefishError
+from pipefish.files import write_atomically
+from pipefish.measured_files import COLOUR_SPAN, FORMAT, RING, VERSION
+from pipefish.page import Chart, chart_html, fill, table_html, whole_page
+
+Z95 = 1.96
+MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # of the 3-D scene: a phone turns that
+NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
+
+# Limits that can be asked for: column, whether the value must stay at most or at least, factor to people's unit, unit.
+LIMITS = {
+    "ovality": ("ovality", "most", 100.0, "%"),
+    "ovality_nominal": ("ovality_nominal", "most", 100.0, "%"),
+    "ovality_astm": ("ovality_astm", "most", 100.0, "%"),
+    "reduction_nominal": ("reduction_nominal", "most", 100.0, "%"),
+    "d_max": ("d_max", "most", 1000.0, "mm"),
+    "d_min": ("d_min", "least", 1000.0, "mm"),
+}
+
+OVALITIES = (
+    ("ovality", "(max - min) / mean"),
+    ("ovality_nominal", "(max - min) / nominal"),
+    ("ovality_astm", "ASTM F1216: (mean - min) / mean"),
+    ("ovality_astm_max", "ASTM F1216: (max - mean) / mean"),
+    ("reduction_nominal", "EN 13508-2 BAA: (nominal - min) / nominal"),
+)
+DIAMETERS = (
+    ("d_mean", "mean (perimeter / pi)"),
+    ("d_max", "widest"),
+    ("d_min", "narrowest"),
+    ("d_area", "of equal area"),
+)
+COLOURS = ("#1f8a94", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63")
+
+
+# ---- texts
+
+
+def length_text(value: float, unit: str, metres: bool = False) -> str:
+    """A length for people."""
+    if unit != "metre":
+        return f"{value:.3f} diameters"
+    return f"{value:.2f} m" if metres else f"{1000 * value:.1f} mm"
+
+
+def percent_text(value: float) -> str:
+    """A share for people."""
+    return f"{100 * value:.2f} %"
+
+
+def clock_text(angle: float) -> str:
+    """A clock position, hours and minutes."""
+    minutes = round(angle * 360 / math.pi) % 720
+    return f"{minutes // 60 or 12}:{minutes % 60:02d}"
+
+
+def _size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
+    if e["kind"] == "not_measured":
+        if e["start"] is not None and e["end"] is not None:
+            yield f"to {length_text(e['end'], unit, metres=True)}"
+        yield e["detail"]
+        return
+    if e["kind"] == "bend":
+        yield f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.1f}°"
+        if e.get("radius"):
+            yield f"radius {length_text(e['radius'], unit, metres=True)}"
+        yield f"from {length_text(e['start'], unit, metres=True)} to {length_text(e['end'], unit, metres=True)}"
+        return
+    for name in ("gap", "step", "height", "length", "width"):
+        if e.get(name) is not None:
+            sigma = e.get("size_sigma" if name in ("length", "width") else f"{name}_sigma")
+            text = length_text(e[name], unit)
+            if sigma is not None:
+                text = text.replace(" ", f" ± {length_text(Z95 * sigma, unit).split()[0]} ", 1)
+            yield f"{name} {text}"
+    if e["kind"] == "joint" and e.get("angle") is not None:
+        yield f"angle {math.degrees(e['angle']):.2f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
+
+
+def events_text(e: dict[str, Any], unit: str) -> str:
+    """One line about an event, without its kind."""
+    at = f"at {length_text(e['chainage'], unit, metres=True)}" if e["chainage"] is not None else "place unknown"
+    clock = f"{clock_text(e['clock'])} o'clock" if e.get("clock") is not None else ""
+    return ", ".join(p for p in (at, clock, *_size_parts(e, unit)) if p)
+
+
+# ---- reading
+
+
+def read_measured(folder: Path) -> dict[str, Any]:
+    """reconstruction.json of a folder. Raises FormatError, OSError."""
+    path = folder / "reconstruction.json"
+    try:
+        document = json.loads(path.read_bytes())
+    except (ValueError, UnicodeDecodeError) as error:
+        raise FormatError(path, None, f"not JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FormatError(path, "format", f"not '{FORMAT}': is this a folder of `pipefish reconstruct`?")
+    if document.get("version") != VERSION:
+        raise FormatError(path, "version", f"{document.get('version')}; this program reads {VERSION}")
+    return document
+
+
+def column(document: dict[str, Any], name: str) -> np.ndarray:
+    """A column of the stations, (N,) with NaN where not measured."""
+    return np.array([np.nan if v is None else v for v in document["stations"][name]], float)
+
+
+# ---- limits
+
+
+def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
+    """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
+    together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""
+    quantity, side, factor, unit = LIMITS[name]
+    scale = document["summary"]
+    if unit == "mm" and scale["unit"] != "metre":
+        return _verdict(name, bound, unit, "not measured", "there is no scale")
+    value = factor * column(document, quantity)
+    sigma = factor * column(document, f"{quantity}_sigma")
+    if quantity in ("d_max", "d_min"):
+        sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
+    elif quantity == "reduction_nominal":
+        sigma = np.hypot(sigma, factor * scale["systematic"]["relative"])
+    if not np.isfinite(value).any():
+        return _verdict(name, bound, unit, "not measured", "no station has it")
+    excess = (value - bound) * (1 if side == "most" else -1)
+    worst = int(np.nanargmax(excess))
+    at = length_text(column(document, "chainage")[worst], scale["unit"], metres=True)
+    shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
+    outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
+    known = np.isfinite(value)
+    missing = len(value) - int(known.sum())
+    state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
+    if state == "passed" and missing:
+        state = "passed where measured"
+    more = f"; {missing} of {len(value)} stations have no value" if missing else ""
+    return _verdict(name, bound, unit, state, shown + more)
+
+
+def _verdict(name: str, bound: float, unit: str, state: str, shown: str) -> dict[str, Any]:
+    word = "at most" if LIMITS[name][1] == "most" else "at least"
+    text = f"{state}: {word} {bound:g} {unit}; worst {shown}" if state != "not measured" else f"not measured: {shown}"
+    return {"name": name, "bound": bound, "unit": unit, "state": state, "worst": shown, "text": text}
+
+
+# ---- charts
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, **more}
+
+
+def _numbers(values: Iterable[float], digits: int = 3) -> list[float | None]:
+    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
+
+
+def _runs(x: np.ndarray, y: np.ndarray, stretch: np.ndarray) -> list[np.ndarray]:
+    """Indices of what may be joined: neighbours of one stretch that have values."""
+    runs: list[list[int]] = []
+    for i in np.flatnonzero(np.isfinite(y)):
+        if runs and runs[-1][-1] == i - 1 and stretch[i] == stretch[i - 1]:
+            runs[-1].append(int(i))
+        else:
+            runs.append([int(i)])
+    return [np.array(r) for r in runs]
+
+
+def _band(
+    x: np.ndarray,
+    y: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    stretch: np.ndarray,
+    name: str,
+    colour: str,
+    **more: Any,
+) -> list[dict[str, Any]]:
+    """A line with its band, broken where nothing was measured."""
+    line_x, line_y, area_x, area_y = ([] for _ in range(4))
+    for run in _runs(x, y, stretch):
+        line_x += [*_numbers(x[run]), None]
+        line_y += [*_numbers(y[run]), None]
+        area_x += [*_numbers(x[run]), *_numbers(x[run][::-1]), None]
+        area_y += [*_numbers(high[run]), *_numbers(low[run][::-1]), None]
+    area = {"type": "scatter", "mode": "none", "x": area_x, "y": area_y, "fill": "toself", "fillcolor": colour + "38"}
+    line = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": line_x,
+        "y": line_y,
+        "name": name,
+        "line": {"color": colour, "width": 2},
+    }
+    return [
+        {**area, "legendgroup": name, "showlegend": False, "hoverinfo": "skip", **more},
+        {**line, "legendgroup": name, **more},
+    ]
+
+
+def _choice(names: list[str], per: int, first: int) -> list[dict[str, Any]]:
+    """A menu that shows one group of `per` traces at a time."""
+    buttons = [
+        {
+            "label": name,
+            "method": "restyle",
+            "args": [{"visible": [k == i for k in range(len(names)) for _ in range(per)]}],
+        }
+        for i, name in enumerate(names)
+    ]
+    return [
+        {
+            "buttons": buttons,
+            "active": first,
+            "x": 0,
+            "xanchor": "left",
+            "y": 1.02,
+            "yanchor": "bottom",
+            "showactive": True,
+        }
+    ]
+
+
+class Report:
+    """Collects the parts of the page. Use `write_report`."""
+
+    def __init__(self, folder: Path, limits: list[tuple[str, float]]) -> None:
+        self.folder = folder
+        self.document = read_measured(folder)
+        self.summary = self.document["summary"]
+        self.unit = self.summary["unit"]
+        self.factor, self.short = (1000.0, "mm") if self.unit == "metre" else (1.0, "diameters")
+        self.along_unit = "m" if self.unit == "metre" else "diameters"
+        self.x = column(self.document, "chainage")
+        self.stretch = column(self.document, "stretch")
+        self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
+
+    def along(self, **more: Any) -> dict[str, Any]:
+        """The axis along the pipe, the same range in all charts."""
+        low, high = float(np.nanmin(self.x)), float(np.nanmax(self.x))
+        margin = 0.02 * max(high - low, 1e-3)
+        return _axis(f"chainage, {self.along_unit}", range=[round(low - margin, 3), round(high + margin, 3)], **more)
+
+    def shapes(self) -> list[dict[str, Any]]:
+        """Grey where nothing was measured, lines where something was found."""
+        shapes: list[dict[str, Any]] = []
+        for gap in self.document["not_measured"]:
+            if gap["start"] is not None and gap["end"] is not None:
+                shapes.append(
+                    {
+                        "type": "rect",
+                        "xref": "x",
+                        "yref": "paper",
+                        "x0": gap["start"],
+                        "x1": gap["end"],
+                        "y0": 0,
+                        "y1": 1,
+                        "fillcolor": "rgba(128,128,128,0.18)",
+                        "line": {"width": 0},
+                        "layer": "below",
+                    }
+                )
+        return shapes
+
+    def chart_diameter(self) -> Chart:
+        """All named diameters with their bands, one at a time and together with nominal."""
+        data: list[dict[str, Any]] = []
+        for (name, words), colour in zip(DIAMETERS, COLOURS, strict=False):
+            value, sigma = (self.factor * column(self.document, n) for n in (name, name + "_sigma"))
+            shown: dict[str, Any] = {} if name != "d_area" else {"visible": "legendonly"}
+            reach = Z95 * sigma
+            data += _band(self.x, value, value - reach, value + reach, self.stretch, words, colour, **shown)
+        for trace in data[1::2]:
+            trace["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} {self.short}"
+        shapes = self.shapes()
+        if self.summary["nominal"] and self.unit == "metre":
+            line = {
+                "type": "line",
+                "xref": "paper",
+                "x0": 0,
+                "x1": 1,
+                "line": {"dash": "dot", "width": 1.5, "color": "#888"},
+            }
+            shapes.append({**line, "y0": 1000 * self.summary["nominal"], "y1": 1000 * self.summary["nominal"]})
+        shared = Z95 * self.factor * self.summary["d_mean_systematic"]
+        digits = 1 if self.unit == "metre" else 4
+        return {
+            "id": "diameter",
+            "title": "Diameter along the pipe",
+            "text": "Bands: 95 % intervals of repeatability. What all values share (scale, camera) is not in them: "
+            f"± {shared:.{digits}f} {self.short} (95 %). Dotted: nominal. Grey: not measured. Names in the legend "
+            "switch on "
+            "and off.",
+            "data": data,
+            "layout": {"xaxis": self.along(), "yaxis": _axis(self.short), "shapes": shapes, "hovermode": "x unified"},
+        }
+
+    def chart_ovality(self) -> Chart:
+        """The definitions of ovality, to choose from."""
+        data: list[dict[str, Any]] = []
+        names = []
+        for name, words in OVALITIES:
+            value = 100 * column(self.document, name)
+            if not np.isfinite(value).any():
+                continue
+            if name == "ovality":
+                low, high = (100 * column(self.document, n) for n in ("ovality_lo", "ovality_hi"))
+            else:
+                reach = Z95 * 100 * column(self.document, name + "_sigma")
+                low, high = value - reach, value + reach
+            colour = COLOURS[0]
+            data += _band(self.x, value, low, high, self.stretch, words, colour, visible=not names)
+            data[-1]["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} %<extra></extra>"
+            names.append(words)
+        shapes = self.shapes()
+        return {
+            "id": "ovality",
+            "title": "Ovality along the pipe",
+            "text": "Choose the definition. Noise makes any circle look oval: its share is taken off, and the "
+            "lower end of an "
+            "interval may be zero.",
+            "data": data,
+            "layout": {
+                "xaxis": self.along(),
+                "yaxis": _axis("%", rangemode="tozero"),
+                "shapes": shapes,
+                "showlegend": False,
+                "updatemenus": _choice(names, 2, 0),
+                "margin": {"t": 48},
+            },
+        }
+
+    def chart_tube(self) -> Chart:
+        """The 3-D scene: wall coloured by deviation, points, path of the camera, findings."""
+        wall = read_columns(self.folder / "tube.ply")
+        missing = {"x", "y", "z", "deviation", "piece"} - set(wall)
+        if missing or len(wall["x"]) % RING:
+            raise FormatError(self.folder / "tube.ply", "vertex", "not a wall that `pipefish reconstruct` wrote")
+        shape = (-1, RING)
+        xyz = np.stack([wall[k].astype(float).reshape(shape) for k in "xyz"], -1)[:, :: RING // AROUND]
+        deviation = self.factor * wall["deviation"].astype(float).reshape(shape)[:, :: RING // AROUND]
+        piece = wall["piece"].reshape(shape)[:, 0]
+        keep = np.arange(len(xyz)) % max(1, math.ceil(len(xyz) / MOST_RINGS)) == 0
+        keep |= np.diff(piece, prepend=-1) != 0
+        keep |= np.diff(piece, append=-1) != 0
+        xyz, deviation, piece = xyz[keep], deviation[keep], piece[keep]
+        same = np.flatnonzero(piece[1:] == piece[:-1])
+        j = np.arange(AROUND)
+        a = (same[:, None] * AROUND + j).ravel()
+        b = (same[:, None] * AROUND + (j + 1) % AROUND).ravel()
+        faces = np.concatenate([np.c_[a, a + AROUND, b], np.c_[b, a + AROUND, b + AROUND]])
+        centre = xyz.mean(axis=(0, 1))
+
+        def at(points: np.ndarray) -> dict[str, list[float | None]]:
+            moved = points.reshape(-1, 3) - centre
+            # Plotly's third axis points upwards: camera x, z, -y.
+            return {"x": _numbers(moved[:, 0], 4), "y": _numbers(moved[:, 2], 4), "z": _numbers(-moved[:, 1], 4)}
+
+        reach = max(1e-6, min(float(np.nanpercentile(np.abs(deviation), 99)), self.factor * COLOUR_SPAN))
+        size = self.summary["nominal"] if self.summary["nominal"] and self.unit == "metre" else self.summary["d_mean"]
+        scale = [[k / (len(DIVERGING) - 1), "rgb({:.0f},{:.0f},{:.0f})".format(*c)] for k, c in enumerate(DIVERGING)]
+        data: list[dict[str, Any]] = [
+            {
+                "type": "mesh3d",
+                "name": "wall",
+                **at(xyz),
+                **{n: faces[:, k].tolist() for k, n in enumerate("ijk")},
+                "intensity": _numbers(deviation.ravel(), 3),
+                "colorscale": scale,
+                "cmin": -reach,
+                "cmax": reach,
+                "opacity": 0.55,
+                "flatshading": False,
+                "lighting": {"ambient": 0.7, "diffuse": 0.5, "specular": 0.1},
+                "colorbar": {
+                    "title": {"text": f"radius - {self.factor * size / 2:.4g}, {self.short}", "side": "top"},
+                    "orientation": "h",
+                    "thickness": 10,
+                    "len": 0.8,
+                    "y": 0,
+                    "yanchor": "bottom",
+                },
+                "hovertemplate": f"%{{intensity:.2f}} {self.short}<extra>wall</extra>",
+            }
+        ]
+        cloud = read_columns(self.folder / "points.ply")
+        points = np.stack([cloud[k].astype(float) for k in "xyz"], -1)
+        near = np.abs(cloud["distance"]) < 0.25 * size  # far ones would shrink the pipe to a dot
+        points = points[near][:: max(1, math.ceil(near.sum() / MOST_POINTS))]
+        dots = {
+            "type": "scatter3d",
+            "mode": "markers",
+            "marker": {"size": 1.2, "color": "#7d8a97"},
+            "hoverinfo": "skip",
+        }
+        data.append({**dots, "name": "points", **at(points)})
+        path = np.array(self.document["poses"]["centre"], float)
+        of_stretch = self.document["poses"]["stretch"]
+        rows: list[np.ndarray] = []
+        for _, run in itertools.groupby(range(len(path)), key=lambda k: of_stretch[k]):
+            rows += [path[list(run)], np.full((1, 3), np.nan)]
+        line = {"type": "scatter3d", "mode": "lines", "line": {"width": 4, "color": "#d8a012"}, "hoverinfo": "skip"}
+        data.append({**line, "name": "camera", **at(np.vstack(rows))})
+        data += self._marks(at)
+        return {
+            "id": "tube",
+            "title": "The pipe in 3-D",
+            "text": "Drag to turn, wheel or two fingers to come nearer. Colour: the wall's radius against "
+            f"{'nominal' if self.summary['nominal'] and self.unit == 'metre' else 'the mean'}.",
+            "data": data,
+            "layout": {
+                "scene": {
+                    "aspectmode": "data",
+                    "xaxis": {"title": {"text": ""}},
+                    "yaxis": {"title": {"text": self.along_unit}},
+                    "zaxis": {"title": {"text": ""}},
+                    "camera": {"eye": {"x": 0.75, "y": -1.85, "z": 0.75}},  # along the pipe: fits tall and wide
+                },
+                "margin": {"l": 0, "r": 0, "t": 28, "b": 0},
+                "dragmode": "orbit",
+            },
+        }
+
+    def _marks(self, at: Any) -> list[dict[str, Any]]:
+        """Findings, on the axis."""
+        found = [e for e in self.document["events"] if e["kind"] != "not_measured"]
+        if not found:
+            return []
+        axis = np.stack([column(self.document, k) for k in "xyz"], -1)
+        order = np.argsort(self.x)
+        place = np.stack(
+            [np.interp([e["chainage"] for e in found], self.x[order], axis[order, k]) for k in range(3)], -1
+        )
+        return [
+            {
+                "type": "scatter3d",
+                "mode": "markers+text",
+                "name": "findings",
+                **at(place),
+                "marker": {"size": 5, "symbol": "diamond", "color": "#b83a63"},
+                "text": [e["kind"] for e in found],
+                "textposition": "top center",
+                "hovertext": [f"{e['kind']} {events_text(e, self.unit)}" for e in found],
+                "hoverinfo": "text",
+            }
+        ]
+
+    def charts_line(self) -> list[Chart]:
+        """Where the axis goes: plan, and height where gravity is known."""
+        axis = np.stack([column(self.document, k) for k in "xyz"], -1)
+        start = axis[0]
+        down = self.document["structure"]["down"]
+        up = -np.array(down if down else [0.0, 1.0, 0.0])
+        heading = np.array([column(self.document, k)[0] for k in ("tx", "ty", "tz")])
+        ahead = heading - (heading @ up) * up
+        if np.linalg.norm(ahead) < 0.2:  # a shaft: any two directions across
+            ahead = np.cross(up, [1.0, 0.0, 0.0])
+        ahead /= np.linalg.norm(ahead)
+        side = np.cross(ahead, up)
+        flat = (axis - start) @ np.stack([ahead, side], -1)
+        height = (axis - start) @ up
+        breaks = np.diff(self.stretch, prepend=self.stretch[0]) != 0
+        line = {"type": "scatter", "mode": "lines", "line": {"width": 2, "color": COLOURS[0]}}
+
+        def cut(values: np.ndarray) -> list[float | None]:
+            return _numbers(np.insert(values, np.flatnonzero(breaks), np.nan), 4)
+
+        unit = self.along_unit
+        known = "by the inclinometer" if down else "up in the first keyframe's picture"
+        return [
+            {
+                "id": "plan",
+                "title": "Centreline from above",
+                "text": "Ahead as the pipe starts, and to the right of it.",
+                "data": [{**line, "x": cut(flat[:, 0]), "y": cut(flat[:, 1])}],
+                "layout": {
+                    "xaxis": _axis(f"ahead, {unit}"),
+                    "yaxis": _axis(f"right, {unit}", scaleanchor="x", autorange="reversed"),
+                },
+            },
+            {
+                "id": "height",
+                "title": "Height of the centreline",
+                "text": f"Above where the pipe starts; up is {known}.",
+                "data": [{**line, "x": cut(self.x), "y": cut(self.factor * height)}],
+                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short)},
+            },
+        ]
+
+    def charts_quality(self) -> list[Chart]:
+        """Points on the wall, residuals by angle, encoder against vision."""
+        quality = self.document["quality"]
+        bins = quality["residuals_by_angle"]
+        names = [f"{b['low_deg']:.0f}-{b['high_deg']:.0f}°" for b in bins]
+        charts: list[Chart] = [
+            {
+                "id": "angle",
+                "title": "Residuals by angle from the axis",
+                "text": f"{quality['observations']} observations, {quality['outliers']} of them outliers and left "
+                "out here. "
+                "A mean outward residual away from zero says that the profile does not fit the camera; judged at "
+                "0.15 px.",
+                "data": [
+                    {
+                        "type": "bar",
+                        "name": "rms",
+                        "x": names,
+                        "y": _numbers(b["rms_px"] for b in bins),
+                        "customdata": [b["count"] for b in bins],
+                        "hovertemplate": "%{y:.3f} px rms of %{customdata}<extra></extra>",
+                    },
+                    {
+                        "type": "scatter",
+                        "mode": "lines+markers",
+                        "name": "mean outwards",
+                        "x": names,
+                        "y": _numbers(b["mean_radial_px"] for b in bins),
+                        "hovertemplate": "%{y:+.3f} px outwards<extra></extra>",
+                    },
+                ],
+                "layout": {"xaxis": _axis("", type="category"), "yaxis": _axis("px")},
+            },
+            {
+                "id": "points",
+                "title": "Points behind each section",
+                "text": "Points within 0.375 diameters of each station. Under 20 nothing is given.",
+                "data": [
+                    {
+                        "type": "scatter",
+                        "mode": "lines",
+                        "x": _numbers(self.x),
+                        "y": _numbers(column(self.document, "inliers"), 0),
+                        "line": {"color": COLOURS[0]},
+                    }
+                ],
+                "layout": {
+                    "xaxis": self.along(),
+                    "yaxis": _axis("points", rangemode="tozero"),
+                    "shapes": self.shapes(),
+                },
+            },
+        ]
+        encoder = quality["encoder"]
+        if encoder and self.unit == "metre":
+            excess = np.array([np.nan if v is None else v for v in encoder["vision_minus_encoder"]], float)
+            along = np.array([np.nan if v is None else v for v in encoder["chainage"]], float)
+            last = excess[np.isfinite(excess)]
+            total = float(np.nanmax(along) - np.nanmin(along)) or math.nan
+            share = f" {100 * last[-1] / total:+.2f} % at the end." if len(last) else ""
+            charts.append(
+                {
+                    "id": "encoder",
+                    "title": "Camera's path against the encoder",
+                    "text": f"How much further the camera's path is than the encoder says.{share} Steps are slips "
+                    "of the wheel or "
+                    "of the tracking.",
+                    "data": [
+                        {
+                            "type": "scatter",
+                            "mode": "lines",
+                            "x": _numbers(along),
+                            "y": _numbers(1000 * excess, 2),
+                            "line": {"color": COLOURS[1]},
+                        }
+                    ],
+                    "layout": {"xaxis": _axis("chainage by the encoder, m"), "yaxis": _axis("mm")},
+                }
+            )
+        return charts
+
+    # ---- texts
+
+    def tiles(self) -> list[tuple[str, str, str]]:
+        """(figure, unit, what) of the head."""
+        s, tiles = self.summary, []
+        if not s["diameter_from_prior"]:
+            random, shared = (1000 * Z95 * s[k] for k in ("d_mean_sigma", "d_mean_systematic"))
+            tiles.append(
+                (
+                    f"{1000 * s['d_mean']:.1f}",
+                    "mm",
+                    f"mean diameter; ± {random:.1f} repeatability, ± {shared:.1f} systematic (95 %)",
+                )
+            )
+        elif self.unit == "metre":
+            tiles.append((f"{1000 * s['d_mean']:.1f}", "mm", "mean diameter, as given: not measured"))
+        digits = 1 if self.unit == "metre" else 3
+        if "d_max" in s:
+            tiles.append((f"{self.factor * s['d_min']:.{digits}f}", self.short, "narrowest anywhere"))
+            tiles.append((f"{self.factor * s['d_max']:.{digits}f}", self.short, "widest anywhere"))
+            at = length_text(s["ovality_most_at"], self.unit, metres=True)
+            mean = 100 * s["ovality_mean"]
+            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {mean:.2f} %"))
+        figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
+        tiles.append(figure)
+        return tiles
+
+    def limits_html(self) -> str:
+        """The limits, passed or failed."""
+        if not self.verdicts:
+            return "<p class='muted'>No limits were given (<code>--limit ovality=5</code>).</p>"
+        shown = [v | {"word": "FAILED" if v["state"] == "failed" else v["state"]} for v in self.verdicts]
+        rows = "".join(
+            f"<tr><th scope='row'>{html.escape(v['name'].replace('_', ' '))}</th>"
+            f"<td><span class='state {v['state'].split()[0]}'>{v['word']}</span></td>"
+            f"<td>{'at most' if LIMITS[v['name']][1] == 'most' else 'at least'} {v['bound']:g} {v['unit']}</td>"
+            f"<td>worst: {html.escape(v['worst'])}</td></tr>"
+            for v in shown
+        )
+        note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
+        return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
+
+    def accuracy_rows(self) -> list[tuple[str, str]]:
+        """Repeatability and systematic error side by side."""
+        s = self.summary
+        if s["diameter_from_prior"]:
+            why = "the scale is the given diameter" if self.unit == "metre" else "there is no scale"
+            rows = [("mean diameter", f"not measured: {why}")]
+        else:
+            rows = [
+                ("repeatability of the mean diameter", f"± {Z95 * 1000 * s['d_mean_sigma']:.2f} mm"),
+                ("repeatability of one station", f"± {Z95 * 1000 * s['station_sigma']:.2f} mm"),
+                ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
+                ("  of which scale (encoder)", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
+            ]
+        camera = s["systematic"]["camera"]
+        rows.append(
+            (
+                "  of which camera",
+                f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance",
+            )
+        )
+        if "ovality_sigma" in s:
+            rows.append(("ovality at one station", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
+        check = self.document["scale"]["check"]
+        if check:
+            word = "agrees" if check["consistent"] else "DISAGREES"
+            rows.append(
+                (
+                    "known diameter against the encoder",
+                    f"{word}: {1000 * check['given']:.1f} mm given, {1000 * check['measured']:.1f} ± "
+                    f"{Z95 * 1000 * check['sigma']:.1f} mm measured",
+                )
+            )
+        return rows
+
+    def events_html(self) -> str:
+        """The table of findings."""
+        rows = []
+        for e in self.document["events"]:
+            at = length_text(e["chainage"], self.unit, metres=True) if e["chainage"] is not None else "unknown"
+            if e.get("s_sigma") is not None:
+                at = at.replace(" ", f" ± {Z95 * e['s_sigma']:.2f} ", 1)
+            clock = clock_text(e["clock"]) if e.get("clock") is not None else ""
+            size = "; ".join(_size_parts(e, self.unit))
+            cells = (e["kind"].replace("_", " "), at, clock, size)
+            rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+        if not rows:
+            return "<p class='muted'>Nothing departs from a smooth pipe, and all of it was measured.</p>"
+        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %"))
+        table = f"<table class='list'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        return f"<div class='wide'>{table}</div>"
+
+    def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
+        """(heading, rows) of what stands at the end."""
+        d, s, camera = self.document, self.summary, self.document["camera"]
+        source = {"encoder": "encoder", "diameter": "given diameter", "none": "none"}[d["scale"]["source"]]
+        structure = d["structure"]
+        gaps = [
+            (
+                f"{g['start']:.2f} to {g['end']:.2f} {self.along_unit}" if g["start"] is not None else "unknown",
+                g["detail"],
+            )
+            for g in d["not_measured"]
+            if g["end"] is not None or g["start"] is None
+        ]
+        digits = 1 if self.unit == "metre" else 3
+        least, most = (f"{self.factor * s[k]:.{digits}f}" for k in ("d_mean_least", "d_mean_most"))
+        measured = [
+            ("keyframes with a pose", f"{s['keyframes_with_pose']} of {s['keyframes']}"),
+            ("left out: nothing had moved", str(len(structure["standing"]))),
+            ("stretches", str(s["stretches"])),
+            ("points", str(s["points"])),
+            ("observations", str(structure["observations"])),
+            ("mean diameter of the stations", f"{least} to {most} {self.short}"),
+            ("stations with diameter", f"{s['stations_measured']} of {s['stations']}"),
+            ("stations with ovality", f"{s['stations_with_ovality']} of {s['stations']}"),
+            ("residuals", f"{d['quality']['residual_rms_px']:.3f} px rms per coordinate"),
+            ("residuals over the tracker's stated noise", f"{d['quality']['residuals_over_noise']:.2f}"),
+            ("scale from", source),
+            ("clock zero", d["clock_zero"]),
+            ("nominal diameter", f"{1000 * s['nominal']:.0f} mm" if s["nominal"] else "unknown"),
+        ]
+        if d["scale"]["wheel_sigma"] is not None:
+            wheel = f"{100 * d['scale']['wheel']:+.2f} ± {100 * Z95 * d['scale']['wheel_sigma']:.2f} %"
+            measured.append(("wheel: true distance against reading", wheel))
+        calibration = [
+            ("profile", camera["name"] or "unnamed"),
+            ("serial", camera["serial"] or "-"),
+            ("model", camera["model"]),
+            ("picture", f"{camera['width']} x {camera['height']}"),
+            ("field", f"to {camera['theta_max_deg']:.1f}° from the axis"),
+            (
+                "residual of the calibration",
+                f"{camera['rms_px']:.3f} px" if camera["rms_px"] is not None else "unknown",
+            ),
+            (
+                "pupil shift",
+                f"{1000 * camera['pupil_e1']:.3g} mm per rad²" if camera["pupil_e1"] else "none in the profile",
+            ),
+            ("covariance", "yes" if camera["covariance"] else "none: its error is in no interval"),
+            ("source", camera["source"] or "-"),
+        ]
+        survey = [
+            ("survey", d["survey"]["name"] or "-"),
+            ("survey id", d["survey"]["survey_id"]),
+            ("file", Path(d["survey"]["file"]).name),
+            ("device", d["survey"]["software"] or "-"),
+            ("measured by", d["software"]),
+        ]
+        return [
+            ("Accuracy, 95 %", self.accuracy_rows()),
+            ("Measured", measured),
+            ("Stretches not measured", gaps or [("none", "all of the path was measured")]),
+            ("Calibration used", calibration),
+            ("Survey", survey),
+        ]
+
+    def render(self, title: str | None) -> str:
+        """The whole page."""
+        diameter, ovality, tube = self.chart_diameter(), self.chart_ovality(), self.chart_tube()
+        line, quality = self.charts_line(), self.charts_quality()
+        tables = dict(self.tables())
+        remarks = "".join(f"<li>{html.escape(r)}</li>" for r in self.document["remarks"])
+        values = {
+            "limits": self.limits_html(),
+            "accuracy": table_html("Accuracy, 95 %", tables.pop("Accuracy, 95 %")),
+            "remarks": f"<ul class='remarks'>{remarks}</ul>" if remarks else "<p class='muted'>None.</p>",
+            "profile": chart_html(diameter) + chart_html(ovality),
+            "events": self.events_html(),
+            "tube": chart_html(tube),
+            "line": "".join(map(chart_html, line)),
+            "quality": "".join(map(chart_html, quality)),
+            "tables": "".join(table_html(heading, rows) for heading, rows in tables.items()),
+        }
+        s = self.summary
+        name = title or self.document["survey"]["name"] or "Pipe"
+        lead = f"{length_text(s['path_length'], self.unit, metres=True)} of "
+        lead += f"DN{1000 * s['nominal']:.0f} pipe, " if s["nominal"] else "pipe, "
+        lead += f"measured from {s['keyframes_with_pose']} keyframes and {s['points']} points of its wall."
+        if self.document["status"] != "ok":
+            lead += " Parts were not measured: they are left blank and listed."
+        charts = [diameter, ovality, tube, *line, *quality]
+        return whole_page("Pipefish measurement", name, lead, fill("report.html", values), charts, self.tiles())
+
+
+def write_report(
+    folder: Path, out: Path, *, limits: list[tuple[str, float]] | None = None, title: str | None = None
+) -> list[dict[str, Any]]:
+    """Writes the page about a folder of `pipefish reconstruct`; returns the verdicts on the limits (name of LIMITS,
+    bound in per cent or millimetres). Raises PipefishError, OSError."""
+    for name, _ in limits or []:
+        if name not in LIMITS:
+            raise PipefishError(f"limit {name}: not one of {', '.join(LIMITS)}")
+    report = Report(folder, limits or [])
+    write_atomically(out, report.render(title).encode())
+    return report.verdicts

@@ -1,0 +1,573 @@
+"""The tube: from points on a pipe's wall to its axis, diameters, ovality, bends, joints and what stands in it or out.
+
+Frames: chainage s runs along the axis. `clock` angles are radians clockwise looking along increasing s, zero at twelve
+o'clock; hours = clock * 6 / pi. Lengths are metres."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipefish import _engine
+from pipefish.errors import ArgumentError
+
+SECTION = 0.75  # length of the stretch that counts as one section, diameters
+KNOT = 0.5  # spacing of the spline's knots, diameters
+STATION = 0.25  # spacing of the stations, diameters
+MIN_INLIERS = 20  # in a section, for its values to be given
+GAP_CIRCLE, GAP_NONE = math.radians(150), math.radians(220)  # azimuth without points: no ellipse, nothing
+MEASURED = ("ok", "circle_only")
+REASONS = {
+    "ok": "",
+    "too_few_points": "too few points for a tube",
+    "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
+    "one_sided": "points on one side only: neither centre nor diameter is determined",
+    "too_short": "the wall is shorter than half a radius",
+}
+
+
+@dataclass
+class Tube:
+    """A fitted tube. `status` "ok", or why there is none: then `stations` has no rows and `events` is empty.
+
+    stations: arrays with one row a station, by name:
+      s, x, y, z, tx, ty, tz   chainage, point of the axis, unit tangent
+      status                   "ok", "circle_only", "one_sided", "too_few_points"; values not measured are NaN
+      d_mean, d_area, circumference, d_max, d_min   perimeter / pi; diameter of the circle of equal area; widest and
+                               narrowest caliper width. The ellipse's part is without the noise's bias
+      clock_max                clock angle of d_max, radians, 0 to pi
+      ovality                  (d_max - d_min) / d_mean;  ovality_nominal: the same over the nominal diameter
+      ovality_astm             (d_mean - d_min) / d_mean (ASTM F1216);  ovality_astm_max: (d_max - d_mean) / d_mean
+      reduction_nominal        (d_nominal - d_min) / d_nominal (EN 13508-2 BAA, relative to nominal)
+      ovality_lo, ovality_hi   95 % interval of `ovality`; e2: unclamped debiased squared ellipse amplitude, m^2 (for
+                               averages), e2_sigma
+      <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
+      curvature, curvature_sigma, inliers, gap, rms, roughness
+    events: one dictionary a finding; see `pipefish.tube_findings`."""
+
+    status: str
+    reason: str
+    stations: dict[str, np.ndarray]
+    events: list[dict[str, Any]] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
+    nominal: float | None = None
+    clock_zero: str = ""
+    points: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # of each point: s, clock, r, distance, sigma, weight, ..
+    surface: Any = None
+    _up: np.ndarray | None = None
+
+    @property
+    def length(self) -> float:
+        """Metres along the axis; 0 without a tube."""
+        return float(self.surface.pieces[-1][1]) if self.surface is not None else 0.0
+
+    def frames(self, s: Any, piece: Any = None) -> dict[str, np.ndarray]:
+        """Of each chainage: centre, tangent, up (twelve o'clock), right (three o'clock), all (n,3); shape (n,k);
+        `zero`, the section's own angle at twelve o'clock."""
+        self._need()
+        s = np.atleast_1d(np.asarray(s, float))
+        found = self.surface.stations(s.tolist(), [-1] * len(s) if piece is None else list(piece))
+        zero = _zero_angle(found, self._up, self.surface)
+        c, n = np.cos(zero)[:, None], np.sin(zero)[:, None]
+        found["up"] = c * found["first"] + n * found["second"]
+        found["right"] = -n * found["first"] + c * found["second"]
+        found["zero"] = zero
+        return found
+
+    def radius(self, s: Any, clock: Any) -> np.ndarray:
+        """Distance of the wall from the axis at chainages s (n,) and clock angles (m,): (n,m), metres."""
+        frame = self.frames(s)
+        clock = np.atleast_1d(np.asarray(clock, float))
+        t = np.linspace(0, 2 * np.pi, 361)
+        curve = section_points(frame["shape"], t)
+        out = np.empty((len(curve), len(clock)))
+        for i, y in enumerate(curve):
+            angle = np.unwrap(np.arctan2(y[:, 1], y[:, 0]))
+            wanted = angle[0] + (clock + frame["zero"][i] - angle[0]) % (2 * np.pi)
+            out[i] = np.interp(wanted, angle, np.hypot(y[:, 0], y[:, 1]))
+        return out
+
+    def evaluate(self, s: Any, clock: Any) -> np.ndarray:
+        """Points of the wall at chainages s (n,) and clock angles (m,): (n,m,3)."""
+        frame, r = self.frames(s), self.radius(s, clock)
+        clock = np.atleast_1d(np.asarray(clock, float))
+        around = np.cos(clock)[:, None] * frame["up"][:, None] + np.sin(clock)[:, None] * frame["right"][:, None]
+        return frame["centre"][:, None] + r[..., None] * around
+
+    def project(self, points: Any) -> dict[str, np.ndarray]:
+        """Place of points (N,3): s, clock, r (from the axis), distance (from the wall, positive outside), piece
+        (-1 beyond the ends)."""
+        self._need()
+        rows = self.surface.project(np.ascontiguousarray(np.asarray(points, float).reshape(-1, 3)))
+        return self._places(rows)
+
+    def mesh(self, along: float | None = None, around: int = 72) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (n*around,3) and triangles (m,3) of the wall, a ring each `along` metres [0.1 d_mean]; pieces are
+        not joined, so that joints stay visible. Triangles face inwards."""
+        self._need()
+        clock = np.arange(around) * 2 * np.pi / around
+        vertices, faces, base = [], [], 0
+        along = along or 0.1 * self.summary["d_mean"]
+        for k, (start, end) in enumerate(self.surface.pieces):
+            rings = max(2, math.ceil((end - start) / along) + 1)
+            s = np.linspace(start, end, rings)
+            vertices.append(self._rings(s, clock, k).reshape(-1, 3))
+            i, j = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
+            a = base + (i * around + j).ravel()
+            b = base + (i * around + (j + 1) % around).ravel()
+            faces += [np.c_[a, a + around, b], np.c_[b, a + around, b + around]]
+            base += rings * around
+        return np.vstack(vertices), np.vstack(faces)
+
+    def _rings(self, s: np.ndarray, clock: np.ndarray, piece: int) -> np.ndarray:
+        frame = self.frames(s, [piece] * len(s))
+        t = np.linspace(0, 2 * np.pi, 361)
+        curve = section_points(frame["shape"], t)
+        out = np.empty((len(s), len(clock), 3))
+        for i, y in enumerate(curve):
+            angle = np.unwrap(np.arctan2(y[:, 1], y[:, 0]))
+            wanted = angle[0] + (clock + frame["zero"][i] - angle[0]) % (2 * np.pi)
+            r = np.interp(wanted, angle, np.hypot(y[:, 0], y[:, 1]))[:, None]
+            out[i] = frame["centre"][i] + r * (
+                np.cos(clock)[:, None] * frame["up"][i] + np.sin(clock)[:, None] * frame["right"][i]
+            )
+        return out
+
+    def _places(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        out = dict(zip(("s", "clock", "r", "distance", "sigma", "weight", "piece"), rows.T.copy(), strict=True))
+        on = out["piece"] >= 0
+        if on.any():
+            grid = np.linspace(0, self.length, max(2, int(self.length / (0.1 * self.summary["d_mean"])) + 1))
+            zero = np.unwrap(self.frames(grid)["zero"])
+            out["clock"][on] = (out["clock"][on] - np.interp(out["s"][on], grid, zero)) % (2 * np.pi)
+        out["piece"] = out["piece"].astype(int)
+        for name in ("s", "clock", "r", "distance", "sigma"):
+            out[name][~on] = np.nan
+        return out
+
+    def _need(self) -> None:
+        if self.surface is None:
+            raise ArgumentError(f"there is no tube: {self.reason}")
+
+
+def fit_tube(
+    points: Any,
+    sigma: Any = None,
+    path: Any = None,
+    *,
+    nominal: float | None = None,
+    up: Any = None,
+    scale_sigma: float = 0.0,
+    order: int = 0,
+    spacing: float | None = None,
+    threads: int = 2,
+    progress: Callable[[float, str], None] | None = None,
+) -> Tube:
+    """Fits a tube to points (N,3), metres, among which there may be gross ones.
+
+    sigma     their measurement noise: one number, (N,) standard deviations or (N,3,3) covariances; None: not known (the
+              roughness that is reported then holds both)
+    path      (K,3) camera centres in the order of travel; None: the pipe is looked for in the bare cloud
+    nominal   nominal diameter, for what is defined against it
+    up        (3,) direction against gravity, for twelve o'clock; None: -y of the points' frame at the start, carried
+              along without twist
+    scale_sigma   relative standard deviation of the scale of the whole cloud: the systematic part of each sigma
+    order     of the section's harmonics: 2 an ellipse, up to 6; 0: by BIC
+    spacing   of the stations, metres [a quarter of the diameter]
+    progress  is called with a fraction done and a word
+
+    Same bits for any number of threads. Raises ArgumentError for wrong shapes; a cloud that holds no tube gives a Tube
+    whose status says why."""
+    from pipefish import tube_findings
+
+    cloud, noise, centres, up_vector, used = _checked(points, sigma, path, up)
+    if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
+        raise ArgumentError(f"nominal: {nominal} is not a positive length")
+    if order not in (0, 2, 3, 4, 6):
+        raise ArgumentError(f"order: {order} is not 0, 2, 3, 4 or 6")
+    tell = progress or (lambda fraction, word: None)
+    if len(cloud) < 60:
+        return _none("too_few_points", f"{len(cloud)} finite points", nominal)
+    tell(0.0, "looking for the pipe")
+    sections = _engine.tube_trace(cloud, noise, centres if centres is not None else np.empty((0, 3)), threads)
+    sections = [c for c in sections if c["status"] in MEASURED]
+    if not sections:
+        return _none(*_why_none(cloud, noise, centres, threads), nominal)
+    nodes, rho = _reference(cloud, sections, centres)
+    if len(nodes) < 2:
+        return _none("too_short", "", nominal)
+    diameter = 2 * float(np.median(rho))
+    tell(0.4, "looking for joints")
+    coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True)
+    breaks = tube_findings.break_candidates(coarse, nodes, diameter)
+    tell(0.55, "fitting the surface")
+    surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False)
+    kept = tube_findings.confirmed(surface, diameter, breaks)
+    if len(kept) < len(breaks):
+        surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False)
+    tube = Tube("ok", "", {}, nominal=nominal, surface=surface, _up=up_vector)
+    tube.clock_zero = "against gravity" if up_vector is not None else "-y of the points' frame at the start"
+    tube.stations = _stations(tube, spacing or STATION * diameter, scale_sigma)
+    tube.summary = _summary(tube, len(cloud), used)
+    if not np.isin(tube.stations["status"], MEASURED).any():
+        worst = str(tube.stations["status"][0])
+        return _none(worst, "", nominal)
+    tube.points = _all_points(tube._places(surface.placed()), used)
+    tell(0.9, "looking for what departs from it")
+    tube.events = tube_findings.events(tube)
+    tube.summary["events"] = len(tube.events)
+    tell(1.0, "done")
+    return tube
+
+
+def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any, Any, np.ndarray]:
+    """Arrays as the engine wants them, without points that are not finite; `used`: which points are."""
+    cloud = _array(points, "points", (None, 3))
+    used = np.isfinite(cloud).all(1)
+    noise = None
+    if sigma is not None:
+        noise = np.asarray(sigma, float)
+        if noise.ndim == 0:
+            noise = np.full(len(cloud), float(noise))
+        if noise.shape not in ((len(cloud),), (len(cloud), 3, 3)):
+            raise ArgumentError(f"sigma: shape {noise.shape} is neither ({len(cloud)},) nor ({len(cloud)}, 3, 3)")
+        sound = np.isfinite(noise) if noise.ndim == 1 else np.isfinite(noise).all((1, 2))
+        if noise.ndim == 1 and (noise[sound] < 0).any():
+            raise ArgumentError("sigma: negative standard deviations")
+        used &= sound
+        noise = np.ascontiguousarray(noise[used])
+    centres = None
+    if path is not None:
+        centres = _array(path, "path", (None, 3))
+        if not np.isfinite(centres).all():
+            raise ArgumentError("path: not finite")
+        centres = _forward(centres)
+        if len(centres) < 2:
+            raise ArgumentError("path: the camera stands still; leave it out")
+    vector = None
+    if up is not None:
+        vector = _array(np.asarray(up, float).reshape(1, -1), "up", (1, 3))[0]
+        if not np.linalg.norm(vector) > 0:
+            raise ArgumentError("up: not a direction")
+        vector = vector / np.linalg.norm(vector)
+    return np.ascontiguousarray(cloud[used]), noise, centres, vector, used
+
+
+def _array(values: Any, name: str, shape: tuple[int | None, int]) -> np.ndarray:
+    try:
+        array = np.ascontiguousarray(np.asarray(values, float))
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name}: not numbers") from None
+    if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] is not None and array.shape[0] != shape[0]):
+        raise ArgumentError(f"{name}: shape {array.shape} is not ({shape[0] or 'N'}, {shape[1]})")
+    return array
+
+
+def _forward(centres: np.ndarray) -> np.ndarray:
+    """The path without standstill and driving back, smoothed and evenly spaced, so that its tangent is the pipe's."""
+    total = np.linalg.norm(np.ptp(centres, axis=0))
+    step = total / 400 if total > 0 else 0.0
+    kept = [centres[0]]
+    heading = None
+    for c in centres[1:]:
+        move = c - kept[-1]
+        length = np.linalg.norm(move)
+        if length <= max(step, 1e-9):
+            continue
+        if heading is not None and move @ heading < 0:  # backwards: wait until it passes again
+            continue
+        heading = move / length if heading is None else heading + 0.3 * (move / length - heading)
+        kept.append(c)
+    line = np.array(kept)
+    if len(line) < 3:
+        return line
+    for _ in range(3):
+        line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
+    s = np.r_[0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+    even = np.linspace(0, s[-1], max(len(line), 8))
+    return np.ascontiguousarray(np.column_stack([np.interp(even, s, line[:, k]) for k in range(3)]))
+
+
+def _why_none(cloud: np.ndarray, noise: Any, centres: Any, threads: int) -> tuple[str, str]:
+    if centres is None:
+        return str(_engine.tube_find_cylinder(cloud, noise, threads)["status"]), ""
+    middle = centres[len(centres) // 2]
+    axis = centres[-1] - centres[0]
+    away = float(np.median(np.linalg.norm(cloud - middle, axis=1)))
+    near = cloud[np.abs((cloud - middle) @ (axis / np.linalg.norm(axis))) < away]
+    found = _engine.tube_fit_cylinder(np.ascontiguousarray(near), None, middle, axis, 0.0, False, 0.35, 24)
+    status = str(found["status"])
+    return (status if status in REASONS and status not in MEASURED else "no_cylinder"), ""
+
+
+def _reference(cloud: np.ndarray, sections: list[dict[str, Any]], path: Any) -> tuple[np.ndarray, list[float]]:
+    """Nodes of the sections, from where the wall begins to where it ends."""
+    if path is None and np.linalg.norm(sections[0]["centre"]) > np.linalg.norm(sections[-1]["centre"]):
+        sections = [{**c, "axis": -c["axis"]} for c in reversed(sections)]
+    nodes = [c["centre"] for c in sections]
+    rho = [float(c["rho"]) for c in sections]
+    typical = float(np.median(rho))
+    ends = []
+    for c, sign in ((sections[0], -1.0), (sections[-1], 1.0)):
+        x = cloud - c["centre"]
+        z = x @ c["axis"]
+        r = np.linalg.norm(x - z[:, None] * c["axis"], axis=1)
+        z = sign * z[(np.abs(r - c["rho"]) < 4 * c["roughness"] + 0.02 * c["rho"]) & (np.abs(z) < 1.0 * typical)]
+        ends.append(sign * max(0.0, float(np.quantile(z, 0.995))) if len(z) else 0.0)
+    first = nodes[0] + ends[0] * sections[0]["axis"]
+    last = nodes[-1] + ends[1] * sections[-1]["axis"]
+    nodes, rho = [first, *nodes, last], [rho[0], *rho, rho[-1]]
+    keep = [0]
+    for i in range(1, len(nodes)):
+        if np.linalg.norm(nodes[i] - nodes[keep[-1]]) > 0.1 * typical:
+            keep.append(i)
+    if sum(np.linalg.norm(nodes[b] - nodes[a]) for a, b in itertools.pairwise(keep)) < 0.5 * typical:
+        return np.empty((0, 3)), []
+    return np.ascontiguousarray(np.array([nodes[i] for i in keep])), [rho[i] for i in keep]
+
+
+def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: Any) -> np.ndarray:
+    """The section's own angle at twelve o'clock, at each station."""
+    start = surface.stations([0.0], [0])
+    down = np.array([0.0, 1.0, 0.0])
+    if up is None:
+        reference = -down if abs(start["tangent"][0] @ down) < 0.9 else np.array([0.0, 0.0, -1.0])
+        angle = math.atan2(float(reference @ start["second"][0]), float(reference @ start["first"][0]))
+        return np.full(len(found["first"]), angle)
+    a, b = found["first"] @ up, found["second"] @ up
+    zero = np.arctan2(b, a)
+    upright = np.hypot(a, b) > 0.1  # steeper shafts keep the last clock
+    if not upright.all():
+        index = np.arange(len(zero))
+        zero = np.interp(index, index[upright], np.unwrap(zero[upright])) if upright.any() else np.zeros(len(zero))
+    return zero
+
+
+def section_points(shape: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The curve { M u + g n } of tube/section.hpp: shape (n,k), t (m,) -> (n,m,2)."""
+    rho, ec, es = (shape[:, k, None] for k in range(3))
+    c, s = np.cos(t), np.sin(t)
+    y = np.stack([(rho + ec) * c + es * s, es * c + (rho - ec) * s], -1)
+    if shape.shape[1] > 3:
+        n = np.stack([(rho - ec) * c - es * s, -es * c + (rho + ec) * s], -1)
+        g = sum(
+            shape[:, k, None] * np.cos(h * t) + shape[:, k + 1, None] * np.sin(h * t)
+            for h, k in zip(range(3, 9), range(3, shape.shape[1], 2), strict=False)
+        )
+        y = y + g[..., None] * n / np.linalg.norm(n, axis=-1, keepdims=True)
+    return y
+
+
+AROUND = np.arange(360) * np.pi / 180
+
+
+def _size(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Perimeter / pi, and diameter of the circle of equal area, of each section."""
+    y = section_points(shape, AROUND)
+    following = np.roll(y, -1, axis=1)
+    # A polygon of 360 corners: its perimeter is short by 1 / (24 * 57.3^2), its area by four times that.
+    chord = np.linalg.norm(following - y, axis=2).sum(1) * (1 + (np.pi / 180) ** 2 / 24)
+    area = 0.5 * np.abs((y[..., 0] * following[..., 1] - y[..., 1] * following[..., 0]).sum(1))
+    area *= 1 + (np.pi / 180) ** 2 / 6
+    return chord / np.pi, 2 * np.sqrt(area / np.pi)
+
+
+def _calipers(shape: np.ndarray) -> dict[str, np.ndarray]:
+    """Widest and narrowest caliper width of each section, their direction and the parameters where they touch."""
+    direction = np.arange(180) * np.pi / 180
+    y = section_points(shape, AROUND)
+    reach = y @ np.stack([np.cos(direction), np.sin(direction)])
+    width = reach.max(1) - reach.min(1)
+    out = {}
+    for name, at in (("max", width.argmax(1)), ("min", width.argmin(1))):
+        rows = np.arange(len(shape))
+        out[name] = width[rows, at]
+        out[name + "_direction"] = direction[at]
+        out[name + "_touch"] = np.stack([reach[rows, :, at].argmax(1), reach[rows, :, at].argmin(1)], 1)
+    return out
+
+
+def _gradients(shape: np.ndarray, calipers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Derivatives (n,k) of the diameters by the section's parameters. A caliper's touching points may be held (they
+    are where the width is stationary)."""
+    n, k = shape.shape
+    out = {name: np.zeros((n, k)) for name in ("d_mean", "d_area", "d_max", "d_min")}
+    step = 1e-4 * shape[:, :1]
+    for p in range(k):
+        up, down = shape.copy(), shape.copy()
+        up[:, p : p + 1] += step
+        down[:, p : p + 1] -= step
+        for name, a, b in zip(("d_mean", "d_area"), _size(up), _size(down), strict=True):
+            out[name][:, p] = (a - b) / (2 * step[:, 0])
+        difference = (section_points(up, AROUND) - section_points(down, AROUND)) / (2 * step[..., None])
+        rows = np.arange(n)
+        for name in ("max", "min"):
+            d = calipers[name + "_direction"]
+            touch = calipers[name + "_touch"]
+            move = difference[rows, touch[:, 0]] - difference[rows, touch[:, 1]]
+            out["d_" + name][:, p] = move[:, 0] * np.cos(d) + move[:, 1] * np.sin(d)
+    return out
+
+
+def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Central 95 % interval of |e| / sigma from its estimate, in two dimensions: both are lengths of a vector."""
+    seen = np.linspace(0, 8, 161)
+    true = np.linspace(0, 12, 481)
+    y, half = seen[:, None] ** 2 / 2, true[None, :] ** 2 / 2
+    below = np.zeros((len(seen), len(true)))  # P(estimate < seen | true)
+    poisson, tail, term = np.exp(-half), 1 - np.exp(-y), np.exp(-y)
+    for j in range(220):
+        below += poisson * tail
+        poisson = poisson * half / (j + 1)
+        term = term * y / (j + 1)
+        tail = tail - term
+    low = np.array([true[np.searchsorted(-row, -0.975)] if row[0] > 0.975 else 0.0 for row in below])
+    high = np.array([true[min(len(true) - 1, np.searchsorted(-row, -0.025))] for row in below])
+    return seen, low, high
+
+
+def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.ndarray]:
+    s, piece = [], []
+    for k, (start, end) in enumerate(tube.surface.pieces):
+        count = max(2, round((end - start) / spacing) + 1)
+        s.append(np.linspace(start, end, count))
+        piece.append(np.full(count, k))
+    s, piece = np.concatenate(s), np.concatenate(piece)
+    f = tube.frames(s, piece)
+    shape, k = f["shape"], f["shape"].shape[1]
+    full = f["covariance"].reshape(len(s), k + 2, k + 2)
+    cov = full[:, 2:, 2:]
+    out: dict[str, np.ndarray] = {"s": s, "piece": piece.astype(int)}
+    out.update(zip("xyz", f["centre"].T, strict=True))
+    out.update(zip(("tx", "ty", "tz"), f["tangent"].T, strict=True))
+    out["centre_sigma"] = np.sqrt(np.maximum(0, full[:, 0, 0] + full[:, 1, 1]))
+    # The ellipse's amplitude without the noise's share; unclamped for averages.
+    e = np.hypot(shape[:, 1], shape[:, 2])
+    unit = shape[:, 1:3] / np.maximum(e, 1e-300)[:, None]
+    e_sigma = np.sqrt(np.einsum("ni,nij,nj->n", unit, cov[:, 1:3, 1:3], unit))
+    trace = cov[:, 1, 1] + cov[:, 2, 2]
+    out["e2"] = e**2 - trace
+    out["e2_sigma"] = np.sqrt(4 * np.maximum(out["e2"], 0) * e_sigma**2 + trace**2)
+    debiased = shape.copy()
+    debiased[:, 1:3] *= (np.sqrt(np.maximum(out["e2"], 0)) / np.maximum(e, 1e-300))[:, None]
+    raw = _calipers(shape)
+    sound = _calipers(debiased)
+    gradient = _gradients(shape, raw)
+    d_mean, d_area = _size(debiased)
+    values = {"d_mean": d_mean, "d_area": d_area, "d_max": sound["max"], "d_min": sound["min"]}
+
+    def sigma_of(g: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", g, cov, g)))
+
+    for name, value in values.items():
+        out[name] = value
+        out[name + "_sigma"] = sigma_of(gradient[name])
+        out[name + "_systematic"] = scale_sigma * value
+    out["circumference"] = np.pi * d_mean
+    out["circumference_sigma"] = np.pi * out["d_mean_sigma"]
+    out["clock_max"] = (raw["max_direction"] - f["zero"]) % np.pi
+    out["clock_max_sigma"] = np.minimum(np.pi / 2, 0.5 * np.sqrt(trace / 2) / np.maximum(e, 1e-300))
+    span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"])
+    out["ovality"], out["ovality_sigma"] = span / d_mean, span_sigma / d_mean
+    out["ovality_astm"] = (d_mean - values["d_min"]) / d_mean
+    out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"]) / d_mean
+    out["ovality_astm_max"] = (values["d_max"] - d_mean) / d_mean
+    out["ovality_astm_max_sigma"] = sigma_of(gradient["d_max"] - gradient["d_mean"]) / d_mean
+    nominal = tube.nominal or math.nan
+    out["ovality_nominal"], out["ovality_nominal_sigma"] = span / nominal, span_sigma / nominal
+    out["reduction_nominal"] = (nominal - values["d_min"]) / nominal
+    out["reduction_nominal_sigma"] = out["d_min_sigma"] / nominal
+    seen, low, high = _rice_table()
+    amplitude, one = (raw["max"] - raw["min"]) / d_mean, np.maximum(span_sigma / d_mean, 1e-300)
+    inside = amplitude / one < seen[-1]
+    out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - 1.96 * one)
+    out["ovality_hi"] = np.where(inside, one * np.interp(amplitude / one, seen, high), amplitude + 1.96 * one)
+    out["oval"] = e**2 / np.maximum(trace / 2, 1e-300) > 5.99  # chi^2 of two, 95 %
+    for name in ("curvature", "curvature_sigma", "gap", "rms", "roughness"):
+        out[name] = f[name]
+    out["inliers"] = f["inliers"].astype(int)
+    out["status"] = _station_status(out, f["ellipse"] > 0)
+    _blank(out)
+    return out
+
+
+def _station_status(out: dict[str, np.ndarray], ellipse: np.ndarray) -> np.ndarray:
+    status = np.full(len(out["s"]), "ok", dtype="U16")
+    status[(out["gap"] > GAP_CIRCLE) | ~ellipse] = "circle_only"
+    status[out["gap"] > GAP_NONE] = "one_sided"
+    status[out["inliers"] < MIN_INLIERS] = "too_few_points"
+    return status
+
+
+OF_ELLIPSE = ("d_max", "d_min", "ovality", "clock_max", "reduction", "e2")
+OF_SIZE = ("d_mean", "d_area", "circumference")
+
+
+def _blank(out: dict[str, np.ndarray]) -> None:
+    """NaN for what was not measured: nothing is invented."""
+    for name in out:
+        if name.startswith(OF_ELLIPSE):
+            out[name] = np.where(out["status"] == "ok", out[name], np.nan)
+        elif name.startswith(OF_SIZE):
+            out[name] = np.where(np.isin(out["status"], MEASURED), out[name], np.nan)
+    out["oval"] = out["oval"] & (out["status"] == "ok")
+
+
+def _summary(tube: Tube, count: int, used: np.ndarray) -> dict[str, Any]:
+    t = tube.stations
+    good = np.isfinite(t["d_mean"])
+    out: dict[str, Any] = {
+        "length": tube.length,
+        "points": len(used),
+        "points_not_finite": int((~used).sum()),
+        "order": tube.surface.order,
+        "correlation": tube.surface.correlation,
+        "converged": bool(tube.surface.converged),
+        "stations": len(t["s"]),
+        "measured": int(good.sum()),
+        "pieces": len(tube.surface.pieces),
+    }
+    if not good.any():
+        out["d_mean"] = float(2 * np.median(tube.frames(t["s"])["shape"][:, 0]))
+        return out
+    weight = 1 / t["d_mean_sigma"][good] ** 2
+    out["d_mean"] = float(np.average(t["d_mean"][good], weights=weight))
+    # Stations within a knot's support tell the same: count one a diameter.
+    independent = max(1.0, good.sum() * tube.length / len(t["s"]) / out["d_mean"])
+    out["d_mean_sigma"] = float(np.sqrt(1 / weight.mean() / min(independent, good.sum())))
+    out["d_mean_spread"] = float(np.std(t["d_mean"][good]))
+    oval = np.isfinite(t["e2"])
+    if oval.any():
+        e2 = float(np.average(t["e2"][oval], weights=1 / t["e2_sigma"][oval] ** 2))
+        out["ovality"] = (
+            4 * math.sqrt(max(0.0, e2)) / out["d_mean"]
+            if tube.surface.order == 2
+            else float(np.mean(t["ovality"][oval]))
+        )
+        out["d_max"] = float(np.max(t["d_max"][oval]))
+        out["d_min"] = float(np.min(t["d_min"][oval]))
+    out["roughness"] = float(np.median(t["roughness"]))
+    return out
+
+
+def _all_points(places: dict[str, np.ndarray], used: np.ndarray) -> dict[str, np.ndarray]:
+    """Rows for the points that were not finite too."""
+    out = {}
+    for name, values in places.items():
+        full = np.full(len(used), -1 if name == "piece" else 0.0 if name == "weight" else np.nan, dtype=values.dtype)
+        full[used] = values
+        out[name] = full
+    out["known"] = used
+    return out
+
+
+def _none(status: str, detail: str, nominal: float | None) -> Tube:
+    reason = REASONS.get(status, status) + (f": {detail}" if detail else "")
+    return Tube(status, reason, {"s": np.empty(0)}, nominal=nominal)

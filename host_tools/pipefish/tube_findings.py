@@ -1,0 +1,392 @@
+"""What departs from the smooth tube: joints, bends, deposits, holes, laterals.
+
+An event is a dictionary: kind ("joint", "bend", "deposit", "hole", "lateral", "recess"), s (chainage, m), s_sigma, and
+  joint    step (m, across), step_sigma, clock (of the step), diameter_step, angle (rad), gap (m or None), gap_sigma
+  bend     start, end, angle (rad), angle_sigma, radius (m), clock (towards which it turns)
+  others   clock, length (along), width (around, m), height (m; how far in or out), height_sigma, points, area (m^2)
+
+False alarms: each test is set so that a clean pipe, rough or with scattered gross points, gives less than one event in
+a hundred fits (FALSE_ALARMS), whatever its length; tests/python/test_tube_findings.py counts them."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pipefish.tube import Tube
+
+FALSE_ALARMS = 0.01  # of one fit
+GROSS = 4.0  # standard deviations
+
+
+def chi2_limit(p: float, freedom: int) -> float:
+    """Where a chi-squared of so many degrees is exceeded with probability p (Wilson and Hilferty)."""
+    z = NormalDist().inv_cdf(1 - p)
+    return freedom * (1 - 2 / (9 * freedom) + z * math.sqrt(2 / (9 * freedom))) ** 3
+
+
+def break_candidates(coarse: Any, nodes: np.ndarray, diameter: float) -> list[float]:
+    """Abscissae along the nodes' polyline where the wall before and after do not meet."""
+    length = coarse.pieces[-1][1]
+    if length < 2 * diameter:
+        return []
+    rows = coarse.steps(diameter, 0.05 * diameter, 0.5 * diameter)
+    if not len(rows):
+        return []
+    # A window is one diameter each way; places a quarter of it apart are almost independent.
+    limit = max(16.0, chi2_limit(FALSE_ALARMS * 0.25 * diameter / length, 7) * coarse.correlation)
+    s, chi2 = rows[:, 0], rows[:, 1].copy()
+    found = []
+    while chi2.max() > limit:
+        k = int(chi2.argmax())
+        found.append(float(s[k]))
+        chi2[np.abs(s - s[k]) < 0.8 * diameter] = 0
+    placed = coarse.placed()
+    found = [_localised(placed, at, diameter) for at in found]
+    total = np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum()
+    scale = total / length  # the smooth axis is a little shorter than the polyline of its nodes
+    return sorted(f * scale for f in found if 0.5 * diameter < f < length - 0.5 * diameter)
+
+
+def _localised(placed: np.ndarray, at: float, diameter: float) -> float:
+    """Where near `at` two smooth walls, one before and one after, leave the least residual."""
+    s, angle, distance, sigma, weight = placed[:, 0], placed[:, 1], placed[:, 3], placed[:, 4], placed[:, 5]
+    near = (placed[:, 6] >= 0) & (weight > 0) & (np.abs(s - at) < 1.2 * diameter)
+    t = (s[near] - at) / diameter
+    c, n, c2, n2 = (f(k * angle[near]) for k in (1, 2) for f in (np.cos, np.sin))
+    one = np.ones_like(t)
+    rows = np.stack([c, n, one, c2, n2, t * c, t * n, t * t * c, t * t * n, t, t * c2, t * n2], 1)
+    root = np.sqrt(weight[near]) / sigma[near]
+    rows, values = rows * root[:, None], distance[near] * root
+    # Normal equations, summed from one try to the next; a hair of ridge for stretches that do not fix all terms.
+    tries = np.arange(-0.6, 0.601, 0.02)
+    bins = np.searchsorted(tries, t, side="right")
+    parts = [bins == i for i in range(len(tries) + 1)]
+    normal = np.cumsum([rows[k].T @ rows[k] for k in parts], axis=0)
+    right = np.cumsum([rows[k].T @ values[k] for k in parts], axis=0)
+    count = np.cumsum([k.sum() for k in parts])
+    ridge = 1e-9 * np.trace(normal[-1]) * np.eye(rows.shape[1])
+    cost = np.full(len(tries), np.inf)
+    for i in range(len(tries)):
+        if min(count[i], count[-1] - count[i]) >= 2 * rows.shape[1]:
+            sides = ((normal[i], right[i]), (normal[-1] - normal[i], right[-1] - right[i]))
+            cost[i] = -sum(float(r @ np.linalg.solve(n + ridge, r)) for n, r in sides)
+    return at + float(tries[int(cost.argmin())]) * diameter if np.isfinite(cost).any() else at
+
+
+def _ends(surface: Any, k: int) -> tuple[dict[str, np.ndarray], float]:
+    """The two sides of the joint after piece k: stations (2 rows) and its chainage."""
+    s = surface.pieces[k][1]
+    return surface.stations([s, s], [k, k + 1]), s
+
+
+def _joint_test(surface: Any, k: int) -> dict[str, Any]:
+    f, s = _ends(surface, k)
+    size = f["shape"].shape[1] + 2
+    cov = f["covariance"].reshape(2, size, size).sum(0)
+    turn = f["tangent_covariance"].reshape(2, 2, 2).sum(0)
+    axes = np.stack([f["first"][0], f["second"][0]])
+    across = axes @ (f["centre"][1] - f["centre"][0])
+    bend = axes @ (f["tangent"][1] - f["tangent"][0])
+    grow = f["shape"][1, 0] - f["shape"][0, 0]
+    chi2 = float(
+        across @ np.linalg.solve(cov[:2, :2], across) + grow**2 / cov[2, 2] + bend @ np.linalg.solve(turn, bend)
+    )
+    step, angle = float(np.hypot(*across)), float(np.hypot(*bend))
+    return {
+        "s": float(s),
+        "chi2": chi2,
+        "across": across,
+        "step": step,
+        "step_sigma": float(np.sqrt(max(0.0, np.trace(cov[:2, :2]) / 2))),
+        "diameter_step": 2 * float(grow),
+        "diameter_step_sigma": 2 * float(np.sqrt(cov[2, 2])),
+        "angle": angle,
+        "angle_sigma": float(np.sqrt(max(0.0, np.trace(turn) / 2))),
+    }
+
+
+def confirmed(surface: Any, diameter: float, breaks: list[float]) -> list[float]:
+    """The breaks whose two sides really differ in the final fit."""
+    length = surface.pieces[-1][1]
+    limit = max(16.0, chi2_limit(FALSE_ALARMS * 0.25 * diameter / length, 5))
+    return [b for k, b in enumerate(breaks) if _joint_test(surface, k)["chi2"] > limit]
+
+
+def events(tube: Tube) -> list[dict[str, Any]]:
+    """All findings, along the pipe."""
+    rings = _rings(tube)
+    found = _joints(tube, rings) + _bends(tube) + _patches(tube, rings)
+    return sorted(found, key=lambda e: e["s"])
+
+
+def _alike(tube: Tube) -> int:
+    """So many neighbouring points tell the same."""
+    return max(1, round(tube.surface.correlation * tube.surface.thinning))
+
+
+def _rings(tube: Tube) -> list[dict[str, Any]]:
+    """Narrow rings of points outside the wall, all around: the gap of a joint, seen from inside."""
+    p, d = tube.points, tube.summary["d_mean"]
+    out = (p["piece"] >= 0) & (p["distance"] > np.maximum(GROSS * p["sigma"], 0.005 * d)) & (p["distance"] < 0.25 * d)
+    s, sextant = p["s"][out], (p["clock"][out] / (np.pi / 3)).astype(int) % 6
+    # Where neighbours tell the same, only one of so many counts.
+    order = np.argsort(s)[:: _alike(tube)]
+    s, sextant = s[order], sextant[order]
+    if len(s) < 4:
+        return []
+    rate, found = len(s) / tube.length, []
+    for width in (0.02 * d, 0.05 * d, 0.1 * d, 0.2 * d):
+        last = np.searchsorted(s, s + width, side="right")
+        limit = _poisson_limit(rate * width, FALSE_ALARMS * width / tube.length / 4)
+        for i in np.flatnonzero(last - np.arange(len(s)) >= limit):
+            inside = slice(i, last[i])
+            if len(set(sextant[inside])) >= 4:
+                found.append((float((last[i] - i) / width), i, int(last[i])))
+    found.sort(key=lambda f: -f[0])
+    rings: list[dict[str, Any]] = []
+    for density, first, after in found:
+        # Grown to the last point that follows as closely as the ring's own do.
+        reach = min(5 / density, 1 / (3 * rate)) if rate < density / 15 else 3 / density
+        while first > 0 and s[first] - s[first - 1] < reach:
+            first -= 1
+        while after < len(s) and s[after] - s[after - 1] < reach:
+            after += 1
+        n, a, b = after - first, float(s[first]), float(s[after - 1])
+        if all(b < r["from"] - 0.1 * d or a > r["to"] + 0.1 * d for r in rings):
+            # Ends of n points spread evenly: each misses the edge by (width / (n + 1)) on average.
+            gap = (b - a) * (n + 1) / max(1, n - 1)
+            sigma = gap * math.sqrt(2.0) / (n + 1)
+            rings.append({"s": (a + b) / 2, "from": a, "to": b, "gap": gap, "gap_sigma": sigma, "points": n})
+    return rings
+
+
+def _poisson_limit(mean: float, p: float) -> int:
+    """Fewest events that chance brings with a probability below p, at least 4."""
+    n, term, total = 0, math.exp(-min(mean, 700.0)), 0.0
+    while n < 100000:
+        total += term
+        n += 1
+        term *= mean / n
+        if 1 - total < p:
+            break
+    return max(4, n)
+
+
+def _joints(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    d, found, free = tube.summary["d_mean"], [], list(rings)
+    for k in range(len(tube.surface.pieces) - 1):
+        test = _joint_test(tube.surface, k)
+        f = tube.frames([test["s"]], [k])
+        shift = test["across"] @ np.stack([f["first"][0], f["second"][0]])
+        near = [r for r in free if abs(r["s"] - test["s"]) < 0.3 * d]
+        event: dict[str, Any] = {
+            "kind": "joint",
+            "s": test["s"],
+            "s_sigma": 0.05 * d,
+            "clock": float(math.atan2(shift @ f["right"][0], shift @ f["up"][0]) % (2 * math.pi)),
+            **{n: v for n, v in test.items() if n not in ("s", "across")},
+            "gap": None,
+            "gap_sigma": None,
+        }
+        if near:
+            ring = min(near, key=lambda r: abs(r["s"] - test["s"]))
+            free.remove(ring)
+            event.update(s=ring["s"], s_sigma=ring["gap"] / math.sqrt(12), gap=ring["gap"], gap_sigma=ring["gap_sigma"])
+        found.append(event)
+    for ring in free:
+        found.append(
+            {
+                "kind": "joint",
+                "s": ring["s"],
+                "s_sigma": max(ring["gap"] / math.sqrt(12), 1e-4),
+                "gap": ring["gap"],
+                "gap_sigma": ring["gap_sigma"],
+                "step": None,
+                "step_sigma": None,
+                "diameter_step": None,
+                "angle": None,
+                "angle_sigma": None,
+                "clock": None,
+                "points": ring["points"],
+            }
+        )
+    return found
+
+
+def _bends(tube: Tube) -> list[dict[str, Any]]:
+    """Stretches whose curvature is more than 3 sigma and that turn by more than 2 degrees."""
+    d, found = tube.summary["d_mean"], []
+    for k, (start, end) in enumerate(tube.surface.pieces):
+        s = np.linspace(start, end, max(3, int((end - start) / (0.05 * d)) + 1))
+        f = tube.frames(s, [k] * len(s))
+        curvature = f["curvature"]
+        bent = curvature > 3 * f["curvature_sigma"]
+        edges = np.flatnonzero(np.diff(np.r_[0, bent, 0]))
+        runs: list[list[int]] = []
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            if runs and s[a] - s[runs[-1][1] - 1] < 0.5 * d:
+                runs[-1][1] = int(b)
+            else:
+                runs.append([int(a), int(b)])
+        for a, b in runs:
+            # The smooth axis enters a bend over about a knot: the angle is taken outside it, the length at half height.
+            out_a, out_b = np.searchsorted(s, s[a] - 0.5 * d), min(len(s) - 1, np.searchsorted(s, s[b - 1] + 0.5 * d))
+            t0, t1 = f["tangent"][out_a], f["tangent"][out_b]
+            angle = math.atan2(float(np.linalg.norm(np.cross(t0, t1))), float(t0 @ t1))
+            if angle < math.radians(2):
+                continue
+            turn = f["tangent_covariance"].reshape(-1, 2, 2)
+            sigma = math.sqrt(max(0.0, (np.trace(turn[out_a]) + np.trace(turn[out_b])) / 2))
+            half = (
+                np.flatnonzero(curvature[a:b] > 0.5 * np.median(np.sort(curvature[a:b])[-max(3, (b - a) // 2) :])) + a
+            )
+            length = float(s[half[-1]] - s[half[0]])
+            middle = int((half[0] + half[-1]) // 2)
+            toward = (t1 - t0) - ((t1 - t0) @ f["tangent"][middle]) * f["tangent"][middle]
+            found.append(
+                {
+                    "kind": "bend",
+                    "s": float(0.5 * (s[half[0]] + s[half[-1]])),
+                    "s_sigma": 0.25 * d,
+                    "start": float(s[half[0]]),
+                    "end": float(s[half[-1]]),
+                    "angle": angle,
+                    "angle_sigma": sigma,
+                    "radius": length / angle if length > 0 else None,
+                    "clock": float(math.atan2(toward @ f["right"][middle], toward @ f["up"][middle]) % (2 * math.pi)),
+                }
+            )
+    return found
+
+
+def _majority(share: float, k: int) -> float:
+    """Chance that more than half of k points stand out, each with probability `share`."""
+    need = (k + 1) // 2
+    return sum(math.comb(k, j) * share**j * (1 - share) ** (k - j) for j in range(need, k + 1))
+
+
+def _limit(z: np.ndarray, k: int, tests: int) -> float:
+    """Standard deviations that a median of k reaches by chance in less than FALSE_ALARMS of fits, on this side: the
+    points' own distribution says how often one of them does."""
+    ordered = np.sort(z)
+    for limit in np.arange(0.5, 8.0, 0.1):
+        share = 1 - np.searchsorted(ordered, limit) / len(z)
+        if tests * _majority(share, k) < FALSE_ALARMS / 4:
+            return float(limit)
+    return 8.0
+
+
+def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Patches of wall whose points stand in or out together."""
+    p, d = tube.points, tube.summary["d_mean"]
+    every = _alike(tube)
+    rows = np.flatnonzero(p["piece"] >= 0)
+    tests = len(rows) // every
+    if tests < 60:
+        return []
+    z = p["distance"][rows] / p["sigma"][rows]
+    radius = 0.5 * d
+    worst = max((z > 3).mean(), (z < -3).mean())
+    k = next((k for k in range(9, 62, 2) if tests * _majority(float(worst), k) < FALSE_ALARMS / 4), 61)
+    spacing = math.sqrt(d * tube.length * k / tests)
+    # `used` are the points that the surface knows: the finite ones.
+    median = np.full(len(p["s"]), np.nan)
+    median[p["known"]] = tube.surface.medians(radius, k, every, 2.5 * spacing, 1.0 * d)
+    rows = rows[np.isfinite(median[rows])]
+    if len(rows) < 60:
+        return []
+    value = median[rows]
+    centre = float(np.median(value))
+    scale = float(1.4826 * np.median(np.abs(value - centre)))
+    gauss = -NormalDist().inv_cdf(FALSE_ALARMS / 4 / max(1.0, tests / k)) * scale
+    out = []
+    for sign in (-1, 1):
+        limit = np.maximum(gauss, _limit(sign * z, k, tests) * p["sigma"][rows])
+        flagged = rows[sign * (value - centre) > limit]
+        for seed in _clusters(p, flagged, radius, spacing):
+            cluster = _grown(p, seed, sign, radius, spacing, float(np.abs(median[seed]).max()))
+            if len(cluster) >= 4:
+                event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
+                ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
+                if not (sign > 0 and ringed and event["length"] < 0.3 * d):
+                    out.append(event)
+    return out
+
+
+def _clusters(p: dict[str, np.ndarray], rows: np.ndarray, radius: float, link: float) -> list[np.ndarray]:
+    """Points that hang together on the unrolled wall, no further apart than `link`."""
+    if not len(rows):
+        return []
+    around = max(1, int(2 * np.pi * radius / link))
+    i = np.floor(p["s"][rows] / link).astype(int)
+    j = np.minimum(around - 1, (p["clock"][rows] / (2 * np.pi) * around).astype(int))
+    cells: dict[tuple[int, int], list[int]] = {}
+    for row, a, b in zip(rows.tolist(), i.tolist(), j.tolist(), strict=True):
+        cells.setdefault((a, b), []).append(row)
+    out, left = [], set(cells)
+    while left:
+        stack, members = [left.pop()], []
+        while stack:
+            a, b = stack.pop()
+            members += cells[a, b]
+            for near in ((a + x, (b + y) % around) for x in (-1, 0, 1) for y in (-1, 0, 1)):
+                if near in left:
+                    left.remove(near)
+                    stack.append(near)
+        out.append(np.array(sorted(members)))
+    return sorted(out, key=lambda c: int(c[0]))
+
+
+def _grown(
+    p: dict[str, np.ndarray], cluster: np.ndarray, sign: int, radius: float, link: float, height: float
+) -> np.ndarray:
+    """The cluster with the points around it that stand out to the same side."""
+    away = sign * p["distance"]
+    standing = np.flatnonzero((p["piece"] >= 0) & (away > 2.5 * p["sigma"]) & (away < 1.5 * height + 3 * p["sigma"]))
+    near = standing[
+        (p["s"][standing] > p["s"][cluster].min() - link) & (p["s"][standing] < p["s"][cluster].max() + link)
+    ]
+    s, clock = p["s"][cluster], p["clock"][cluster]
+    keep = []
+    for row in near.tolist():
+        around = (p["clock"][row] - clock + np.pi) % (2 * np.pi) - np.pi
+        if (np.hypot(p["s"][row] - s, around * radius) < link).any():
+            keep.append(row)
+    return np.array(keep, dtype=int)
+
+
+def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any]:
+    p, d = tube.points, tube.summary["d_mean"]
+    s, value = p["s"][cluster], np.abs(p["distance"][cluster])
+    weight = np.full(len(cluster), 1 / len(cluster))
+    clock = float(np.angle(np.exp(1j * p["clock"][cluster]).mean()) % (2 * np.pi))
+    off = (p["clock"][cluster] - clock + np.pi) % (2 * np.pi) - np.pi
+    n = len(cluster)
+    # The outermost of n points miss the rim of a patch by about its size over n.
+    length = float(np.ptp(s)) * (n + 1) / (n - 1)
+    width = float(np.ptp(off)) * 0.5 * d * (n + 1) / (n - 1)
+    height = float(np.quantile(value, 0.9))
+    kind = "deposit"
+    if sign > 0:
+        kind = "recess"
+        if height > 0.03 * d:
+            kind = "lateral" if height > 0.12 * d and min(length, width) > 0.15 * d else "hole"
+    return {
+        "kind": kind,
+        "s": float(s @ weight),
+        "s_sigma": float(max(spacing, length / math.sqrt(12)) / math.sqrt(n)),
+        "clock": clock,
+        "clock_sigma": float(max(spacing, width / math.sqrt(12)) / math.sqrt(n) / (0.5 * d)),
+        "length": length,
+        "width": width,
+        "size_sigma": float(max(length, width) * math.sqrt(2) / (n + 1) + spacing / 2),
+        "height": height,
+        "height_sigma": float(np.median(p["sigma"][cluster]) / math.sqrt(max(1.0, 0.2 * n))),
+        "area": length * width * math.pi / 4,
+        "points": n,
+    }

@@ -1,0 +1,369 @@
+"""`pipefish calibrate`: from corner files and pictures to a profile, what it says, its report, and its refusals."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import calib_scenes as scenes
+import pipefish as pf
+from device import Device
+from pipefish import cli
+from pipefish import pipefish_pb2 as pb
+from pipefish.calib_input import load_target, load_views, natural
+from pipefish.calib_live import Guide
+from pipefish.calib_run import circle_around
+from pipefish.calib_verdict import verdict
+from synthetic import SURVEY, Object, as_object, end, keyframe, start
+from test_page import Outline, data_of
+
+TARGET = pf.Target("checkerboard", 9, 12, 0.03)
+LENS = scenes.Lens("equidistant", 1280, 960, 380.0, (640.0, 470.0), 1.0, (0.005, -0.001), math.radians(95))
+
+
+def simulated(count: int = 14, noise: float = 0.1, seed: int = 4, lens: scenes.Lens = LENS, points=None):
+    random = np.random.default_rng(seed)
+    return scenes.views_of(random, lens, count, noise, points=TARGET.points() if points is None else points)[0]
+
+
+def write_csv(path, views, prefix="v"):
+    """view,x,y,z,u,v of numerical views."""
+    lines = ["view,x,y,z,u,v"]
+    for i, view in enumerate(views):
+        for (x, y, z), (u, v) in zip(view.board_xyz, view.pixels, strict=True):
+            lines.append(f"{prefix}{i},{x!r},{y!r},{z!r},{u!r},{v!r}".replace("np.float64(", "").replace(")", ""))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture
+def target(tmp_path):
+    TARGET.save(tmp_path / "board.json")
+    return tmp_path / "board.json"
+
+
+@pytest.fixture
+def corners(tmp_path):
+    return write_csv(tmp_path / "corners.csv", simulated())
+
+
+def run(*arguments) -> int:
+    return cli.main(["calibrate", *map(str, arguments)])
+
+
+def test_corner_files_give_a_profile_with_all_that_is_known_about_it(tmp_path, target, corners, capsys):
+    out = tmp_path / "camera.json"
+    assert run(corners, "--target", target, "--size", "1280x960", "-o", out, "--model", "p9", "--serial", "A7") == 0
+    text = capsys.readouterr().out
+    assert "Usable for DN" in text and f"pipefish flash DEVICE {out}" in text and "held-out" in text
+    camera = pf.Camera.load(out)
+    assert camera.serial == "A7" and camera.source == "target" and camera.covariance is not None
+    assert camera.provenance.views == 14 and camera.provenance.held_out_views == 14
+    assert camera.rms_px == pytest.approx(0.1 * math.sqrt(2), rel=0.08)
+    assert camera.rms_px < camera.held_out_rms_px < 1.1 * camera.rms_px
+    assert abs(camera.f_u - 380) < 0.5 and abs(camera.c_v - 470) < 0.5
+
+
+def test_json_tells_everything_and_nothing_else(tmp_path, target, corners, capsys):
+    assert run(corners, "--size", "1280x960", "-o", tmp_path / "c.json", "--model", "p6", "--json") == 0
+    document = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert document["files"] == {"camera": str(tmp_path / "c.json")}
+    assert len(document["camera_from_board"]) == 14 and document["verdicts"]["camera"]["pipes"][0]["dn_mm"] == 100
+    assert document["report"]["points"] == len(document["report"]["residuals"]["pixel"])
+
+
+def test_point_numbers_mean_rows_of_the_target(tmp_path, target):
+    path = tmp_path / "a.csv"
+    path.write_text("# by hand\nview,point,u,v\nfirst, 0 ,10,20\nfirst,87,30,40\nfirst,5,1,2\nfirst,6,1,3\n")
+    (view,) = load_views({"c": [path]}, [load_target(target)], (100, 100)).views
+    np.testing.assert_array_equal(view.board_xyz, TARGET.points()[[0, 87, 5, 6]])
+    np.testing.assert_array_equal(view.pixels, [[10, 20], [30, 40], [1, 2], [1, 3]])
+
+
+def test_mrcal_corners_leave_out_what_was_not_found(tmp_path, target):
+    rows = [f"x/img1.png {i} {2 * i} {'-' if i == 3 else -1 if i == 4 else 0}" for i in range(88)]
+    path = tmp_path / "corners.vnl"
+    path.write_text("## generated\n# filename x y level\n" + "\n".join([*rows, "x/img2.png - - -"]) + "\n")
+    (view,) = load_views({"c": [path]}, [load_target(target)], (100, 200)).views
+    assert view.name == "img1.png" and len(view.pixels) == 86
+    np.testing.assert_array_equal(view.board_xyz[3], TARGET.points()[5])
+    path.write_text("\n".join(rows[:80]))
+    with pytest.raises(pf.FormatError, match=r"img1.png: 80 corners, the target has 88"):
+        load_views({"c": [path]}, [load_target(target)], (100, 200))
+
+
+def test_lists_of_babelcalib_are_in_centimetres(tmp_path):
+    (tmp_path / "b.dsc").write_text("0,2,2,7.5\nt25h7,2.0\n-1,0,0,0.75,16.5,0\n-1,0,1,1.5,16.5,0\n")
+    (tmp_path / "p.orpc").write_text("filename: p.png\nwidth: 64\nheight: 48\nnum_corners: 4\n" + "0,1,1,7.5,8\n" * 4)
+    given = load_views({"c": [tmp_path / "p.orpc"]}, [load_target(tmp_path / "b.dsc")])
+    assert given.sizes == [(64, 48)]
+    np.testing.assert_allclose(given.views[0].board_xyz[0], [0.015, 0.165, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("view,point,u\na,1,2\n", "line 1: columns view, point, u: must be"),
+        ("view,point,u,v\na,88,2,3\n", "line 2: point: '88' is not a whole number below 88"),
+        ("view,x,y,z,u,v\na,0,0,nan,2,3\n", "line 2: z: 'nan' is no number"),
+        ("view,point,u,v\na,1,2\n", "line 2: 3 cells, the header has 4"),
+    ],
+)
+def test_a_bad_corner_file_names_line_and_column(tmp_path, target, capsys, text, reason):
+    (tmp_path / "bad.csv").write_text(text)
+    assert run(tmp_path / "bad.csv", "--target", target, "--size", "100x100", "-o", tmp_path / "c.json") == 1
+    error = capsys.readouterr().err
+    assert reason in error and "bad.csv" in error and error.count("\n") == 1
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_refusals_say_what_is_wrong_with_the_views(tmp_path, target, capsys):
+    def refused(views, *more):
+        path = write_csv(tmp_path / "x.csv", views)
+        assert run(path, "--size", "1280x960", "-o", tmp_path / "c.json", "--model", "p9", *more) == 1
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        return error
+
+    views = simulated(8)
+    assert "2 views are too few" in refused(views[:2])
+    one = [pf.View(views[0].board_xyz, views[0].pixels + 0.01 * i) for i in range(5)]
+    assert "pose" in refused(one)
+    assert "lie outside the image" in refused([pf.View(v.board_xyz, v.pixels + np.array([900, 0])) for v in views])
+    narrow = scenes.Lens("perspective", 1280, 960, 900.0, (640.0, 480.0), 1.0, (0.0, 0.0), math.radians(35))
+    assert "two cameras" in refused([*simulated(12), *simulated(12, lens=narrow, seed=2)])
+    assert "two cameras" in refused([*simulated(8), *simulated(8, lens=narrow, seed=9)])  # the common lens fits neither
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_wrong_usage_is_told_before_anything_is_read(tmp_path, target, capsys):
+    for arguments, reason in (
+        ([], "give either VIEWS"),
+        (["a/", "--device", "tcp://x:1"], "give either VIEWS"),
+        (["a/"], "--target FILE is needed"),
+        (["--camera", "one=a/", "--target", target], "at least two cameras"),
+        (["a/", "--target", target, "--report", "r.pdf"], "must end in .html"),
+        (["a/", "--target", target, "--recording", "r.mcap"], "--recording is for --device"),
+    ):
+        assert run(*arguments, "-o", tmp_path / "c.json") == 2
+        assert reason in capsys.readouterr().err
+    assert run("a.csv", "--target", target) == 2
+
+
+def test_two_cameras_of_a_rig_get_a_profile_each_and_their_place(tmp_path, target, capsys):
+    """The right camera is 20 cm to the right, turned 5 degrees: both see the same boards."""
+    random = np.random.default_rng(3)
+    right = np.column_stack([scenes.turn(np.array([0, math.radians(5), 0])), [-0.2, 0.01, 0.03]])
+    left, other = [], []
+    while len(left) < 12:
+        pose = scenes.random_pose(random, TARGET.points(), LENS)
+        x = TARGET.points() @ pose[:, :3].T + pose[:, 3]
+        a, seen_a = LENS.project(x)
+        b, seen_b = LENS.project(x @ right[:, :3].T + right[:, 3])
+        if min(seen_a.sum(), seen_b.sum()) < 40:
+            continue
+        for into, pixels, seen in ((left, a, seen_a), (other, b, seen_b)):
+            into.append(pf.View(TARGET.points()[seen], pixels[seen] + random.normal(0, 0.1, (seen.sum(), 2))))
+    for name, views in (("left", left), ("right", other)):
+        (tmp_path / name).mkdir()
+        write_csv(tmp_path / name / "corners.csv", views)
+    folders = [f"--camera={n}={tmp_path / n}" for n in ("left", "right")]
+    out = tmp_path / "rig"
+    assert run(*folders, "--target", target, "--size", "1280x960", "-o", out, "--model", "p9") == 0
+    rig = json.loads((out / "rig.json").read_text())
+    assert [c["name"] for c in rig["cameras"]] == ["left", "right"] and pf.Camera.load(out / "right.json").rms_px < 0.2
+    np.testing.assert_allclose(rig["cameras"][1]["translation_m"], right[:, 3], atol=1e-3)
+    half = math.radians(2.5)
+    np.testing.assert_allclose(rig["cameras"][1]["quaternion_wxyz"], [math.cos(half), 0, math.sin(half), 0], atol=1e-3)
+
+
+def test_the_verdict_follows_the_bounds_and_says_why():
+    pipes = [{"dn_mm": 100, "sigma_mm": 0.5}, {"dn_mm": 300, "sigma_mm": 0.4}, {"dn_mm": 500, "sigma_mm": math.nan}]
+    camera = {
+        "camera": 0,
+        "pipes": pipes,
+        "coverage": {"share_covered": 0.4, "advice": "next view: there"},
+        "uncertainty": {"distance_m": 1.0},
+        "halves": {"ratio": 1.5},
+    }
+    views = [{"used": True, "camera": 0, "points": 100}, {"used": False, "camera": 0, "points": 0}]
+    report = {"cameras": [camera], "views": views, "rms_px": 0.2}
+    found = verdict(report, 0.3, math.radians(50))
+    assert found["usable"] and (found["dn_from"], found["dn_to"]) == (300, 300)
+    assert found["systematic_mm"] == pytest.approx(1.96 * 0.4 * 1.5)
+    said = " ".join(found["cautions"])
+    for words in ("fit worse", "50 degrees off the axis only", "only 40 % of the picture", "stood 1 m away", "1 of 2"):
+        assert words in said
+    camera["pipes"] = [{"dn_mm": 300, "sigma_mm": 2.0}]
+    worse = verdict(report, 0.2, math.radians(90))
+    assert not worse["usable"] and "Not usable" in worse["text"] and "DN 300" in worse["text"]
+    camera["pipes"] = pipes
+    mixed = verdict(report | {"rms_px": 4.6}, 4.7, math.radians(90), bend=0.03)
+    assert not mixed["usable"] and "of one camera" in mixed["text"] and "bends by 3.0 %" in " ".join(mixed["cautions"])
+
+
+def test_files_are_taken_in_natural_order():
+    assert sorted(["img10.png", "img2.png", "img1.png", "a.png"], key=natural) == [
+        "a.png",
+        "img1.png",
+        "img2.png",
+        "img10.png",
+    ]
+
+
+# ---------------------------------------------------------------------- pictures and the report
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """A folder of simulated pictures of a board, one of them without it; the target; the simulator's focal length."""
+    folder = tmp_path_factory.mktemp("shots")
+    board = pf.Target("checkerboard", 6, 9, 0.03)
+    views, truth = pf.simulate_target_views(
+        board, {"preset": "fisheye-185", "width": 480, "height": 360}, 9, samples=34, seed=6, clutter=False
+    )
+    for i, view in enumerate(views):
+        Image.fromarray(view.image).save(folder / f"shot{i}.png")
+    Image.fromarray(np.full((360, 480), 90, dtype=np.uint8)).save(folder / "shot20.png")
+    board.save(folder.parent / "small.json")
+    return folder, folder.parent / "small.json", truth
+
+
+@pytest.fixture(scope="module")
+def made(pictures, tmp_path_factory):
+    """What --json says of them, the profile and the page."""
+    folder, target, _ = pictures
+    here = tmp_path_factory.mktemp("made")
+    arguments = [folder, "--target", target, "-o", here / "c.json", "--report", here / "r.html", "--model", "p9"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert run(*arguments, "--name", "<Lens & Co>", "--json") == 0
+    return json.loads(said.getvalue()), here / "c.json", here / "r.html"
+
+
+def test_pictures_become_a_profile(pictures, made):
+    document, profile, _ = made
+    assert [p["status"] for p in document["pictures"]].count("none") == 1 and document["pictures"][-1]["reason"]
+    table = pictures[2]["lens"]
+    focal = table["radius_px"][1] / table["theta"][1]
+    assert pf.Camera.load(profile).f_u == pytest.approx(focal, rel=0.01)
+    assert document["rms_px"] < 0.3
+
+
+def test_the_report_stands_alone_and_shows_what_was_left_out(made):
+    text = made[2].read_text(encoding="utf-8")
+    outline = Outline(text)
+    assert not outline.open and all(a.startswith("data:") for a in outline.addresses)
+    assert ["plot-" + c["id"] for c in data_of(text)["charts"]] == outline.charts and len(outline.charts) == 6
+    assert "&lt;Lens &amp; Co&gt;" in text and "<Lens" not in text
+    assert re.search(r"<img [^>]*left out[^>]*><figcaption>shot20.png: ", text)
+    straight = [float(x) for x in re.findall(r"straight within ([0-9.]+) px", text)]
+    assert len(straight) == 2 and max(straight) < 0.5
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium to draw the page")
+def test_the_report_draws_in_a_browser(made):
+    browser = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000", "--dump-dom"]
+    command = [*browser, f"file://{made[2]}"]
+    drawn = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    charts = data_of(made[2].read_text(encoding="utf-8"))["charts"]
+    for chart in charts:
+        part = drawn.split(f'id="plot-{chart["id"]}"')[1].split("</figure>")[0]
+        assert 'class="main-svg"' in part and re.search(r'<path [^>]*d="M|<image [^>]*href="data', part), chart["id"]
+
+
+def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+
+    def refused(source, description=target):
+        assert run(source, "--target", description, "-o", tmp_path / "c.json") == 1
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        return error
+
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for i in range(3):
+        shutil.copy(folder / f"shot{i}.png", mixed)
+    pf.Target("checkerboard", 12, 14, 0.03).save(tmp_path / "other.json")
+    assert "found in 0 of 3 pictures" in refused(mixed, tmp_path / "other.json")
+    Image.fromarray(np.zeros((300, 400), dtype=np.uint8)).save(mixed / "shot0b.png")
+    error = refused(mixed)
+    assert "shot0b.png: 400 x 300 pixels, the first picture has 480 x 360" in error and "two cameras" in error
+    (mixed / "shot0b.png").write_bytes(b"no picture")
+    assert "shot0b.png: not a picture" in refused(mixed)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "no pictures" in refused(empty)
+
+
+def test_points_of_the_target_lie_inside_the_image_circle():
+    v, u = np.mgrid[:480, :640]
+    lit = np.where(np.hypot(u - 325.3, v - 236.8) < 225.4, 160, 6).astype(np.uint8)
+    views = [pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 30.8]])]
+    np.testing.assert_allclose(circle_around(lit, views), [325.3, 236.8, 225.4], atol=1.0)
+    views.append(pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 10.8]]))
+    assert circle_around(lit, views)[2] == pytest.approx(228, abs=1)
+    assert circle_around(np.full((480, 640), 90, dtype=np.uint8), views) is None
+
+
+# ---------------------------------------------------------------------- from a device
+
+
+def device_objects(folder) -> list[Object]:
+    """A survey whose keyframes are the pictures of a folder, the first one twice."""
+    objects = [start()]
+    files = sorted(folder.iterdir(), key=lambda p: natural(p.name))
+    files = [files[0], *files]
+    for i, path in enumerate(files):
+        message = pb.Keyframe.FromString(keyframe(i)[2])
+        out = io.BytesIO()
+        Image.open(path).save(out, "JPEG", quality=92)
+        message.jpeg, message.width, message.height = out.getvalue(), 480, 360
+        objects.append(as_object(2, message))
+    return [*objects, end(len(files))]
+
+
+def test_a_device_is_calibrated_from_its_keyframes_and_they_are_kept(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    out = tmp_path / "c.json"
+    with Device(device_objects(folder), SURVEY) as device:
+        arguments = ["--device", device.address, "--target", target, "-o", out, "--model", "p9"]
+        assert run(*arguments) == 0
+    text = capsys.readouterr()
+    assert f"pipefish flash {device.address} {out}" in text.out
+    lines = text.err.splitlines()
+    assert "keyframe 0: view 1, " in lines[0] and "next: " in lines[0]
+    assert lines[1] == "keyframe 1: as in a view before; move the target"
+    assert any(line.startswith("keyframe 10: ") and "view" not in line for line in lines)  # the one without a target
+    assert pf.Camera.load(out).provenance.views == 9
+    survey = pf.Survey.open(out.with_suffix(".mcap"))
+    assert survey.complete and len(survey.keyframes) == 11
+    assert not device.spool
+    assert run(*arguments) == 2 and "calibrate from it" in capsys.readouterr().err
+
+
+def test_a_device_that_shows_no_target_is_told_so(tmp_path, target, capsys):
+    with Device([start(), keyframe(0), keyframe(1), end(2)], SURVEY) as device:
+        assert run("--device", device.address, "--target", target, "-o", tmp_path / "c.json") == 1
+    assert "0 views with the target came from the device (the survey ended)" in capsys.readouterr().err
+
+
+def test_guidance_points_where_nothing_was_seen(target):
+    guide = Guide([load_target(target)], (800, 500))
+    x, y = np.meshgrid(np.linspace(5, 795, 40), np.linspace(5, 495, 40))
+    seen = np.stack([x, y], axis=-1).reshape(-1, 2)
+    seen = seen[~((seen[:, 0] > 700) & (seen[:, 1] > 400))]
+    guide.views = [pf.View(np.random.default_rng(1).normal(size=(len(seen), 3)), seen)]
+    guide.names = ["a"]
+    guide._think()
+    assert guide.advice == "next: bottom right of the picture, tilted" and guide.seen == pytest.approx(39 / 40)
+    assert guide.map_text().splitlines()[-1].endswith("  ")

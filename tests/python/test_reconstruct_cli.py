@@ -1,0 +1,349 @@
+"""From a survey file to a measured pipe, its files and its report; no pictures are rendered.
+
+Proves that what is written is what was measured, that scale is what it says it is, that bad input gets a clear answer.
+How exact the structure and the tube are is the subject of test_reconstruct.py and test_tube.py."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipefish as pf
+from pipefish import pipefish_pb2 as pb
+from pipefish.cli import main
+from pipefish.cloudfile import read_columns, read_points
+from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
+from synthetic import BOOT, SURVEY, as_object, picture, write_survey
+from test_page import Outline, data_of
+from tube_tracks import Drive, tube_drive
+
+COUNT = 0.0005  # metres of the encoder
+LENGTH = 2.0
+
+
+def survey_of(
+    drive: Drive,
+    path: Path,
+    *,
+    keep: np.ndarray | None = None,
+    encoder: bool = True,
+    attitude: bool = False,
+    profile: pf.Camera | None = None,
+    gain: float = 1.0,
+    frames: np.ndarray | None = None,
+    nominal: float = 0.3,
+) -> Path:
+    """A survey file of a drive. keep: (observations,) bool; gain: of the encoder; frames: which, in the order given."""
+    order = np.arange(len(drive.poses)) if frames is None else frames
+    camera, jpeg = drive.camera, picture(16, 16, 0)
+    begin = pb.SurveyStart(survey_id=SURVEY, name="made-up pipe", software="test", width=camera.width)
+    begin.height, begin.nominal_diameter_m = camera.height, nominal
+    begin.time.boot_id, begin.profile = BOOT, (profile or camera).to_binary()
+    if encoder:
+        begin.encoder.metres_per_count, begin.encoder.metres_per_count_sigma = COUNT, 0.001 * COUNT
+    objects = [as_object(OBJECT_START, begin)]
+    tracks, random = drive.tracks, np.random.default_rng(3)
+    keep = np.ones(len(tracks.frame), bool) if keep is None else keep
+    steps = np.abs(np.diff(drive.driven[order], prepend=drive.driven[order[0]]))
+    driven = np.cumsum(steps + random.normal(0, 0.0005, len(order)) * (np.arange(len(order)) > 0))
+    for index, frame in enumerate(order):
+        message = pb.Keyframe(survey_id=SURVEY, index=index, frame_sequence=5 * index, cause=2, after_break=index == 0)
+        message.width, message.height, message.jpeg = camera.width, camera.height, jpeg
+        message.time.boot_id, message.time.monotonic_ns = BOOT, 10**9 + index * 2 * 10**8
+        if encoder:
+            message.telemetry.encoder_count = round(gain * driven[index] / COUNT)
+        if attitude:
+            down = drive.poses[frame, :, :3] @ np.array([0.0, 1.0, 0.0])
+            message.telemetry.roll_rad, message.telemetry.pitch_rad = np.arctan2(down[0], down[1]), -np.arcsin(down[2])
+            message.telemetry.attitude_sigma_rad = 0.003
+        here = np.flatnonzero((tracks.frame == frame) & keep)
+        here = here[np.argsort(tracks.track[here])]
+        ids, obs = tracks.track[here] + 1, message.observations
+        obs.id_delta.extend(np.diff(ids, prepend=0).tolist())
+        xy = np.round(tracks.pixels[here] * 65536).astype(int)
+        obs.x_q16.extend(xy[:, 0].tolist())
+        obs.y_q16.extend(xy[:, 1].tolist())
+        for name, value in (("cov_xx_q20", 94372), ("cov_xy_q20", 0), ("cov_yy_q20", 94372)):  # 0.3 px
+            getattr(obs, name).extend([value] * len(ids))
+        obs.age.extend([5] * len(ids))
+        obs.quality.extend([32000] * len(ids))
+        obs.status.extend([2] * len(ids))
+        objects.append(as_object(OBJECT_KEYFRAME, message))
+    finish = pb.SurveyEnd(survey_id=SURVEY, keyframes=len(order), frames=5 * len(order), boots=1, reason="done")
+    write_survey(path, objects=[*objects, as_object(OBJECT_END, finish)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    """2 m of DN300, 3 % oval, the long axis upright."""
+    return tube_drive(21, LENGTH)
+
+
+@pytest.fixture(scope="module")
+def out(drive: Drive, tmp_path_factory) -> Path:
+    """The files of a survey with encoder and inclinometer."""
+    folder = tmp_path_factory.mktemp("measured")
+    survey = survey_of(drive, folder / "survey.mcap", attitude=True)
+    assert main(["reconstruct", str(survey), "-o", str(folder / "out"), "--json"]) == 0
+    return folder / "out"
+
+
+def document_of(out: Path) -> dict:
+    return json.loads((out / "reconstruction.json").read_text())
+
+
+def failure(capsys, *arguments: object) -> str:
+    """The line of a command that must fail with exit code 1."""
+    capsys.readouterr()
+    assert main([str(a) for a in arguments]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_diameter_is_the_truth_within_what_is_stated(out):
+    s = document_of(out)["summary"]
+    sigma = np.hypot(s["d_mean_sigma"], s["d_mean_systematic"])
+    # Perimeter / pi of an ellipse of 0.3 (1 +- 0.015): above 0.3 by a quarter of 0.015^2.
+    assert s["d_mean"] == pytest.approx(0.3 * (1 + 0.015**2 / 4), abs=3 * sigma) and sigma < 0.0012
+    assert s["unit"] == "metre" and not s["diameter_from_prior"]
+    assert s["ovality_mean"] == pytest.approx(0.03, abs=0.0015)
+
+
+def test_tables_say_the_same_as_the_document(out):
+    document, profile = document_of(out), rows_of(out / "profile.csv")
+    for name in ("chainage", "d_mean", "ovality", "d_mean_sigma"):
+        written = [float(r[name]) if r[name] else None for r in profile]
+        assert written == pytest.approx(document["stations"][name], rel=1e-6, nan_ok=True)
+    line = rows_of(out / "centreline.csv")
+    assert [r["x"] for r in line] == [r["x"] for r in profile] and "curvature" in line[0]
+    assert len(rows_of(out / "events.csv")) == len(document["events"])
+    assert set(document["files"]) == {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+
+
+def test_chainage_is_the_encoders(drive, out):
+    """Where the axis passes a camera, its chainage is that camera's reading."""
+    document = document_of(out)
+    centres, along = np.array(document["poses"]["centre"]), np.array(document["poses"]["chainage"])
+    stations = document["stations"]
+    axis = np.stack([stations[k] for k in "xyz"], -1)
+    inner = along[(along > 0.3) & (along < LENGTH - 0.3)]
+    nearest = [np.argmin(np.linalg.norm(axis - centres[along == a], axis=1)) for a in inner]
+    assert np.array(stations["chainage"])[nearest] == pytest.approx(inner, abs=0.08)  # stations are 75 mm apart
+
+
+def test_clock_of_the_long_axis_is_upright_by_gravity(out):
+    document = document_of(out)
+    assert document["clock_zero"] == "against gravity"
+    clock = np.array([c for c in document["stations"]["clock_max"] if c is not None])
+    assert np.abs((clock + np.pi / 2) % np.pi - np.pi / 2).max() < 0.2
+
+
+def test_clouds_have_points_on_the_wall_and_a_closed_skin(out):
+    points, sigma = read_points(out / "points.ply")
+    columns = read_columns(out / "points.ply")
+    assert len(points) == document_of(out)["summary"]["points"] and (sigma > 0).all()
+    on = np.isfinite(columns["distance"])
+    assert on.mean() > 0.9 and np.median(np.abs(columns["distance"][on])) < 0.002
+    wall = read_columns(out / "tube.ply")
+    assert len(wall["x"]) % 72 == 0 and set(wall["piece"]) == {0}
+    assert np.abs(wall["deviation"]).max() == pytest.approx(0.3 * 0.015, rel=0.5)
+
+
+def test_the_colmap_model_reprojects_with_its_own_pixel_origin(drive, out):
+    """Its fisheye model, written out here from COLMAP's documentation, puts every point where it was observed."""
+    head = (out / "colmap" / "cameras.txt").read_text().splitlines()[-1].split()
+    assert head[1] == "OPENCV_FISHEYE"
+    fx, fy, cx, cy, *k = map(float, head[4:])
+    assert (cx, cy) == (drive.camera.c_u + 0.5, drive.camera.c_v + 0.5)
+    world = {}
+    for line in (out / "colmap" / "points3D.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            words = line.split()
+            world[int(words[0])] = (np.array(words[1:4], float), np.array(words[8:], int).reshape(-1, 2))
+    images = [t for t in (out / "colmap" / "images.txt").read_text().splitlines() if not t.startswith("#")]
+    errors, seen = [], {}
+    for pose, row in zip(images[::2], images[1::2], strict=True):
+        number, qw, qx, qy, qz, *t = (float(v) for v in pose.split()[:8])
+        v, w = np.array([qx, qy, qz]), qw
+        observed = np.array(row.split(), float).reshape(-1, 3)
+        seen[int(number)] = observed
+        observed = observed[observed[:, 2] >= 0]
+        x = np.array([world[int(p)][0] for p in observed[:, 2]])
+        x = x + 2 * np.cross(v, np.cross(v, x) + w * x) + t
+        theta = np.arctan2(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
+        r = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+        phi = np.arctan2(x[:, 1], x[:, 0])
+        errors.append(observed[:, :2] - np.stack([fx * r * np.cos(phi) + cx, fy * r * np.sin(phi) + cy], -1))
+    errors = np.vstack(errors)
+    assert np.sqrt((errors**2).mean()) < 0.4 and np.abs(errors.mean(axis=0)).max() < 0.02
+    for number, (_, track) in world.items():
+        assert all(seen[i][j, 2] == number for i, j in track)
+
+
+def test_without_scale_everything_is_relative_and_says_so(drive, tmp_path, capsys):
+    survey = survey_of(drive, tmp_path / "a.mcap", encoder=False)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert "no scale" in text and "mm" not in re.sub(r"note.*|written.*", "", text)
+    s = document_of(tmp_path / "out")["summary"]
+    assert s["unit"] == "diameter" and s["d_mean"] == pytest.approx(1, abs=0.01)
+    assert s["ovality_mean"] == pytest.approx(0.03, abs=0.0015)
+    assert s["path_length"] == pytest.approx(drive.driven[-1] / 0.3, rel=0.02)
+
+
+def test_a_known_diameter_is_a_scale_and_then_not_measured(drive, tmp_path):
+    survey = survey_of(drive, tmp_path / "a.mcap", encoder=False)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--diameter", "300", "--json"]) == 0
+    document = document_of(tmp_path / "out")
+    assert document["summary"]["diameter_from_prior"] and document["summary"]["unit"] == "metre"
+    assert document["summary"]["path_length"] == pytest.approx(drive.driven[-1], rel=0.02)
+    assert any("not measured" in r for r in document["remarks"])
+
+
+def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged(drive, tmp_path):
+    survey = survey_of(drive, tmp_path / "a.mcap", gain=1.05)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--diameter", "300", "--json"]) == 0
+    document = document_of(tmp_path / "out")
+    check = document["scale"]["check"]
+    assert not check["consistent"] and check["deviation"] > 3
+    assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
+    assert "sigma apart" in " ".join(document["remarks"])
+
+
+def test_a_stretch_without_texture_is_left_blank_and_the_rest_is_measured(tmp_path):
+    drive = tube_drive(14, 4.0)
+    bare = (drive.tracks.frame >= 35) & (drive.tracks.frame <= 45)
+    keep = ~bare | (np.random.default_rng(0).uniform(size=len(bare)) < 0.05)
+    survey = survey_of(drive, tmp_path / "a.mcap", keep=keep)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = document_of(tmp_path / "out")
+    assert document["status"] == "partial" and document["summary"]["stretches"] == 2
+    gap = next(g for g in document["not_measured"] if g["reason"] == "weak_texture")
+    assert gap["start"] > 1.4 and gap["end"] < 2.6
+    assert any(e["kind"] == "not_measured" for e in document["events"])
+    assert not [e for e in document["events"] if e["kind"] != "not_measured"], "a gap is no finding"
+    first, second = (np.array(document["stations"]["stretch"]) == k for k in (0, 1))
+    chainage = np.array(document["stations"]["chainage"])
+    assert chainage[second].max() == pytest.approx(4.4, abs=0.3)
+    assert chainage[second].min() > chainage[first].max() - 0.6
+
+
+def test_a_survey_driven_backwards_is_measured_and_says_so(drive, tmp_path):
+    backwards = np.arange(len(drive.poses))[::-1]
+    survey = survey_of(drive, tmp_path / "a.mcap", frames=backwards)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = document_of(tmp_path / "out")
+    assert document["structure"]["backwards"] and any("backwards" in r for r in document["remarks"])
+    assert document["summary"]["d_mean"] == pytest.approx(0.3, rel=0.01)
+    assert document["tubes"][0]["chainage_sign"] == -1
+
+
+def test_surveys_that_cannot_be_measured_say_why_in_one_line(drive, tmp_path, capsys):
+    black = survey_of(drive, tmp_path / "black.mcap", keep=np.zeros(len(drive.tracks.frame), bool))
+    assert "no keyframe has tracks: a black or covered picture?" in failure(
+        capsys, "reconstruct", black, "-o", tmp_path
+    )
+    two = survey_of(drive, tmp_path / "two.mcap", frames=np.arange(2))
+    assert "2 keyframes; three are the least" in failure(capsys, "reconstruct", two, "-o", tmp_path)
+    three = survey_of(drive, tmp_path / "three.mcap", frames=np.arange(3))
+    code = main(["reconstruct", str(three), "-o", str(tmp_path / "three"), "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert (code == 1 and "no pipe around them" in answer["error"]["message"]) or (code == 0 and answer["summary"])
+    still = survey_of(drive, tmp_path / "still.mcap", frames=np.zeros(8, int))
+    assert "moves" in failure(capsys, "reconstruct", still, "-o", tmp_path)
+    small = dataclasses.replace(drive.camera, width=640, height=480, c_u=320.0, c_v=240.0)
+    wrong = survey_of(drive, tmp_path / "wrong.mcap", profile=small)
+    assert "a wrong profile?" in failure(capsys, "reconstruct", wrong, "-o", tmp_path)
+    assert not list(tmp_path.glob("*.csv"))
+
+
+def test_a_profile_that_does_not_fit_is_refused_or_warned_of(drive, tmp_path, capsys):
+    bent = dataclasses.replace(drive.camera, f_u=360.0, f_v=360.0, k2=-0.08, theta_max=1.5)
+    survey = survey_of(drive, tmp_path / "a.mcap", profile=bent)
+    code = main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    words = answer["error"]["message"] if code else " ".join(answer["remarks"])
+    assert "profile" in words
+
+
+# ---------------------------------------------------------------- the report
+
+
+def test_the_report_stands_alone_and_its_scene_has_geometry(out, tmp_path, capsys):
+    page = tmp_path / "report.html"
+    limits = ("ovality=5", "ovality_astm=0.5", "d_min=295.5")
+    arguments = [x for limit in limits for x in ("--limit", limit)]
+    assert main(["report", str(out), "-o", str(page), *arguments, "--json"]) == 0
+    verdicts = {v["name"]: v["state"] for v in json.loads(capsys.readouterr().out)["limits"]}
+    assert verdicts["ovality"] == "passed" and verdicts["ovality_astm"] == "failed"
+    text = page.read_text()
+    outline = Outline(text)
+    assert not outline.open and all(a.startswith("data:") for a in outline.addresses)
+    charts = {c["id"]: c for c in data_of(text)["charts"]}
+    assert {"plot-" + name for name in charts} == set(outline.charts)
+    mesh = charts["tube"]["data"][0]
+    assert mesh["type"] == "mesh3d" and len(mesh["i"]) > 500 and max(mesh["k"]) < len(mesh["x"])
+    z = np.array([mesh["x"], mesh["y"], mesh["z"]])
+    assert np.ptp(z, axis=1).max() > LENGTH and len(charts["tube"]["data"][1]["x"]) > 500
+    menu = [b["label"] for b in charts["ovality"]["layout"]["updatemenus"][0]["buttons"]]
+    assert any("F1216" in m for m in menu) and any("13508" in m for m in menu) and len(menu) == 5
+
+
+def test_the_report_renders_in_a_browser(out, tmp_path):
+    """Plotly draws every chart, the 3-D scene among them, without an error of the script."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium")
+    page = tmp_path / "report.html"
+    assert main(["report", str(out), "-o", str(page), "--json"]) == 0
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
+    command += ["--enable-unsafe-swiftshader", "--virtual-time-budget=15000", "--window-size=1280,2000", "--dump-dom"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+    assert done.stdout.count("js-plotly-plot") >= len(data_of(page.read_text())["charts"])
+    assert "gl-container" in done.stdout and "<canvas" in done.stdout
+    assert 'class="no-webgl' not in done.stdout
+
+
+def test_limits_hold_the_interval_against_the_bound(out):
+    from pipefish.report import read_measured, verdict
+
+    document = read_measured(out)
+    worst = max(v for v in document["stations"]["d_max"] if v is not None) * 1000
+    assert verdict(document, "d_max", worst + 20)["state"] == "passed"
+    assert verdict(document, "d_max", worst - 20)["state"] == "failed"
+    assert verdict(document, "d_max", worst)["state"] == "undecided"
+
+
+def test_texts_of_the_survey_cannot_break_the_report(out, tmp_path):
+    nasty = "</script><script>alert(1)</script><b>'\"&"
+    copy = shutil.copytree(out, tmp_path / "copy")
+    document = document_of(copy)
+    document["survey"]["name"] = document["camera"]["name"] = nasty
+    document["remarks"].append(nasty)
+    (copy / "reconstruction.json").write_text(json.dumps(document))
+    assert main(["report", str(copy), "-o", str(tmp_path / "r.html"), "--json"]) == 0
+    text = (tmp_path / "r.html").read_text()
+    assert "<script>alert" not in text and not Outline(text).open
+
+
+def test_a_folder_that_is_none_is_named(tmp_path, capsys):
+    assert "reconstruction.json" in failure(capsys, "report", tmp_path, "-o", tmp_path / "r.html")
+    (tmp_path / "reconstruction.json").write_text("{}")
+    assert "pipefish reconstruct" in failure(capsys, "report", tmp_path, "-o", tmp_path / "r.html")
+    assert main(["report", str(tmp_path), "-o", "r.html", "--limit", "beauty=3"]) == 2

@@ -1,0 +1,272 @@
+"""The tube as a whole: simulated pipes of all sizes within their intervals, real clouds, files, command."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipefish as pf
+from pipe_cloud import Pipe
+from pipefish.cli import main
+from pipefish.cloudfile import ply_bytes, read_points
+
+
+def turned(seed: int) -> np.ndarray:
+    """Any rotation."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.diag(r)) * np.linalg.det(q)
+
+
+@pytest.mark.parametrize(
+    "pipe",
+    [
+        Pipe(diameter=0.1, length=1.5, noise=0.0005, ovality=0.02, seed=1),
+        Pipe(outliers=0.3, ovality=0.03, seed=2),
+        Pipe(diameter=0.4, length=5, noise=0.002, bend=(2, math.radians(30), 1.2), seed=3, tilt=turned(3)),
+        Pipe(diameter=1.0, length=8, noise=0.005, outliers=0.1, ovality=0.01, seed=4),
+        Pipe(diameter=0.6, noise=0.003, cover=math.radians(250), seed=5),
+    ],
+    ids=["DN100", "DN300 30 % gross", "DN400 bend", "DN1000", "DN600 one-sided"],
+)
+@pytest.mark.parametrize("with_path", [False, True], ids=["bare", "path"])
+def test_sizes_shapes_and_gross_points_are_within_their_intervals(pipe: Pipe, with_path: bool) -> None:
+    tube = pf.fit_tube(pipe.points(2000), pipe.noise, pipe.cameras() if with_path else None, nominal=pipe.diameter)
+    t = tube.stations
+    assert tube.status == "ok" and (t["status"] == "ok").mean() > 0.9
+    s = np.linspace(0, pipe.length, 5)
+    clock = np.linspace(0, 2 * np.pi, 720)
+    r = pipe.radius(s[:1], clock)
+    mean = 2 * r.mean()
+    assert np.abs(t["d_mean"] / mean - 1).max() < 0.005
+    assert (np.abs(t["d_mean"] - mean) < 1.96 * t["d_mean_sigma"]).mean() > 0.7
+    assert (np.abs(t["d_mean"] - mean) < 4.5 * t["d_mean_sigma"]).all()
+    assert ((t["ovality_lo"] <= pipe.ovality + 1e-3) & (pipe.ovality - 1e-3 <= t["ovality_hi"])).mean() > 0.7
+    assert abs(tube.length - pipe.length) < 0.02 * pipe.diameter + 0.01 * pipe.length
+    assert not [e for e in tube.events if e["kind"] != "bend"]
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    inside, oval, z = [], [], []
+    for seed in range(18):
+        pipe = Pipe(ovality=0.01 * (seed % 3), outliers=0.1, seed=seed)
+        t = pf.fit_tube(pipe.points(900), pipe.noise, pipe.cameras()).stations
+        some = np.arange(2, len(t["s"]) - 2, 6)  # at 1.5 diameters
+        z += ((t["d_mean"] - 0.3) / t["d_mean_sigma"])[some].tolist()
+        inside += (np.abs(t["d_mean"] - 0.3) < 1.96 * t["d_mean_sigma"])[some].tolist()
+        oval += ((t["ovality_lo"] <= pipe.ovality) & (pipe.ovality <= t["ovality_hi"]))[some].tolist()
+    assert 0.90 <= np.mean(inside) <= 0.985
+    assert 0.90 <= np.mean(oval) <= 0.995  # of circles the lower end is zero more often than not
+    assert 0.85 <= np.std(z) <= 1.15
+
+
+def test_an_ovality_that_grows_is_followed() -> None:
+    pipe = Pipe(ovality=0.0, ovality_end=0.05, length=4, noise=0.001, seed=6)
+    t = pf.fit_tube(pipe.points(3000), pipe.noise, pipe.cameras(), nominal=0.3).stations
+    truth = 0.05 * t["s"] / pipe.length
+    some = t["s"] > 0.8
+    assert np.abs(t["ovality"] - truth)[some].max() < 0.003
+    assert (np.abs(t["ovality"] - truth) < 3 * t["ovality_sigma"])[some].mean() > 0.9
+    assert np.abs((t["clock_max"] - pipe.clock_max + np.pi / 2) % np.pi - np.pi / 2)[some].max() < 0.1
+    assert t["ovality_astm"][some] == pytest.approx(truth[some] / 2, abs=0.002)
+    assert t["reduction_nominal"][some] == pytest.approx(truth[some] / 2, abs=0.003)
+
+
+def test_eggs_get_the_harmonics_they_need_and_ellipses_none() -> None:
+    egg = Pipe(diameter=0.6, egg=0.05, ovality=0.2, noise=0.003, seed=7)
+    tube = pf.fit_tube(egg.points(4000), egg.noise, egg.cameras())
+    assert tube.surface.order >= 3
+    clock = np.linspace(0, 2 * np.pi, 73)
+    got, want = tube.radius([1.5], clock)[0], egg.radius(np.full(73, 1.5), clock)
+    assert np.abs(got - want).max() < 0.004  # 1.3 % of the radius, whose third harmonic is 15 mm
+    plain = Pipe(ovality=0.03, seed=7)
+    assert pf.fit_tube(plain.points(2000), plain.noise).surface.order == 2
+
+
+def test_full_covariances_count_along_the_wall_s_normal() -> None:
+    pipe = Pipe(noise=0.0, roughness=0.001, seed=8)
+    points = pipe.points(1500)
+    rng = np.random.default_rng(8)
+    points[:, 2] += rng.normal(0, 0.01, len(points))  # along the axis: tells nothing of the wall
+    sigma = np.tile(np.diag([0.0, 0.0, 1e-4]), (len(points), 1, 1))
+    tube = pf.fit_tube(points, sigma, pipe.cameras())
+    assert tube.summary["roughness"] == pytest.approx(0.001, rel=0.15)
+
+
+def test_projecting_and_evaluating_are_inverse() -> None:
+    pipe = Pipe(length=4, bend=(1.5, 0.5, 0.9), ovality=0.03, seed=9)
+    tube = pf.fit_tube(pipe.points(2500), pipe.noise, pipe.cameras())
+    s, clock = np.array([0.5, 1.7, 3.2]), np.array([0.2, 2.0, 4.4])
+    back = tube.project(tube.evaluate(s, clock).reshape(-1, 3))
+    assert np.abs(back["distance"]).max() < 1e-4
+    assert np.abs(back["s"].reshape(3, 3) - s[:, None]).max() < 1e-4
+    assert np.abs(back["clock"].reshape(3, 3) - clock).max() < 1e-4
+
+
+def test_up_turns_the_clock() -> None:
+    pipe = Pipe(ovality=0.05, seed=10)
+    t = pf.fit_tube(
+        pipe.points(1500), pipe.noise, pipe.cameras(), up=(1, 0, 0)
+    ).stations  # three o'clock becomes twelve
+    off = (t["clock_max"] - (pipe.clock_max - np.pi / 2) + np.pi / 2) % np.pi - np.pi / 2
+    assert np.abs(off).max() < 0.1
+
+
+def test_the_same_bits_for_any_number_of_threads() -> None:
+    points = Pipe(outliers=0.2, seed=11).points(1500)
+    one, four = (pf.fit_tube(points, 0.0015, threads=n).stations for n in (1, 4))
+    for name, values in one.items():
+        assert np.array_equal(values, four[name], equal_nan=values.dtype.kind == "f"), name
+
+
+def test_scale_goes_into_the_systematic_sigma() -> None:
+    t = pf.fit_tube(Pipe(seed=12).points(1200), 0.0015, scale_sigma=0.002).stations
+    assert t["d_mean_systematic"] == pytest.approx(0.002 * t["d_mean"])
+
+
+def test_half_a_pipe_gives_diameters_but_no_ovality() -> None:
+    tube = pf.fit_tube(Pipe(cover=math.pi, seed=13).points(1200), 0.0015)
+    t = tube.stations
+    assert (t["status"] == "circle_only").all() and np.isnan(t["ovality"]).all() and np.isnan(t["d_max"]).all()
+    assert (np.abs(t["d_mean"] - 0.3) < 4 * t["d_mean_sigma"]).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "status"),
+    [
+        (np.zeros((0, 3)), "too_few_points"),
+        (np.full((500, 3), np.nan), "too_few_points"),
+        (np.zeros((500, 3)), "no_cylinder"),
+        (np.random.default_rng(0).normal(size=(1500, 3)), "no_cylinder"),
+        (Pipe(cover=1.9).points(1200), "one_sided"),
+    ],
+    ids=["none", "not finite", "one place", "a cloud", "a strip"],
+)
+def test_what_is_no_pipe_is_an_answer(points: np.ndarray, status: str) -> None:
+    tube = pf.fit_tube(points)
+    assert tube.status == status and tube.reason and len(tube.stations["s"]) == 0 and not tube.events
+
+
+def test_a_stretch_without_points_is_a_gap_not_a_guess() -> None:
+    pipe = Pipe(length=4, seed=14)
+    points = pipe.points(2000)
+    points = points[(points[:, 2] < 1.5) | (points[:, 2] > 2.3)]
+    t = pf.fit_tube(points, pipe.noise, pipe.cameras()).stations
+    hole = (t["s"] > 1.7) & (t["s"] < 2.1)
+    assert (t["status"][hole] == "too_few_points").all() and np.isnan(t["d_mean"][hole]).all()
+    assert np.isfinite(t["d_mean"][(t["s"] < 1.3) | (t["s"] > 2.5)]).all()
+
+
+def test_wrong_arguments_are_named() -> None:
+    points = Pipe().points(200)
+    for wrong, name in (
+        (dict(points=points[:, :2]), "points"),
+        (dict(points=points, sigma=np.ones(3)), "sigma"),
+        (dict(points=points, sigma=-1.0), "sigma"),
+        (dict(points=points, path=np.zeros((5, 3))), "path"),
+        (dict(points=points, nominal=-1.0), "nominal"),
+        (dict(points=points, order=5), "order"),
+        (dict(points=points, up=(0, 0, 0)), "up"),
+    ):
+        with pytest.raises(pf.ArgumentError, match=name):
+            pf.fit_tube(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "diameter", "within"),
+    [
+        ("200mm_pvc/cloud13", 0.1896, 0.002),
+        ("200mm_pvc/cloud15", 0.1896, 0.002),
+        ("340mm/light", 0.354, 0.004),
+        ("340mm/nolight", 0.354, 0.004),
+    ],
+)
+def test_real_pipes_have_the_diameter_that_a_careful_fit_finds(
+    real_data: Callable[[str], Path], name: str, diameter: float, within: float
+) -> None:
+    points, _ = read_points(real_data(f"pipes/{name}.ply"))
+    tube = pf.fit_tube(points)
+    assert tube.status == "ok"
+    assert abs(tube.summary["d_mean"] - diameter) < within
+
+
+def test_files_hold_the_same_points(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    sigma = np.linspace(0.1, 0.2, 50)
+    columns = dict(zip(("x", "y", "z", "sigma"), np.column_stack([points, sigma]).T, strict=True))
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns))
+    rows = "".join(
+        f"{x!r} {y!r} {z!r} {v!r}\n" for x, y, z, v in zip(*(c.tolist() for c in columns.values()), strict=True)
+    )
+    head = "ply\nformat ascii 1.0\nelement vertex 50\n" + "".join(f"property double {n}\n" for n in columns)
+    (tmp_path / "b.ply").write_text(head + "end_header\n" + rows)
+    (tmp_path / "c.xyz").write_text("# x y z sigma\nx y z sigma\n" + rows)
+    (tmp_path / "d.csv").write_text("x,y,z,sigma\n" + rows.replace(" ", ","))
+    np.save(tmp_path / "e.npy", np.column_stack([points, sigma]))
+    big = b"".join(struct.pack(">ffffB", *p, s, 7) for p, s in zip(points, sigma, strict=True))
+    head = "ply\nformat binary_big_endian 1.0\ncomment hello\nelement vertex 50\n"
+    head += "".join(f"property float {n}\n" for n in columns) + "property uchar red\nelement face 0\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "f.ply").write_bytes(head.encode() + big)
+    for file in sorted(tmp_path.iterdir()):
+        got, noise = read_points(file)
+        assert got == pytest.approx(points, abs=1e-6 if file.name == "f.ply" else 1e-15), file.name
+        assert noise == pytest.approx(sigma, abs=1e-6), file.name
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "where"),
+    [
+        ("a.ply", b"plywood", "header"),
+        ("b.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1 2 3", "x, y, z"),
+        ("c.ply", b"ply\nformat ascii 2\nelement face 3\nend_header\n", "vertex"),
+        ("d.ply", b"ply\nformat middle_endian 1.0\nelement vertex 1\nend_header\n", "middle_endian"),
+        (
+            "e.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty char x\nproperty char y\nproperty char z\n"
+            b"end_header\n1 2",
+            "0 of 3",
+        ),
+        ("f.xyz", b"1 2 3\n4 five 6\n", "line 2"),
+        ("g.csv", b"", "no points"),
+        ("h.npy", b"\x93NUMPY garbage", "NumPy"),
+        ("i.las", b"", "not a kind"),
+    ],
+)
+def test_broken_files_are_refused_with_the_place(tmp_path: Path, name: str, content: bytes, where: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(pf.FormatError, match=where):
+        read_points(tmp_path / name)
+
+
+def test_the_command_writes_profile_events_mesh_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pipe = Pipe(length=4, bend=(1.5, 0.5, 0.9), ovality=0.02, seed=15)
+    np.save(tmp_path / "cloud.npy", 1000 * pipe.points(2000))
+    out = tmp_path / "out"
+    command = ["tube", str(tmp_path / "cloud.npy"), "-o", str(out), "--unit", "mm", "--sigma", "1.5"]
+    assert main([*command, "--nominal", "300", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == {**json.loads((out / "tube.json").read_text()), "files": document["files"]}
+    assert document["summary"]["d_mean"] == pytest.approx(0.3, abs=0.001)
+    assert [e["kind"] for e in document["events"]] == ["bend"]
+    lines = (out / "profile.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(document["stations"]["s"]) and "ovality_astm" in lines[0].split(",")
+    assert (out / "events.csv").read_text().splitlines()[1].startswith("bend")
+    vertices, _ = read_points(out / "tube.ply")
+    assert len(vertices) > 1000
+    assert main(command) == 0
+    text = capsys.readouterr().out
+    assert "mean diameter" in text and "bend" in text
+
+
+def test_the_command_refuses_what_is_no_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal(size=(1000, 3)))
+    assert main(["tube", str(tmp_path / "cloud.npy")]) == 1
+    assert "looks like the wall of a pipe" in capsys.readouterr().err
+    assert main(["tube", str(tmp_path / "nothing.ply")]) == 1
+    assert "nothing.ply" in capsys.readouterr().err

@@ -1,0 +1,67 @@
+"""Findings of the tube: bends, joints, deposits with size; and none in clean rough pipes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import pipefish as pf
+from pipe_cloud import Pipe
+
+
+def of_kind(tube: pf.Tube, kind: str) -> dict:
+    found = [e for e in tube.events if e["kind"] == kind]
+    assert len(found) == 1, tube.events
+    return found[0]
+
+
+def test_clean_rough_pipes_raise_no_alarms() -> None:
+    alarms = []
+    for seed in range(8):
+        pipe = Pipe(length=4, roughness=0.002, noise=0.001, outliers=0.2 * (seed % 2), ovality=0.01, seed=100 + seed)
+        tube = pf.fit_tube(pipe.points(1600), pipe.noise, pipe.cameras())
+        assert tube.status == "ok"
+        alarms += tube.events
+    assert not alarms  # one in a hundred fits is allowed: 8 % of such batches would show one
+
+
+@pytest.mark.parametrize("degrees", [15.0, 45.0])
+def test_bends_have_their_angle_radius_and_side(degrees: float) -> None:
+    pipe = Pipe(length=4, bend=(1.5, math.radians(degrees), 0.9), seed=3)
+    tube = pf.fit_tube(pipe.points(2400), pipe.noise, pipe.cameras())
+    bend = of_kind(tube, "bend")
+    assert abs(math.degrees(bend["angle"]) - degrees) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
+    assert abs(bend["start"] - 1.5) < 0.15 and abs(bend["end"] - 1.5 - 0.9 * math.radians(degrees)) < 0.15
+    assert bend["clock"] == pytest.approx(math.pi / 2, abs=0.1)  # to the right: three o'clock
+    truth, _ = pipe.axis(np.linspace(0.3, 3.7, 60))
+    assert np.abs(tube.project(truth)["r"]).max() < 0.005 * pipe.diameter
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_displaced_joint_is_found_with_its_step(seed: int) -> None:
+    pipe = Pipe(joint=(1.5, 0.012, 0.0), seed=seed)
+    joint = of_kind(pf.fit_tube(pipe.points(2000), pipe.noise, pipe.cameras()), "joint")
+    assert abs(joint["s"] - 1.5) < 0.03
+    assert abs(joint["step"] - 0.012) < max(0.002, 2.5 * joint["step_sigma"])
+    assert min(joint["clock"], 2 * math.pi - joint["clock"]) < 0.3  # upwards: twelve o'clock
+
+
+def test_an_open_joint_is_found_with_its_gap() -> None:
+    pipe = Pipe(ring=(1.2, 0.03), seed=4)
+    joint = of_kind(pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras()), "joint")
+    assert abs(joint["s"] - 1.2) < 0.005
+    assert abs(joint["gap"] - 0.03) < max(0.2 * 0.03, 3 * joint["gap_sigma"])
+    assert joint["step"] is None
+
+
+@pytest.mark.parametrize(("clock", "height"), [(3.0, 0.015), (0.05, 0.009), (4.5, -0.012)])
+def test_deposits_and_holes_have_place_height_and_kind(clock: float, height: float) -> None:
+    pipe = Pipe(deposit=(1.4, clock, 0.15, height), outliers=0.1, seed=5)
+    tube = pf.fit_tube(pipe.points(5000), pipe.noise, pipe.cameras())
+    found = of_kind(tube, "deposit" if height > 0 else "hole")
+    assert abs(found["s"] - 1.4) < 0.02
+    assert abs((found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi) * 0.15 < 0.02
+    assert abs(found["height"] - abs(height)) < max(0.2 * abs(height), 0.002)
+    assert abs(found["length"] - 0.15) < 0.05 and abs(found["width"] - 0.15) < 0.05
