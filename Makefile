@@ -88,6 +88,8 @@ pytest: build
 
 bench: build $(STAMP)/venv-peers
 	@tools/install-packages bench
+	@test -f build/peers/build.ninja || cmake --preset peers
+	@cmake --build --preset peers
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
 accept: build unit fuzz-build cross $(STAMP)/venv-peers

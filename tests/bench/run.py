@@ -52,9 +52,11 @@ def bench_camera() -> list[dict]:
 
 
 def bench_recon() -> list[dict]:
-    """recon.two_view beside PoseLib, both in one process."""
+    """recon.two_view beside PoseLib and recon.total_30m beside COLMAP, each in one process; recon.ba beside Ceres."""
     peers = PEERS["pip"].parents[1] / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
-    return run_program(sys.executable, ROOT / "tests" / "bench" / "recon_peers.py", peers) if peers.exists() else []
+    ceres = ROOT / "build" / "peers" / "tests" / "bench" / "bench_recon"
+    figures = run_program(sys.executable, ROOT / "tests" / "bench" / "recon_peers.py", peers) if peers.exists() else []
+    return figures + (run_program(ceres) if ceres.exists() else [])
 
 
 PYTHON_ROOMS = {

@@ -44,7 +44,9 @@ public:
         offset_.push_back(0);
         for (size_t p = 0; p < map.tracks.size(); p++) {
             const size_t before = place_.size();
-            for (const Observation &o : table.of_track(map.tracks[p])) {
+            const std::span<const Observation> seen = table.of_track(map.tracks[p]);
+            for (size_t i = seen.size(); i-- > 0;) {
+                const Observation &o = seen[i];
                 if (!map.has(o.frame)) {
                     continue;
                 }
@@ -52,11 +54,13 @@ public:
                 if (std::isfinite(squared) && (options.gate <= 0.0 || squared < options.gate * options.gate)) {
                     place_.push_back(static_cast<int>(&o - table.observations().data()));
                     frame_.push_back(o.frame - first_);
+                    block_.push_back(block_of(o.frame - first_));
                 }
             }
             if (place_.size() - before < static_cast<size_t>(options.min_views)) {
                 place_.resize(before);
                 frame_.resize(before);
+                block_.resize(before);
                 continue;
             }
             offset_.push_back(place_.size());
@@ -72,12 +76,11 @@ public:
     int eliminated() const { return static_cast<int>(state_.point.size()); }
     int banded() const { return static_cast<int>(state_.centre.size()); }
     int border() const { return border_; }
-    int reach() const { return std::max(reach_, options_.odometry ? 1 : 0); }
-    void widen(int reach) { reach_ = std::min(reach, banded() - 1); }
+    int reach() const { return options_.odometry ? 1 : 0; }
     std::span<const int> couplings(int e) const
     {
         const size_t from = offset_[static_cast<size_t>(e)];
-        return {frame_.data() + from, offset_[static_cast<size_t>(e) + 1] - from};
+        return {block_.data() + from, offset_[static_cast<size_t>(e) + 1] - from};
     }
 
     template <class Sink> void linearize(int e, Sink &sink) const
@@ -116,7 +119,7 @@ public:
                     o.whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
             }
             const std::array<const double *, 1> j_f{j_pose.data()};
-            sink.add(2, r.data(), options_.loss, j_point.data(), std::span(&frame_[k], 1), j_f,
+            sink.add(2, r.data(), options_.loss, j_point.data(), std::span(&block_[k], 1), j_f,
                      camera_columns_ ? j_border.data() : nullptr);
         }
     }
@@ -142,8 +145,9 @@ public:
     void apply(const Step &step)
     {
         for (size_t f = 0; f < state_.centre.size(); f++) {
-            state_.rotation[f] = geometry::rotation_exp(step.f[f].head<3>()) * saved_.rotation[f];
-            state_.centre[f] = saved_.centre[f] + step.f[f].tail<3>();
+            const Eigen::Matrix<double, 6, 1> &pose = step.f[static_cast<size_t>(block_of(static_cast<int>(f)))];
+            state_.rotation[f] = geometry::rotation_exp(pose.head<3>()) * saved_.rotation[f];
+            state_.centre[f] = saved_.centre[f] + pose.tail<3>();
         }
         for (size_t e = 0; e < state_.point.size(); e++) {
             state_.point[e] = saved_.point[e] + step.e[e];
@@ -204,6 +208,10 @@ private:
         }
         pf_camera_project_n(&camera_, n, in_camera_.data(), pixel_.data(), seen_.data());
     }
+
+    // Blocks run from the last frame to the first, which is held: the covariance then grows along the recursion that
+    // makes it, block by block. The other way round it would be what is left of differences, of the far end's.
+    int block_of(int f) const { return banded() - 1 - f; }
 
     bool is_held(int f) const { return f < options_.held_front || f >= banded() - options_.held_back; }
 
@@ -311,11 +319,12 @@ private:
                 const Eigen::Matrix<double, 6, 1> zero = Eigen::Matrix<double, 6, 1>::Zero();
                 const Rows<6, 6> one = Rows<6, 6>::Identity();
                 const std::array<const double *, 1> j{one.data()};
-                sink.add(6, zero.data(), plain, nullptr, std::span(&f, 1), j, nullptr);
+                const int block = block_of(f);
+                sink.add(6, zero.data(), plain, nullptr, std::span(&block, 1), j, nullptr);
             }
         }
         if (holds_scale()) {
-            const int last = banded() - 1;
+            const int last = block_of(banded() - 1);
             const double r = scale_residual();
             Rows<1, 6> j_last = Rows<1, 6>::Zero();
             j_last.rightCols<3>() =
@@ -360,7 +369,8 @@ private:
                 (state_.centre[static_cast<size_t>(f) + 1] - state_.centre[static_cast<size_t>(f)]).norm();
             j_border(0, 0) = -inverse * length / gain;
             const std::array<const double *, 2> j_f{j[0].data(), j[1].data()};
-            sink.add(1, &r, loss, nullptr, frames, j_f, j_border.data());
+            const int blocks[2] = {block_of(f), block_of(f + 1)};
+            sink.add(1, &r, loss, nullptr, blocks, j_f, j_border.data());
         }
         j_border.setZero();
         j_border(0, 0) = 1.0 / options_.odometry->scale_sigma;
@@ -386,17 +396,18 @@ private:
             }
             j_border.middleCols(down_at_, 2) = across * state_.rotation[i] * basis;
             const std::array<const double *, 1> j_f{j.data()};
-            sink.add(2, r.data(), optim::RobustLoss{}, nullptr, std::span(&f, 1), j_f, j_border.data());
+            const int block = block_of(f);
+            sink.add(2, r.data(), optim::RobustLoss{}, nullptr, std::span(&block, 1), j_f, j_border.data());
         }
     }
 
     const TrackTable &table_;
     pf_camera original_, camera_;
     BundleOptions options_;
-    int first_, reach_ = 0;
+    int first_;
     State state_, saved_;
-    std::vector<size_t> offset_; // of each point in place_ and frame_
-    std::vector<int> place_, frame_, track_;
+    std::vector<size_t> offset_; // of each point in place_, frame_ and block_
+    std::vector<int> place_, frame_, block_, track_;
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
     int border_ = 0, down_at_ = 0, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
@@ -445,7 +456,6 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
     report.camera = problem.state().camera;
     if (covariance) {
-        problem.widen(options.reach);
         auto known = solver.covariance(problem, options.threads);
         *covariance = BundleCovariance(std::move(solver), std::move(known));
     }

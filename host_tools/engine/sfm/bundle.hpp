@@ -54,7 +54,6 @@ struct BundleOptions {
     double gate = 0.0; // observations further off than this many sigmas are left out; 0: all that can be projected
     int min_views = 2; // points with fewer are left out
     int threads = 1;
-    int reach = 0; // covariance of poses at least so many frames apart is kept
     const Odometry *odometry = nullptr;
     const Gravity *gravity = nullptr;
     const CameraPrior *camera_prior = nullptr;
@@ -84,16 +83,15 @@ public:
     size_t frames() const { return known_.f.size(); }
     const Eigen::Matrix<double, 6, 6> &pose(size_t frame) const
     {
-        return known_.f[frame][0];
+        return known_.f[frames() - 1 - frame][0];
     }                                                                // rotation (left), centre
     const std::vector<Matrix3d> &points() const { return known_.e; } // as the map's points
     const Eigen::MatrixXd &border() const { return known_.g; }       // wheel, gravity (2), camera: those of the options
 
     // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
-    // Poses further apart than `reach` of the options and the longest track are taken to be independent.
     Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const
     {
-        return solver_.functions(known_, points, a);
+        return solver_.functions(points, a);
     }
 
 private:

@@ -324,23 +324,6 @@ void normalise(Submap &map)
     transform(map, s);
 }
 
-// Frames over which sections of the wall are correlated: those that see points of one section as long as the view.
-int section_reach(const Submap &map, const TrackTable &table)
-{
-    int longest = 0;
-    for (const int track : map.tracks) {
-        int first = map.end(), last = map.first;
-        for (const Observation &o : table.of_track(track)) {
-            if (map.has(o.frame)) {
-                first = std::min(first, o.frame);
-                last = std::max(last, o.frame);
-            }
-        }
-        longest = std::max(longest, last - first);
-    }
-    return 2 * longest + 5;
-}
-
 void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
@@ -364,6 +347,7 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     settings.odometry = segment.metric ? options.odometry : nullptr;
     settings.gravity = options.gravity;
     settings.min_views = 3;
+    int observations = 0;
     for (int cycle = 0; cycle < 3; cycle++) {
         settings.loss = {optim::RobustLoss::Kind::huber, 3.0};
         settings.max_iterations = cycle == 0 ? 30 : 15;
@@ -371,6 +355,7 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
         settings.lambda = 1e-9;
         settings.gate = cycle == 0 ? 50.0 : 15.0;
         const BundleReport report = adjust(map, table, central, settings);
+        observations = report.observations;
         // Residuals are smaller than errors: poses and points were fitted to them.
         segment.sigma = robust_sigma(map, table, central) *
                         std::sqrt(2.0 * report.observations / static_cast<double>(report.redundancy));
@@ -382,12 +367,12 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
             break;
         }
     }
-    settings.reach = section_reach(map, table);
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
     settings.max_iterations = 30;
-    settings.cost_tolerance = 1e-9;
+    // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
+    settings.cost_tolerance = 0.01 / std::max(observations, 1);
     segment.report = adjust(map, table, central, settings, &segment.random);
     if (options.camera_prior) {
         settings.camera_prior = options.camera_prior;

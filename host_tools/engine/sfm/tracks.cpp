@@ -11,6 +11,7 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
                        std::span<const int> track, const double *uv, const double *covariance, double sigma)
 {
     const std::vector<Sight> sights = geometry::make_sights(camera, frame.size(), uv, covariance, sigma);
+    all_.reserve(frame.size());
     for (size_t i = 0; i < frame.size(); i++) {
         if (!sights[i].valid) {
             outside_++;
@@ -18,9 +19,12 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
         }
         all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse()});
     }
-    std::stable_sort(all_.begin(), all_.end(), [](const Observation &a, const Observation &b) {
+    const auto before = [](const Observation &a, const Observation &b) {
         return a.track != b.track ? a.track < b.track : a.frame < b.frame;
-    });
+    };
+    if (!std::is_sorted(all_.begin(), all_.end(), before)) {
+        std::stable_sort(all_.begin(), all_.end(), before);
+    }
     const auto same = [](const Observation &a, const Observation &b) {
         return a.track == b.track && a.frame == b.frame;
     };
