@@ -98,13 +98,18 @@ static const setting settings[] = {
     {"encoder", "noise", NUMBER, AT(encoder.noise), "m/sqrt(m)", "0.005", 0, 1, NULL,
      "random error of the distance over one metre"},
 
-    {"link", "transport", CHOICE, AT(link.transport), "", "tcp", 0, 0, "serial|tcp", "how the host is reached"},
+    {"link", "transport", CHOICE, AT(link.transport), "", "tcp", 0, 0, "serial|tcp|tls",
+     "how the host is reached; tcp is not encrypted, and on this machine only"},
     {"link", "device", TEXT, AT(link.device), "", "", 0, 0, NULL, "serial: the device, as /dev/ttyS0; required"},
     {"link", "baud", INTEGER, AT(link.baud), "baud", "921600", 9600, 4000000, NULL, "serial: the rate"},
     {"link", "rtscts", SWITCH, AT(link.rtscts), "", "false", 0, 0, NULL, "serial: hardware flow control"},
     {"link", "address", TEXT, AT(link.address), "", "127.0.0.1", 0, 0, NULL,
-     "tcp: the address to listen on; a loopback address until the link is encrypted"},
-    {"link", "port", INTEGER, AT(link.port), "", "7447", 0, 65535, NULL, "tcp: the port; 0 = any (the log tells)"},
+     "tcp: the loopback address to listen on; tls: any address of this machine, 0.0.0.0 for all"},
+    {"link", "port", INTEGER, AT(link.port), "", "7447", 0, 65535, NULL, "tcp, tls: the port; 0 = any (the log tells)"},
+    {"link", "trust", TEXT, AT(link.trust), "", "", 0, 0, NULL,
+     "folder with this device's key and the hosts that it lets in (pipefish pair); made at the first start; required "
+     "for "
+     "tls"},
     {"link", "window", INTEGER, AT(link.window), "bytes", "65536", 1024, 1048576, NULL,
      "most unacknowledged bytes under way"},
     {"link", "send_slots", INTEGER, AT(link.send_slots), "", "4", 1, 16, NULL, "objects under way at once"},
@@ -351,8 +356,10 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
         why = "camera.black_level: must be below camera.white_level";
     else if (c->link.transport == PF_TRANSPORT_SERIAL && c->link.device[0] == '\0')
         why = "link.device: must be set for link.transport = serial";
-    else if (c->link.transport == PF_TRANSPORT_TCP && c->link.address[0] == '\0')
-        why = "link.address: must be set for link.transport = tcp";
+    else if (c->link.transport != PF_TRANSPORT_SERIAL && c->link.address[0] == '\0')
+        why = "link.address: must be set for link.transport = tcp and tls";
+    else if (c->link.transport == PF_TRANSPORT_TLS && c->link.trust[0] == '\0')
+        why = "link.trust: must be set for link.transport = tls: the folder of the keys";
     else if (c->spool.path[0] == '\0')
         why = "spool.path: must be set";
     else if (c->tracker.window % 2 == 0)

@@ -16,7 +16,7 @@
 enum { PF_CAMERA_REPLAY = 0 };
 enum { PF_SPEED_RECORDED = 0, PF_SPEED_FAST = 1 };
 enum { PF_CELLS_GRID = 0, PF_CELLS_POLAR = 1 };
-enum { PF_TRANSPORT_SERIAL = 0, PF_TRANSPORT_TCP = 1 };
+enum { PF_TRANSPORT_SERIAL = 0, PF_TRANSPORT_TCP = 1, PF_TRANSPORT_TLS = 2 };
 enum { PF_LOG_ERROR = 0, PF_LOG_WARNING = 1, PF_LOG_INFO = 2, PF_LOG_DEBUG = 3 };
 
 typedef char pf_config_text[PF_CONFIG_TEXT_MAX];
@@ -49,7 +49,7 @@ typedef struct pf_config {
     } encoder;
     struct {
         uint32_t transport;
-        pf_config_text device, address;
+        pf_config_text device, address, trust;
         uint32_t baud, port;
         bool rtscts;
         uint32_t window, send_slots, max_fragment, keepalive_ms, rto_min_ms;

@@ -43,7 +43,17 @@ struct pf_courier {
 static void publish(pf_courier *c, uint64_t now)
 {
     pf_counters *k = &c->daemon->counters;
+    const pf_transport *t = &c->daemon->transport;
+    const pf_transport_stats *network;
+    const char *name;
+    pf_role role = t->ops->peer(t->self, &name, &network);
     pthread_mutex_lock(&k->mutex);
+    k->has_network = network != NULL;
+    if (network != NULL) {
+        k->network = *network;
+        k->peer_role = role;
+        (void)snprintf(k->peer_name, sizeof k->peer_name, "%s", name);
+    }
     k->link_up = pf_link_is_up(c->link);
     k->link = *pf_link_get_stats(c->link);
     pthread_mutex_unlock(&k->mutex);
@@ -51,6 +61,14 @@ static void publish(pf_courier *c, uint64_t now)
 }
 
 /* ---- control */
+
+static pf_role peer_role(const pf_courier *c)
+{
+    const pf_transport *t = &c->daemon->transport;
+    const pf_transport_stats *network;
+    const char *name;
+    return t->ops->peer(t->self, &name, &network);
+}
 
 static void set_lamp(pf_courier *c, float level, pf_msg_reply *reply)
 {
@@ -129,6 +147,11 @@ static bool ask_keeper(pf_courier *c, const pf_msg_request *request, pf_msg_repl
     return true;
 }
 
+static bool may_send(const pf_courier *c, uint32_t kind)
+{
+    return kind == PF_OBJECT_PROFILE && c->daemon->keeper != NULL && peer_role(c) >= PF_ROLE_CALIBRATOR;
+}
+
 static void take_profile(pf_courier *c, const pf_link_event *e)
 {
     uint8_t sha256[32];
@@ -165,12 +188,65 @@ static void serve_keeper(pf_courier *c)
 
 /* ---- requests */
 
+/* The least role that may ask for it. */
+static pf_role role_for(pf_request_what what)
+{
+    switch (what) {
+    case PF_REQUEST_GET_STATUS:
+    case PF_REQUEST_GET_INFO:
+    case PF_REQUEST_GET_PROFILE:
+    case PF_REQUEST_UNKNOWN:
+        return PF_ROLE_VIEWER;
+    case PF_REQUEST_STOP_SURVEY:
+    case PF_REQUEST_SET_LAMP:
+    case PF_REQUEST_CLOCK_SYNC:
+    case PF_REQUEST_SHUTDOWN:
+        return PF_ROLE_OPERATOR;
+    case PF_REQUEST_CONFIRM_PROFILE:
+    case PF_REQUEST_REVERT_PROFILE:
+    case PF_REQUEST_PAIR:
+        break;
+    }
+    return PF_ROLE_CALIBRATOR;
+}
+
+/* False: the host's role is not enough, and the reply says so. */
+static bool may_ask(const pf_courier *c, pf_request_what what, pf_msg_reply *reply)
+{
+    pf_role has = peer_role(c), needs = role_for(what);
+    if (has >= needs)
+        return true;
+    reply->error = needs == PF_ROLE_OPERATOR ? "this host may not: the role operator is needed"
+                                             : "this host may not: the role calibrator is needed";
+    pf_log(PF_LOG_WARNING, "request %u is refused: the host is a %s", (unsigned)what, pf_role_text(has));
+    return false;
+}
+
+static void pair(pf_courier *c, const pf_msg_pair *pair, pf_msg_reply *reply)
+{
+    pf_trust *trust = c->daemon->trust;
+    if (trust == NULL) {
+        reply->error = "this device lets no host in over a network: link.trust is not set";
+        return;
+    }
+    pf_role role = pf_role_parse(pair->role, strlen(pair->role));
+    if (pf_trust_set(trust, pair->key, role, pair->name) != PF_OK) {
+        reply->error = pf_trust_error(trust);
+        return;
+    }
+    char key[65];
+    pf_key_print(pair->key, key);
+    pf_log(PF_LOG_INFO, "host %s (key %.16s...) is from now on: %s", pair->name, key, pf_role_text(role));
+    reply->paired_key = pf_trust_key(trust);
+}
+
 static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t now)
 {
     pf_daemon *d = c->daemon;
     pf_msg_request request;
     pf_msg_reply reply = {.error = ""};
     pf_msg_status status;
+    char peer[PF_PEER_NAME_MAX];
     pf_msg_info info = {
         .software = PF_SOFTWARE, .source = d->source, .boot_id = d->boot_id, .schema = PF_SCHEMA_VERSION};
     bool is_answered = true;
@@ -180,10 +256,17 @@ static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t no
         return;
     }
     reply.id = request.id;
+    if (!may_ask(c, request.what, &reply)) {
+        send_reply(c, &reply);
+        return;
+    }
     switch (request.what) {
+    case PF_REQUEST_PAIR:
+        pair(c, &request.pair, &reply);
+        break;
     case PF_REQUEST_GET_STATUS:
         publish(c, now);
-        pf_daemon_status(d, &status);
+        pf_daemon_status(d, &status, peer);
         reply.status = &status;
         break;
     case PF_REQUEST_GET_INFO:
@@ -242,9 +325,7 @@ static void take_event(pf_courier *c, const pf_link_event *e, uint64_t now)
     case PF_LINK_LATEST: /* the host has none to send */
         break;
     case PF_LINK_OFFER:
-        (void)pf_link_answer_object(c->link, e->slot,
-                                    e->kind == PF_OBJECT_PROFILE && c->daemon->keeper != NULL ? PF_ANSWER_ACCEPT
-                                                                                              : PF_ANSWER_REFUSE);
+        (void)pf_link_answer_object(c->link, e->slot, may_send(c, e->kind) ? PF_ANSWER_ACCEPT : PF_ANSWER_REFUSE);
         break;
     case PF_LINK_OBJECT:
         take_profile(c, e);
@@ -301,6 +382,7 @@ static void service(pf_courier *c, uint64_t now)
     pf_status status = t->ops->service(t->self, &is_fresh);
     if (is_fresh) {
         drop_session(c, now);
+        pf_link_hold_objects(c->link, peer_role(c) < PF_ROLE_OPERATOR);
         c->failure[0] = '\0';
         pf_log(PF_LOG_DEBUG, "%s: connected", t->ops->name(t->self));
     }
@@ -361,9 +443,10 @@ static bool write_stream(pf_courier *c, uint64_t now)
 static void send_status(pf_courier *c, uint64_t now)
 {
     pf_msg_status status;
+    char peer[PF_PEER_NAME_MAX];
     size_t n;
     publish(c, now);
-    pf_daemon_status(c->daemon, &status);
+    pf_daemon_status(c->daemon, &status, peer);
     if (pf_msg_encode_status(&status, c->message, sizeof c->message, &n) == PF_OK)
         (void)pf_link_send_latest(c->link, PF_TOPIC_STATUS, c->message, n);
     c->status_due = now + c->daemon->config.status.interval_ms * MS;

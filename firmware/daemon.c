@@ -49,7 +49,7 @@ pf_msg_profile pf_daemon_profile(pf_daemon *d)
     return profile;
 }
 
-void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
+void pf_daemon_status(pf_daemon *d, pf_msg_status *status, char *peer)
 {
     static const char *const states[] = {"surveying", "draining", "idle"};
     pf_counters *c = &d->counters;
@@ -84,7 +84,18 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status)
         .has_clock = c->has_clock,
         .clock = c->clock,
         .tracking = c->tracking,
+        .has_network = c->has_network,
+        .network = {.peer = peer,
+                    .role = c->peer_role >= PF_ROLE_VIEWER ? pf_role_text(c->peer_role) : "",
+                    .sessions = c->network.sessions,
+                    .refused_unknown = c->network.refused_unknown,
+                    .refused_revoked = c->network.refused_revoked,
+                    .refused_handshake = c->network.refused_handshake,
+                    .refused_late = c->network.refused_late,
+                    .refused_often = c->network.refused_often,
+                    .refused_busy = c->network.refused_busy},
     };
+    memcpy(peer, c->peer_name, sizeof c->peer_name);
     if (c->last_ns > c->first_ns)
         status->fps = (double)c->frames_tracked * 1e9 / (double)(c->last_ns - c->first_ns);
     pthread_mutex_unlock(&c->mutex);
@@ -113,12 +124,23 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
                   t->quality_median, t->static_blocks);
 }
 
-static void print_problem(FILE *out, const char *text)
+static void print_text(FILE *out, const char *key, const char *text)
 {
-    (void)fputs(",\n  \"profile_problem\": \"", out);
+    (void)fprintf(out, ",\n  \"%s\": \"", key);
     for (; *text != '\0'; text++)
         (void)fputc(*text == '"' || *text == '\\' || (unsigned char)*text < 0x20 ? '?' : *text, out);
     (void)fputc('"', out);
+}
+
+static void print_network(FILE *out, const pf_msg_network *w)
+{
+    print_text(out, "peer", w->peer);
+    (void)fprintf(out,
+                  ",\n  \"network\": {\"role\": \"%s\", \"sessions\": %u, \"refused_unknown\": %u"
+                  ", \"refused_revoked\": %u, \"refused_handshake\": %u, \"refused_late\": %u"
+                  ", \"refused_often\": %u, \"refused_busy\": %u}",
+                  w->role, w->sessions, w->refused_unknown, w->refused_revoked, w->refused_handshake, w->refused_late,
+                  w->refused_often, w->refused_busy);
 }
 
 static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const char *problem)
@@ -162,8 +184,10 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
         (void)fprintf(out, "\", \"crc32c\": \"%08" PRIx32 "\", \"trial\": %s}", s->profile.crc32c,
                       s->profile.is_trial ? "true" : "false");
     }
+    if (s->has_network)
+        print_network(out, &s->network);
     if (problem[0] != '\0')
-        print_problem(out, problem);
+        print_text(out, "profile_problem", problem);
     if (s->has_clock)
         (void)fprintf(out, ",\n  \"clock\": {\"offset_ns\": %" PRId64 ", \"error_ns\": %" PRIu64 "}",
                       s->clock.offset_ns, s->clock.error_ns);
@@ -174,6 +198,7 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
 {
     char draft[PF_CONFIG_TEXT_MAX + 8];
     pf_msg_status status;
+    char peer[PF_PEER_NAME_MAX];
     pf_store_stats store;
     pf_msg_profile_state profile;
     pf_keeper_texts texts = {.problem = ""};
@@ -182,7 +207,7 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     (void)snprintf(draft, sizeof draft, "%s.new", path);
     out = fopen(draft, "w");
     if (out != NULL) {
-        pf_daemon_status(d, &status);
+        pf_daemon_status(d, &status, peer);
         pf_store_get_stats(d->store, &store);
         if (d->keeper != NULL)
             pf_keeper_state(d->keeper, &profile, &texts);

@@ -12,6 +12,7 @@
 #include "pipefish/drivers/gpio.h"
 #include "pipefish/drivers/spool.h"
 #include "pipefish/drivers/transport.h"
+#include "pipefish/drivers/trust.h"
 #include "pipefish/messages.h"
 #include "pipefish/profile.h"
 #include "store.h"
@@ -42,6 +43,10 @@ typedef struct pf_counters {
     pf_link_stats link;
     bool has_clock;
     pf_msg_clock_sync clock;
+    bool has_network; /* the transport refuses whom it does not know */
+    pf_transport_stats network;
+    pf_role peer_role;
+    char peer_name[PF_PEER_NAME_MAX];
 } pf_counters;
 
 typedef struct pf_keeper pf_keeper;
@@ -54,6 +59,7 @@ typedef struct pf_daemon {
     pf_camera_source camera;
     pf_gpio gpio;
     pf_transport transport;
+    pf_trust *trust; /* of link.trust; NULL = there is none. The courier's, once it runs */
     pf_spool spool;
     bool has_profile;
     pf_profile profile;
@@ -80,8 +86,8 @@ bool pf_daemon_read_profile(const uint8_t *bytes, size_t n, pf_profile *profile,
 /* The profile in use, of a daemon that has one. The texts are the daemon's. Any thread. */
 pf_msg_profile pf_daemon_profile(pf_daemon *daemon);
 
-/* The status message as of now. Any thread. */
-void pf_daemon_status(pf_daemon *daemon, pf_msg_status *status);
+/* The status message as of now. Any thread. peer[PF_PEER_NAME_MAX]: memory for a text of it. */
+void pf_daemon_status(pf_daemon *daemon, pf_msg_status *status, char *peer);
 
 /* The same as a JSON file, replaced as a whole. False: error[n] says why. */
 bool pf_daemon_write_status(pf_daemon *daemon, const char *path, char *error, size_t n);

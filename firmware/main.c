@@ -22,37 +22,40 @@
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
 #define TICK_MS        50
 #define OVERRIDES_MAX  128
+#define SILENCES       4 /* keepalives without an answer after which a host counts as gone, as the link has it */
 
 enum { DONE = 0, FAILED = 1, USAGE = 2 };
 
-static const char usage[] = "usage: pipefishd [--config FILE] [--set section.key=value]...\n"
-                            "\n"
-                            "  --config FILE            settings (default " DEFAULT_CONFIG ")\n"
-                            "  --set section.key=value  one setting, over the file's; may be repeated\n"
-                            "  --check-config           check the settings and the profile, start nothing\n"
-                            "  --help-config            print every setting with its meaning: an example file\n"
-                            "  --version                print the version\n"
-                            "\n"
-                            "example: pipefishd --config survey.ini --set camera.speed=fast\n"
-                            "exit codes: 0 done, 1 failed, 2 wrong usage\n";
+static const char usage[] =
+    "usage: pipefishd [--config FILE] [--set section.key=value]...\n"
+    "\n"
+    "  --config FILE            settings (default " DEFAULT_CONFIG ")\n"
+    "  --set section.key=value  one setting, over the file's; may be repeated\n"
+    "  --pair \"ROLE KEY NAME\"   let a host in over the network (viewer, operator, calibrator; revoked\n"
+    "                           = never again), print this device's key; see `pipefish pair`\n"
+    "  --check-config           check the settings and the profile, start nothing\n"
+    "  --help-config            print every setting with its meaning: an example file\n"
+    "  --version                print the version\n"
+    "\n"
+    "example: pipefishd --config survey.ini --set camera.speed=fast\n"
+    "exit codes: 0 done, 1 failed, 2 wrong usage\n";
 
 typedef struct options {
     const char *config;
     const char *override[OVERRIDES_MAX];
     int overrides;
+    const char *pair;
     bool check;
 } options;
 
 /* -1 = go on, else the exit code. */
 static int parse_options(int argc, char **argv, options *o)
 {
-    static const struct option known[] = {{"config", required_argument, NULL, 'c'},
-                                          {"set", required_argument, NULL, 's'},
-                                          {"check-config", no_argument, NULL, 'k'},
-                                          {"help-config", no_argument, NULL, 'H'},
-                                          {"version", no_argument, NULL, 'V'},
-                                          {"help", no_argument, NULL, 'h'},
-                                          {NULL, 0, NULL, 0}};
+    static const struct option known[] = {
+        {"config", required_argument, NULL, 'c'}, {"set", required_argument, NULL, 's'},
+        {"pair", required_argument, NULL, 'p'},   {"check-config", no_argument, NULL, 'k'},
+        {"help-config", no_argument, NULL, 'H'},  {"version", no_argument, NULL, 'V'},
+        {"help", no_argument, NULL, 'h'},         {NULL, 0, NULL, 0}};
     int choice;
     while ((choice = getopt_long(argc, argv, "h", known, NULL)) != -1) {
         switch (choice) {
@@ -65,6 +68,9 @@ static int parse_options(int argc, char **argv, options *o)
                 return USAGE;
             }
             o->override[o->overrides++] = optarg;
+            break;
+        case 'p':
+            o->pair = optarg;
             break;
         case 'k':
             o->check = true;
@@ -179,15 +185,62 @@ static void settle_profile(pf_daemon *d)
     }
 }
 
+static bool open_trust(pf_daemon *d, char *error, size_t n)
+{
+    const char *folder = d->config.link.trust;
+    char why[768] = "";
+    if (folder[0] == '\0' || pf_trust_open(&d->trust, folder, why, sizeof why) == PF_OK)
+        return true;
+    (void)snprintf(error, n, "link.trust: %s", why);
+    return false;
+}
+
+/* Lets a host in without its cable: "role key name" as a line of the file of hosts. */
+static int pair(pf_daemon *d, const char *line, char *error, size_t n)
+{
+    char key[65], why[128];
+    pf_peers one;
+    if (pf_peers_parse(&one, line, strlen(line), why, sizeof why) != PF_OK || one.count != 1) {
+        (void)snprintf(error, n, "--pair: %s", one.count == 0 && why[0] == '\0' ? "nobody" : why);
+        return USAGE;
+    }
+    if (d->config.link.trust[0] == '\0') {
+        (void)snprintf(error, n, "link.trust: must be set: the folder of the keys");
+        return FAILED;
+    }
+    if (!open_trust(d, error, n))
+        return FAILED;
+    const pf_peer *peer = &one.peer[0];
+    int code = DONE;
+    if (pf_trust_set(d->trust, peer->key, peer->role, peer->name) == PF_OK) {
+        pf_key_print(pf_trust_key(d->trust), key);
+        (void)printf("%s: %s\nthis device's key: %s\n", peer->name, pf_role_text(peer->role), key);
+    } else {
+        (void)snprintf(error, n, "link.trust: %s", pf_trust_error(d->trust));
+        code = FAILED;
+    }
+    pf_trust_close(d->trust);
+    return code;
+}
+
 static bool open_transport(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
     pf_status status;
+    if (!open_trust(d, error, n))
+        return false;
     if (c->link.transport == PF_TRANSPORT_SERIAL)
         status =
             pf_serial_open(&d->transport, &(pf_serial_config){c->link.device, c->link.baud, c->link.rtscts}, error, n);
+    else if (c->link.transport == PF_TRANSPORT_TLS)
+        status = pf_tls_listen(
+            &d->transport,
+            &(pf_tls_config){c->link.address, (uint16_t)c->link.port, SILENCES * c->link.keepalive_ms, d->trust}, error,
+            n);
     else
         status = pf_tcp_listen(&d->transport, &(pf_tcp_config){c->link.address, (uint16_t)c->link.port}, error, n);
+    if (status != PF_OK)
+        pf_trust_close(d->trust);
     return status == PF_OK;
 }
 
@@ -356,6 +409,7 @@ static int open_and_run(pf_daemon *d, int signals)
                 d->spool.ops->close(d->spool.self);
             }
             d->transport.ops->close(d->transport.self);
+            pf_trust_close(d->trust);
         }
         d->gpio.ops->close(d->gpio.self);
     }
@@ -377,7 +431,17 @@ int main(int argc, char **argv)
     if (code >= 0)
         return code;
     d.started_ns = pf_now();
-    if (!load_config(&o, &d.config, error, sizeof error) || !load_profile(&d, o.check, error, sizeof error)) {
+    if (!load_config(&o, &d.config, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return FAILED;
+    }
+    if (o.pair != NULL) {
+        code = pair(&d, o.pair, error, sizeof error);
+        if (code != DONE)
+            pf_log(PF_LOG_ERROR, "%s", error);
+        return code;
+    }
+    if (!load_profile(&d, o.check, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }

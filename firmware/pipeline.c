@@ -466,6 +466,7 @@ static void store_end(pf_pipeline *p, const char *reason)
 {
     pf_daemon *d = p->daemon;
     pf_msg_status status;
+    char peer[PF_PEER_NAME_MAX];
     pf_survey survey;
     pf_job *job;
     pf_msg_survey_end end = {.time = {d->boot_id, pf_now()},
@@ -476,7 +477,7 @@ static void store_end(pf_pipeline *p, const char *reason)
                              .lost_first = survey.lost_first,
                              .lost_count = survey.lost_count};
     pf_store_settle(d->store);
-    pf_daemon_status(d, &status);
+    pf_daemon_status(d, &status, peer);
     pf_store_get_survey(d->store, &survey);
     memcpy(end.survey_id, d->survey_id, sizeof end.survey_id);
     end.frames = status.frames;

@@ -237,6 +237,14 @@ static size_t serial_room(void *self)
     return limit - queued > PF_LINK_FRAME_MAX ? limit - queued : PF_LINK_FRAME_MAX;
 }
 
+static pf_role serial_peer(void *self, const char **name, const pf_transport_stats **stats)
+{
+    (void)self;
+    *name = "";
+    *stats = NULL;
+    return PF_ROLE_CALIBRATOR;
+}
+
 static const char *serial_name(void *self)
 {
     serial *s = self;
@@ -266,6 +274,7 @@ pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config
         .read = serial_read,
         .write = serial_write,
         .room = serial_room,
+        .peer = serial_peer,
         .name = serial_name,
         .error = serial_error,
         .close = serial_close,

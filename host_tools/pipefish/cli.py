@@ -20,7 +20,7 @@ class UsageError(PipefishError):
     """Arguments that do not go together."""
 
 
-DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud) or tcp://host:port"
+DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud), tls://host:port or tcp://host:port"
 
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
@@ -523,11 +523,13 @@ def build_parser() -> argparse.ArgumentParser:
 
     from pipefish.cli_calibrate import add_calibrate  # they need what stands above
     from pipefish.cli_homography import add_homography
+    from pipefish.cli_pair import add_pair
     from pipefish.cli_profile import add_profile, add_profile_input
     from pipefish.cli_target import add_target
 
     add_profile(commands)
     add_target(commands)
+    add_pair(commands)
     add_calibrate(commands)
     add_homography(commands)
 

@@ -151,7 +151,8 @@ class Client:
             return
         try:
             self._turn(most_s)
-        except TransportClosed:
+        except TransportClosed as error:
+            self._open_error = error.reason
             self._lost()
 
     def _turn(self, most_s: float) -> None:

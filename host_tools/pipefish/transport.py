@@ -1,4 +1,4 @@
-"""Byte streams to a device: a serial line or a TCP connection, non-blocking, with a file descriptor to wait on."""
+"""Byte streams to a device: serial line, TCP or TLS, non-blocking, with a file descriptor to wait on."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import fcntl
 import os
 import re
 import socket
+import ssl
 import struct
 import termios
 from abc import ABC, abstractmethod
@@ -24,9 +25,9 @@ class TransportClosed(PipefishError):
     reason    without the name of the line
     is_final  waiting does not help: we may not open it, or it is no line"""
 
-    def __init__(self, text: str, cause: Exception | None = None) -> None:
+    def __init__(self, text: str, cause: Exception | None = None, reason: str = "") -> None:
         super().__init__(text)
-        self.reason = text if cause is None else _reason(cause)
+        self.reason = reason or (text if cause is None else _reason(cause))
         self.is_final = _number(cause) in (errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTTY)
 
 
@@ -48,6 +49,10 @@ def _number(error: BaseException | None) -> int:
             return number
         error = error.__context__
     return 0
+
+
+class Refused(PipefishError):
+    """The other end does not let us in, or is not whom we know: opening it again does not help."""
 
 
 class Transport(ABC):
@@ -133,8 +138,10 @@ class SerialTransport(Transport):
 class TcpTransport(Transport):
     """A TCP connection."""
 
+    scheme = "tcp"
+
     def __init__(self, host: str, port: int) -> None:
-        self.name = f"tcp://{host}:{port}"
+        self.name = f"{self.scheme}://{f'[{host}]' if ':' in host else host}:{port}"
         self.address = (host, port)
         self._socket: socket.socket | None = None
 
@@ -188,23 +195,129 @@ class TcpTransport(Transport):
             self._socket = None
 
 
+# What OpenSSL reports of a device that sent us away, and what it means.
+REFUSALS = {
+    "BAD_CERTIFICATE": "the device does not know this host's key: pair first (pipefish pair)",
+    "CERTIFICATE_REVOKED": "the device has revoked this host's key",
+    "CERTIFICATE_REQUIRED": "the device wants a certificate",
+    "PROTOCOL_VERSION": "the other end has no TLS 1.3",
+    "WRONG_VERSION_NUMBER": "the other end speaks no TLS (tcp:// instead?)",
+}
+
+
+class TlsTransport(TcpTransport):
+    """Mutual TLS 1.3 (docs/network.md): this host's key, and only devices that it knows.
+
+    device    name of the device at the other end, once opened"""
+
+    scheme = "tls"
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(host, port)
+        self.device = ""
+        self._heard = False
+
+    def _context(self) -> ssl.SSLContext:
+        from pipefish.keys import host_key_file
+
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        # Neither a name nor an issuer counts, only the key, which is looked at before a byte is sent.
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        path = host_key_file()
+        try:
+            context.load_cert_chain(path)
+        except (ssl.SSLError, OSError) as error:
+            raise PipefishError(f"{path}: no private key with its certificate: remove it and pair again") from error
+        return context
+
+    def _failed(self, error: OSError) -> PipefishError:
+        said = getattr(error, "reason", None) or ""
+        for word, reason in REFUSALS.items():
+            if word in said:
+                return Refused(f"{self.name}: {reason}")
+        return TransportClosed(f"{self.name}: {_reason(error)}", error)
+
+    def open(self) -> None:
+        from pipefish.keys import certificate_key, known_devices
+
+        context = self._context()
+        devices = known_devices()
+        super().open()
+        try:
+            self._socket.settimeout(CONNECT_TIMEOUT_S)
+            self._socket = context.wrap_socket(self._socket)
+            key = certificate_key(self._socket.getpeercert(binary_form=True) or b"")
+            self._socket.setblocking(False)
+        except ValueError as error:
+            self.close()
+            raise TransportClosed(f"{self.name}: the device shows no key") from error
+        except TimeoutError as error:
+            self.close()
+            raise TransportClosed(f"{self.name}: the device does not answer the handshake", error) from error
+        except OSError as error:
+            self.close()
+            raise self._failed(error) from error
+        if key not in devices:
+            self.close()
+            raise Refused(
+                f"{self.name}: a device that this host does not know (key {key}). If it is yours, pair with it: "
+                "pipefish pair"
+            )
+        self.device = devices[key]
+        self._heard = False
+
+    def read(self) -> bytes:
+        if self._socket is None:
+            raise TransportClosed(f"{self.name}: not connected")
+        data = bytearray()
+        try:
+            # Also what is decrypted already, for which no descriptor becomes readable.
+            while len(data) < 65536 or self._socket.pending():
+                part = self._socket.recv(65536)
+                if not part:
+                    break
+                data += part
+        except (ssl.SSLWantReadError, ssl.SSLWantWriteError, InterruptedError):
+            return bytes(data)
+        except OSError as error:
+            raise self._failed(error) from error
+        if not data:
+            why = "the device closed the connection" if self._heard else "another host is connected to the device"
+            raise TransportClosed(f"{self.name}: {why}", reason=why)
+        self._heard = True
+        return bytes(data)
+
+    def write(self, data: bytes) -> int:
+        if self._socket is None:
+            raise TransportClosed(f"{self.name}: not connected")
+        try:
+            return self._socket.send(data)
+        except (ssl.SSLWantReadError, ssl.SSLWantWriteError, InterruptedError):
+            return 0
+        except OSError as error:
+            raise self._failed(error) from error
+
+
 def open_transport(address: str, baud: int | None = None) -> Transport:
-    """A transport, not yet opened, for `serial:/dev/ttyUSB0@3000000`, `/dev/ttyUSB0` (speed from `baud`) or `tcp://host:port`.
+    """A transport, not yet opened, for `serial:/dev/ttyUSB0@3000000`, `/dev/ttyUSB0` (speed from `baud`), `tls://host:port`
+    or `tcp://host:port`.
 
     Raises PipefishError if the address makes no sense.
     """
-    if address.startswith("tcp://"):
-        match = re.fullmatch(r"tcp://(\[[0-9a-fA-F:.]+\]|[^\[\]/:]+)(?::(\d+))?/?", address)
+    if address.startswith(("tcp://", "tls://")):
+        match = re.fullmatch(r"t(?:cp|ls)://(\[[0-9a-fA-F:.]+\]|[^\[\]/:]+)(?::(\d+))?/?", address)
         port = int(match[2] or DEFAULT_PORT) if match else 0
         if not match or not 0 < port < 65536:
             raise PipefishError(
-                f"'{address}' is no address; write tcp://host:port, for example tcp://10.0.0.7:{DEFAULT_PORT}"
+                f"'{address}' is no address; write tls://host:port, for example tls://10.0.0.7:{DEFAULT_PORT}"
             )
-        return TcpTransport(match[1].strip("[]"), port)
+        return (TlsTransport if address[1] == "l" else TcpTransport)(match[1].strip("[]"), port)
     path = address.removeprefix("serial:")
     if "://" in path or not path:
         raise PipefishError(
-            f"'{address}' is no device; write /dev/ttyUSB0, serial:/dev/ttyUSB0@3000000 or tcp://host:port"
+            f"'{address}' is no device; write /dev/ttyUSB0, serial:/dev/ttyUSB0@3000000, tls://host:port or tcp://host:port"
         )
     path, at, speed = path.rpartition("@") if re.search(r"@\d*$", path) else (path, "", "")
     if at:

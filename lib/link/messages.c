@@ -259,6 +259,17 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     if (in->has_profile)
         out->profile = profile_message(&in->profile);
     set_tracking(&out->tracking, &in->tracking);
+    out->has_network = in->has_network;
+    if (in->has_network)
+        out->network = (pipefish_v1_Status_Network){.peer = text(in->network.peer),
+                                                    .role = text(in->network.role),
+                                                    .sessions = in->network.sessions,
+                                                    .refused_unknown = in->network.refused_unknown,
+                                                    .refused_revoked = in->network.refused_revoked,
+                                                    .refused_handshake = in->network.refused_handshake,
+                                                    .refused_late = in->network.refused_late,
+                                                    .refused_often = in->network.refused_often,
+                                                    .refused_busy = in->network.refused_busy};
 }
 
 /* The library fails on a full buffer only: the callbacks here never do, and texts are not checked. */
@@ -427,7 +438,7 @@ pf_status pf_msg_encode_preview(const pf_msg_preview *p, uint8_t *out, size_t ca
 pf_status pf_msg_encode_reply(const pf_msg_reply *r, uint8_t *out, size_t capacity, size_t *n)
 {
     pipefish_v1_Reply m = pipefish_v1_Reply_init_zero;
-    if ((r->status != NULL) + (r->info != NULL) + (r->profile != NULL) > 1)
+    if ((r->status != NULL) + (r->info != NULL) + (r->profile != NULL) + (r->paired_key != NULL) > 1)
         return PF_ERR_ARGUMENT;
     m.id = r->id;
     m.error = text(r->error);
@@ -455,6 +466,9 @@ pf_status pf_msg_encode_reply(const pf_msg_reply *r, uint8_t *out, size_t capaci
             state->in_use = profile_message(&r->profile->in_use);
         if (state->has_stored)
             state->stored = profile_message(&r->profile->stored);
+    } else if (r->paired_key) {
+        m.which_what = pipefish_v1_Reply_paired_tag;
+        memcpy(m.what.paired.key, r->paired_key, sizeof m.what.paired.key);
     }
     return encode(pipefish_v1_Reply_fields, &m, out, capacity, n);
 }
@@ -468,7 +482,8 @@ _Static_assert((int)PF_REQUEST_GET_STATUS == pipefish_v1_Request_get_status_tag 
                    (int)PF_REQUEST_SHUTDOWN == pipefish_v1_Request_shutdown_tag &&
                    (int)PF_REQUEST_GET_PROFILE == pipefish_v1_Request_get_profile_tag &&
                    (int)PF_REQUEST_CONFIRM_PROFILE == pipefish_v1_Request_confirm_profile_tag &&
-                   (int)PF_REQUEST_REVERT_PROFILE == pipefish_v1_Request_revert_profile_tag,
+                   (int)PF_REQUEST_REVERT_PROFILE == pipefish_v1_Request_revert_profile_tag &&
+                   (int)PF_REQUEST_PAIR == pipefish_v1_Request_pair_tag,
                "pf_msg_decode_request copies the number");
 
 pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *request)
@@ -482,6 +497,11 @@ pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *
         request->lamp = m.what.set_lamp;
     if (request->what == PF_REQUEST_CONFIRM_PROFILE)
         memcpy(request->profile_sha256, m.what.confirm_profile, sizeof request->profile_sha256);
+    if (request->what == PF_REQUEST_PAIR) {
+        memcpy(request->pair.key, m.what.pair.key, sizeof request->pair.key);
+        memcpy(request->pair.role, m.what.pair.role, sizeof request->pair.role);
+        memcpy(request->pair.name, m.what.pair.name, sizeof request->pair.name);
+    }
     if (request->what == PF_REQUEST_CLOCK_SYNC)
         request->clock =
             (pf_msg_clock_sync){m.what.clock_sync.boot_id, m.what.clock_sync.offset_ns, m.what.clock_sync.error_ns};

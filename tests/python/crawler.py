@@ -129,8 +129,9 @@ class Crawler:
 class Store(ObjectHandlers):
     """A host's durable store: what it holds outlives its clients."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, transport: type[TcpTransport] = TcpTransport) -> None:
         self.port = port
+        self.transport = transport
         self.objects: dict[bytes, tuple[int, bytes]] = {}
         self.arrivals: Counter[bytes] = Counter()
         self.statuses: list[pb.Status] = []
@@ -154,7 +155,7 @@ class Store(ObjectHandlers):
     @contextlib.contextmanager
     def client(self) -> Iterator[Client]:
         """A fresh client, as after the host's own restart; waits for the daemon's port."""
-        client = Client(TcpTransport("127.0.0.1", self.port), self)
+        client = Client(self.transport("127.0.0.1", self.port), self)
         end = time.monotonic() + 10
         while True:
             try:

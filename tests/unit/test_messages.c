@@ -68,6 +68,8 @@ static pf_msg_status sample_status(void)
                        .uptime_ns = 99,
                        .has_clock = true,
                        .clock = {7, -123456789, 1000},
+                       .has_network = true,
+                       .network = {"Anna", "viewer", 3, 4, 5, 6, 7, 8, 9},
                        .tracking = sample_tracking()};
     s.link.bytes_out = 21;
     s.link.bytes_in = 22;
@@ -215,6 +217,10 @@ static void check_status(view s)
     check_tracking(bytes(s, 20));
     TEST_ASSERT_EQUAL_INT64(-123456789, zigzag(number(bytes(s, 18), 2)));
     TEST_ASSERT_EQUAL_UINT64(1000, number(bytes(s, 18), 3));
+    check_text("Anna", bytes(bytes(s, 30), 1));
+    check_text("viewer", bytes(bytes(s, 30), 2));
+    for (uint32_t i = 3; i <= 9; i++)
+        TEST_ASSERT_EQUAL_UINT64(i, number(bytes(s, 30), i));
 }
 
 static pf_msg_profile sample_profile(void)
@@ -437,6 +443,10 @@ static void test_reply_round_trip(void)
     reply.info = &info;
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 
+    reply = (pf_msg_reply){.id = 80, .error = "", .paired_key = state.stored.sha256};
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_MEMORY(state.stored.sha256, bytes(bytes((view){out, n}, 20), 1).data, 32);
+
     status.has_profile = true;
     status.profile = sample_profile();
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_status(&status, out, sizeof out, &n));
@@ -461,6 +471,9 @@ static void test_largest_status_fits_a_control_message(void)
     memset(problem, 'x', sizeof problem - 1);
     s.has_profile = s.profile.is_trial = true;
     s.profile.name = s.profile.serial = name;
+    s.has_network = true;
+    s.network.peer = name + sizeof name - 48; /* as long as a host's name may be */
+    s.network.role = "calibrator";
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 
     pf_msg_profile_state state = {true, true, s.profile, s.profile, problem, {UINT32_MAX, UINT32_MAX}};
@@ -592,6 +605,14 @@ static void test_requests_are_decoded(void)
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(confirm, sizeof confirm, &r));
     TEST_ASSERT_EQUAL_INT(PF_REQUEST_CONFIRM_PROFILE, r.what);
     TEST_ASSERT_EQUAL_MEMORY(sha256, r.profile_sha256, sizeof sha256);
+    uint8_t pair[64] = {0x08, 4, 0xA2, 0x01, 50, 0x0A, 32}; /* field 20 of 50 bytes */
+    memcpy(pair + 7, sha256, sizeof sha256);
+    memcpy(pair + 39, "\x12\x06viewer\x1A\x06laptop", 16);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(pair, 55, &r));
+    TEST_ASSERT_EQUAL_INT(PF_REQUEST_PAIR, r.what);
+    TEST_ASSERT_EQUAL_MEMORY(sha256, r.pair.key, sizeof sha256);
+    TEST_ASSERT_EQUAL_STRING("viewer", r.pair.role);
+    TEST_ASSERT_EQUAL_STRING("laptop", r.pair.name);
     confirm[3] = 31; /* not a SHA-256 */
     TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_msg_decode_request(confirm, sizeof confirm - 1, &r));
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(newer, sizeof newer, &r));

@@ -164,7 +164,7 @@ static void test_room_bounds_the_queue(void)
     close(client);
 }
 
-/* Proves: only loopback is listened on without TLS; what is no address is said to be none. */
+/* Proves: only loopback is listened on without encryption; what is no address is said to be none. */
 static void test_other_addresses_are_refused(void)
 {
     static const char *const others[] = {"0.0.0.0", "192.168.1.1", "128.0.0.1", "::", "fe80::1", "::ffff:127.0.0.1"};
@@ -173,7 +173,7 @@ static void test_other_addresses_are_refused(void)
         pf_tcp_config config = {others[i], 0};
         TEST_ASSERT_EQUAL_INT_MESSAGE(PF_ERR_UNSUPPORTED, pf_tcp_listen(&line, &config, error, sizeof error),
                                       others[i]);
-        TEST_ASSERT_NOT_NULL(strstr(error, "TLS"));
+        TEST_ASSERT_NOT_NULL(strstr(error, "tls"));
         TEST_ASSERT_NOT_NULL(strstr(error, others[i]));
     }
     for (size_t i = 0; i < sizeof no_addresses / sizeof no_addresses[0]; i++) {

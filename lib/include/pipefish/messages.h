@@ -87,6 +87,11 @@ typedef struct pf_msg_spool {
     uint64_t objects, bytes, stored, acknowledged, errors;
 } pf_msg_spool;
 
+typedef struct pf_msg_network {
+    const char *peer, *role; /* "" = nobody */
+    uint32_t sessions, refused_unknown, refused_revoked, refused_handshake, refused_late, refused_often, refused_busy;
+} pf_msg_network;
+
 typedef struct pf_msg_clock_sync {
     uint64_t boot_id;
     int64_t offset_ns;
@@ -120,6 +125,8 @@ typedef struct pf_msg_status {
     bool has_profile;
     pf_msg_profile profile; /* in use */
     pf_msg_tracking tracking;
+    bool has_network;
+    pf_msg_network network;
 } pf_msg_status;
 
 typedef struct pf_msg_survey_end {
@@ -158,10 +165,12 @@ typedef struct pf_msg_profile_state {
 
 typedef struct pf_msg_reply {
     uint32_t id;
-    const char *error;           /* "" = done */
-    const pf_msg_status *status; /* at most one of status, info and profile; all NULL = none was asked for */
+    const char *error; /* "" = done */
+    const pf_msg_status
+        *status; /* at most one of status, info, profile and paired_key; all NULL = none was asked for */
     const pf_msg_info *info;
     const pf_msg_profile_state *profile;
+    const uint8_t *paired_key; /* 32 bytes, the device's */
 } pf_msg_reply;
 
 typedef enum pf_request_what {
@@ -175,7 +184,13 @@ typedef enum pf_request_what {
     PF_REQUEST_GET_PROFILE = 8,
     PF_REQUEST_CONFIRM_PROFILE = 9,
     PF_REQUEST_REVERT_PROFILE = 10,
+    PF_REQUEST_PAIR = 20,
 } pf_request_what;
+
+typedef struct pf_msg_pair {
+    uint8_t key[32]; /* the host's */
+    char role[12], name[48];
+} pf_msg_pair;
 
 typedef struct pf_msg_request {
     uint32_t id;
@@ -183,6 +198,7 @@ typedef struct pf_msg_request {
     float lamp;                 /* PF_REQUEST_SET_LAMP; as sent: may be any float */
     pf_msg_clock_sync clock;    /* PF_REQUEST_CLOCK_SYNC */
     uint8_t profile_sha256[32]; /* PF_REQUEST_CONFIRM_PROFILE */
+    pf_msg_pair pair;           /* PF_REQUEST_PAIR; the texts are any UTF-8 */
 } pf_msg_request;
 
 /* Marks the keyframe message out[0 .. *n) as the first after a break, for this reason; *n grows. PF_ERR_SPACE. */

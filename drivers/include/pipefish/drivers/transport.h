@@ -1,10 +1,28 @@
-/* A byte stream to the other end: serial line, TCP. Never blocks; the daemon's loop polls fd. */
+/* A byte stream to the other end: serial line, TCP, TLS. Never blocks; the daemon's loop polls fd. */
 #ifndef PIPEFISH_DRIVERS_TRANSPORT_H
 #define PIPEFISH_DRIVERS_TRANSPORT_H
 
 #include "pipefish/base.h"
 
 #define PF_TRANSPORT_RETRY_MS 250u
+
+/* What the host at the other end may do; each may also do what those before it may. */
+typedef enum pf_role {
+    PF_ROLE_NONE = 0,
+    PF_ROLE_REVOKED,    /* nothing, never again */
+    PF_ROLE_VIEWER,     /* see status, previews, profile */
+    PF_ROLE_OPERATOR,   /* take the survey's objects, which the device then forgets; lamp, stop, shut down */
+    PF_ROLE_CALIBRATOR, /* send, confirm and revert profiles; let other hosts in */
+} pf_role;
+
+typedef struct pf_transport_stats { /* of a transport that lets in only those it knows; since it was opened */
+    uint32_t sessions;              /* hosts let in */
+    uint32_t refused_unknown, refused_revoked;
+    uint32_t refused_handshake; /* no certificate, another version, no TLS at all */
+    uint32_t refused_late;      /* the handshake took too long */
+    uint32_t refused_often;     /* too many at once, or after too many failures */
+    uint32_t refused_busy;      /* another host has the line */
+} pf_transport_stats;
 
 typedef struct pf_transport {
     void *self;
@@ -32,6 +50,10 @@ typedef struct pf_transport_ops {
      * much it holds, counts as a line of that rate. TCP: 64 KiB. */
     size_t (*room)(void *self);
 
+    /* Who is there. A wire or loopback ends where only those who may touch the device are: whoever speaks there may do
+     * everything, and has no name (""). *stats is NULL where nobody is refused. PF_ROLE_NONE: nobody. */
+    pf_role (*peer)(void *self, const char **name, const pf_transport_stats **stats);
+
     const char *(*name)(void *self);  /* "serial /dev/ttyS0 3000000", "tcp 127.0.0.1:7447" */
     const char *(*error)(void *self); /* last failure in words */
     void (*close)(void *self);
@@ -48,7 +70,8 @@ typedef struct pf_serial_config {
  * PF_ERR_UNSUPPORTED (not a terminal, or not at this rate). */
 pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config, char *error, size_t n);
 
-/* Listens; one client at a time, the next waits. Without TLS (a later issue) only loopback addresses are accepted. */
+/* Listens; one client at a time, the next waits. Nothing is encrypted: only loopback addresses are accepted
+ * (pf_tls_listen is for the others). */
 typedef struct pf_tcp_config {
     const char *address; /* "127.0.0.1", "::1" */
     uint16_t port;       /* 0 = any; name() tells which */

@@ -1,0 +1,431 @@
+/* Mutual TLS 1.3 by OpenSSL. One epoll descriptor holds the listener, the guests whose handshake is under way, and the
+ * connection: it is what the daemon polls, and it becomes readable for all of them. */
+#include "common/listener.h"
+#include "tls/gate.h"
+#include "trust/private.h"
+
+#include <errno.h>
+#include <openssl/err.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <time.h>
+#include <unistd.h>
+
+#define GUESTS_MAX           4
+#define GUESTS_OF_ADDRESS    2
+#define HANDSHAKE_NS         UINT64_C(5000000000)
+#define LEAVING_NS           UINT64_C(1000000000) /* for the peer to read why */
+#define RECHECK_NS           UINT64_C(500000000)  /* between looks at the file of hosts */
+#define CERTIFICATE_MAX      8192                 /* bytes of a peer's chain */
+#define ACCEPTS_MAX          16                   /* of one call of service: the rest of the daemon waits */
+#define FINGERPRINT_IN_ERROR 16                   /* digits */
+
+typedef struct guest {
+    int fd; /* -1 = free */
+    SSL *ssl;
+    bool is_counted; /* among the refused, by its key */
+    bool is_leaving; /* it was refused; what it still sends is thrown away until it closes */
+    uint64_t deadline_ns;
+    uint8_t address[16], key[32];
+    pf_role role;
+    char name[PF_PEER_NAME_MAX];
+    uint32_t events; /* that epoll watches */
+} guest;
+
+typedef struct tls {
+    SSL_CTX *context;
+    pf_trust *trust;
+    int epoll, listener;
+    guest guests[GUESTS_MAX], host; /* host.fd -1 = nobody */
+    uint64_t silence_ns, heard_ns, recheck_ns;
+    pf_gate gate;
+    pf_transport_stats stats;
+    char name[PF_LISTENER_NAME_MAX];
+    pf_failure failure;
+} tls;
+
+static uint64_t now_ns(void)
+{
+    struct timespec t;
+    (void)clock_gettime(CLOCK_MONOTONIC, &t);
+    return (uint64_t)t.tv_sec * 1000000000u + (uint64_t)t.tv_nsec;
+}
+
+static void watch(tls *t, guest *g, uint32_t events)
+{
+    struct epoll_event e = {.events = events};
+    if (g->events == events)
+        return;
+    if (epoll_ctl(t->epoll, g->events == 0 ? EPOLL_CTL_ADD : EPOLL_CTL_MOD, g->fd, &e) == 0)
+        g->events = events;
+}
+
+static void drop(guest *g)
+{
+    SSL_free(g->ssl);
+    if (g->fd >= 0)
+        (void)close(g->fd); /* which also ends its watch */
+    memset(g, 0, sizeof *g);
+    g->fd = -1;
+}
+
+/* ---- who may come in */
+
+/* OpenSSL asks this instead of looking for an issuer: the key alone counts. */
+static int verify(X509_STORE_CTX *store, void *argument)
+{
+    tls *t = argument;
+    SSL *ssl = X509_STORE_CTX_get_ex_data(store, SSL_get_ex_data_X509_STORE_CTX_idx());
+    guest *g = SSL_get_app_data(ssl);
+    X509 *certificate = X509_STORE_CTX_get0_cert(store);
+    if (certificate == NULL || !pf_certificate_key(certificate, g->key))
+        return 0;
+    g->role = pf_trust_role(t->trust, g->key, g->name);
+    if (g->role >= PF_ROLE_VIEWER)
+        return 1;
+    X509_STORE_CTX_set_error(store, g->role == PF_ROLE_REVOKED ? X509_V_ERR_CERT_REVOKED : X509_V_ERR_CERT_REJECTED);
+    char key[65];
+    pf_key_print(g->key, key);
+    g->is_counted = true;
+    if (g->role == PF_ROLE_REVOKED) {
+        t->stats.refused_revoked++;
+        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a host whose key was revoked: %s (%.*s...)", g->name,
+                      FINGERPRINT_IN_ERROR, key);
+    } else {
+        t->stats.refused_unknown++;
+        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a host that is not known: key %s", key);
+    }
+    return 0;
+}
+
+static pf_status open_context(tls *t)
+{
+    t->context = SSL_CTX_new(TLS_server_method());
+    /* No tickets and no resumption: each session proves its key anew, and nothing that was recorded can be sent again.
+     */
+    bool ok = t->context != NULL && SSL_CTX_set_min_proto_version(t->context, TLS1_3_VERSION) == 1 &&
+              SSL_CTX_set_max_proto_version(t->context, TLS1_3_VERSION) == 1 &&
+              SSL_CTX_set_num_tickets(t->context, 0) == 1 &&
+              SSL_CTX_use_certificate(t->context, pf_trust_certificate(t->trust)) == 1 &&
+              SSL_CTX_use_PrivateKey(t->context, pf_trust_private_key(t->trust)) == 1;
+    if (!ok) {
+        ERR_clear_error();
+        return pf_fail(&t->failure, PF_ERR_IO, "%s: OpenSSL gives no TLS 1.3", t->name);
+    }
+    (void)SSL_CTX_set_session_cache_mode(t->context, SSL_SESS_CACHE_OFF);
+    (void)SSL_CTX_set_options(t->context, SSL_OP_NO_TICKET | SSL_OP_NO_COMPRESSION);
+    (void)SSL_CTX_set_mode(t->context, SSL_MODE_ENABLE_PARTIAL_WRITE | SSL_MODE_ACCEPT_MOVING_WRITE_BUFFER |
+                                           SSL_MODE_RELEASE_BUFFERS);
+    SSL_CTX_set_max_cert_list(t->context, CERTIFICATE_MAX);
+    SSL_CTX_set_verify(t->context, SSL_VERIFY_PEER | SSL_VERIFY_FAIL_IF_NO_PEER_CERT, NULL);
+    SSL_CTX_set_cert_verify_callback(t->context, verify, t);
+    return PF_OK;
+}
+
+/* ---- guests */
+
+static guest *free_place(tls *t, const uint8_t address[16])
+{
+    guest *place = NULL;
+    int same = 0;
+    for (int i = 0; i < GUESTS_MAX; i++) {
+        if (t->guests[i].fd < 0)
+            place = &t->guests[i];
+        else if (memcmp(t->guests[i].address, address, 16) == 0)
+            same++;
+    }
+    return same < GUESTS_OF_ADDRESS ? place : NULL;
+}
+
+/* Takes those that wait. One for whom there is no place is closed at once: left waiting it would keep the listener
+ * readable, and the daemon awake. */
+static pf_status take_guests(tls *t, uint64_t now)
+{
+    for (int i = 0; i < ACCEPTS_MAX; i++) {
+        pf_address peer;
+        uint8_t address[16];
+        int fd = pf_listener_accept(t->listener, &peer);
+        if (fd < 0) {
+            if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
+                return PF_OK;
+            return pf_fail(&t->failure, PF_ERR_IO, "%s: accept: %s", t->name, strerror(errno));
+        }
+        pf_gate_address(&peer, address);
+        guest *g = pf_gate_is_open(&t->gate, address, now) ? free_place(t, address) : NULL;
+        SSL *ssl = g != NULL ? SSL_new(t->context) : NULL;
+        if (ssl == NULL || SSL_set_fd(ssl, fd) != 1) {
+            SSL_free(ssl);
+            (void)close(fd);
+            t->stats.refused_often++;
+            continue;
+        }
+        *g = (guest){.fd = fd, .ssl = ssl, .deadline_ns = now + HANDSHAKE_NS};
+        memcpy(g->address, address, sizeof g->address);
+        SSL_set_accept_state(ssl);
+        SSL_set_app_data(ssl, g);
+        watch(t, g, EPOLLIN);
+    }
+    return PF_OK;
+}
+
+/* Says no more, but lets the peer read what was said: a close with bytes unread would destroy it on the way. */
+static void send_away(tls *t, guest *g, uint64_t now)
+{
+    (void)shutdown(g->fd, SHUT_WR);
+    g->is_leaving = true;
+    g->deadline_ns = now + LEAVING_NS;
+    watch(t, g, EPOLLIN);
+}
+
+static void see_off(tls *t, guest *g, uint64_t now)
+{
+    uint8_t bytes[4096];
+    ssize_t k = recv(g->fd, bytes, sizeof bytes, 0);
+    if (k == 0 || (k < 0 && errno != EAGAIN && errno != EINTR) || now >= g->deadline_ns)
+        drop(g);
+    (void)t;
+}
+
+/* A guest that has proved its key: it becomes the host, or is told that there is one. */
+static bool welcome(tls *t, guest *g, uint64_t now)
+{
+    if (t->host.fd >= 0 && memcmp(t->host.key, g->key, 32) != 0 && now - t->heard_ns < t->silence_ns) {
+        t->stats.refused_busy++;
+        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "%s wanted in while %s is there", g->name, t->host.name);
+        (void)SSL_shutdown(g->ssl);
+        send_away(t, g, now);
+        return false;
+    }
+    drop(&t->host);
+    t->host = *g;
+    g->ssl = NULL;
+    g->fd = -1;
+    SSL_set_app_data(t->host.ssl, &t->host);
+    t->heard_ns = now;
+    t->stats.sessions++;
+    return true;
+}
+
+/* One step of a handshake. True: it became the host. */
+static bool serve_guest(tls *t, guest *g, uint64_t now)
+{
+    if (g->is_leaving) {
+        see_off(t, g, now);
+        return false;
+    }
+    ERR_clear_error();
+    int done = SSL_do_handshake(g->ssl);
+    int why = done == 1 ? SSL_ERROR_NONE : SSL_get_error(g->ssl, done);
+    if (why == SSL_ERROR_NONE)
+        return welcome(t, g, now);
+    if (why == SSL_ERROR_WANT_READ || why == SSL_ERROR_WANT_WRITE) {
+        if (now < g->deadline_ns) {
+            watch(t, g, why == SSL_ERROR_WANT_WRITE ? EPOLLIN | EPOLLOUT : EPOLLIN);
+            return false;
+        }
+        t->stats.refused_late++;
+        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a handshake took longer than 5 s");
+    } else if (!g->is_counted) {
+        const char *reason = ERR_reason_error_string(ERR_peek_last_error());
+        t->stats.refused_handshake++;
+        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a handshake failed: %s", reason != NULL ? reason : "closed");
+    }
+    ERR_clear_error();
+    pf_gate_note_failure(&t->gate, g->address, now);
+    send_away(t, g, now);
+    return false;
+}
+
+/* ---- the host that is there */
+
+static pf_status hang_up(tls *t, const char *why)
+{
+    drop(&t->host);
+    return pf_fail(&t->failure, PF_ERR_CLOSED, "%s", why);
+}
+
+/* A key that was revoked while its host is there ends the session. So does another role: what it may do is settled when
+ * a session begins. */
+static void recheck(tls *t, uint64_t now)
+{
+    if (t->host.fd < 0 || now < t->recheck_ns)
+        return;
+    t->recheck_ns = now + RECHECK_NS;
+    if (pf_trust_role(t->trust, t->host.key, t->host.name) != t->host.role) {
+        (void)SSL_shutdown(t->host.ssl);
+        (void)hang_up(t, "the host's role was changed");
+    }
+}
+
+/* Bytes that OpenSSL has already decrypted make no descriptor readable: the watch for room, which there nearly always
+ * is, stands for them. */
+static void rewatch(tls *t, bool is_full)
+{
+    watch(t, &t->host, is_full || SSL_pending(t->host.ssl) > 0 ? EPOLLIN | EPOLLOUT : EPOLLIN);
+}
+
+/* What an SSL_read or SSL_write of `k` came to. True: it may be tried again later. */
+static bool may_go_on(tls *t, int k, bool *is_full)
+{
+    int why = SSL_get_error(t->host.ssl, k);
+    *is_full = why == SSL_ERROR_WANT_WRITE;
+    return why == SSL_ERROR_WANT_READ || why == SSL_ERROR_WANT_WRITE;
+}
+
+static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *done)
+{
+    tls *t = self;
+    bool is_full = false;
+    *done = 0;
+    if (t->host.fd < 0)
+        return PF_ERR_CLOSED;
+    if (capacity == 0)
+        return PF_OK;
+    ERR_clear_error();
+    int k = SSL_read(t->host.ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
+    if (k > 0) {
+        *done = (size_t)k;
+        t->heard_ns = now_ns();
+    } else if (!may_go_on(t, k, &is_full)) {
+        return hang_up(t, "the other side closed the connection");
+    }
+    rewatch(t, is_full);
+    return PF_OK;
+}
+
+static pf_status tls_write(void *self, const uint8_t *bytes, size_t n, size_t *done)
+{
+    tls *t = self;
+    bool is_full = false;
+    *done = 0;
+    if (t->host.fd < 0)
+        return PF_ERR_CLOSED;
+    if (n == 0)
+        return PF_OK;
+    ERR_clear_error();
+    int k = SSL_write(t->host.ssl, bytes, n > 65536 ? 65536 : (int)n);
+    if (k > 0)
+        *done = (size_t)k;
+    else if (!may_go_on(t, k, &is_full))
+        return hang_up(t, "the connection broke");
+    rewatch(t, is_full);
+    return PF_OK;
+}
+
+/* ---- the interface */
+
+static int tls_fd(void *self)
+{
+    tls *t = self;
+    return t->epoll;
+}
+
+static pf_status tls_service(void *self, bool *fresh)
+{
+    tls *t = self;
+    uint64_t now = now_ns();
+    *fresh = false;
+    pf_status status = take_guests(t, now);
+    for (int i = 0; i < GUESTS_MAX; i++)
+        if (t->guests[i].fd >= 0 && serve_guest(t, &t->guests[i], now))
+            *fresh = true;
+    recheck(t, now);
+    if (t->host.fd >= 0)
+        return PF_OK;
+    *fresh = false;
+    return status == PF_OK ? PF_ERR_AGAIN : status;
+}
+
+static size_t tls_room(void *self)
+{
+    tls *t = self;
+    return pf_tcp_queue_room(t->host.fd);
+}
+
+static pf_role tls_peer(void *self, const char **name, const pf_transport_stats **stats)
+{
+    tls *t = self;
+    *stats = &t->stats;
+    *name = t->host.name;
+    return t->host.role;
+}
+
+static const char *tls_name(void *self)
+{
+    tls *t = self;
+    return t->name;
+}
+
+static const char *tls_error(void *self)
+{
+    tls *t = self;
+    return t->failure.text;
+}
+
+static void tls_close(void *self)
+{
+    tls *t = self;
+    if (t->host.fd >= 0)
+        (void)SSL_shutdown(t->host.ssl);
+    drop(&t->host);
+    for (int i = 0; i < GUESTS_MAX; i++)
+        drop(&t->guests[i]);
+    if (t->listener >= 0)
+        (void)close(t->listener);
+    if (t->epoll >= 0)
+        (void)close(t->epoll);
+    SSL_CTX_free(t->context);
+    free(t);
+}
+
+static pf_status open_sockets(tls *t, const pf_tls_config *config)
+{
+    pf_address a;
+    struct epoll_event e = {.events = EPOLLIN};
+    pf_status status = pf_address_parse(&a, config->address, config->port, "tls", &t->failure);
+    if (status == PF_OK)
+        status = pf_listener_open(&t->listener, t->name, &a, config->address, "tls", &t->failure);
+    if (status != PF_OK)
+        return status;
+    t->epoll = epoll_create1(EPOLL_CLOEXEC);
+    if (t->epoll < 0 || epoll_ctl(t->epoll, EPOLL_CTL_ADD, t->listener, &e) != 0)
+        return pf_fail(&t->failure, PF_ERR_IO, "%s: epoll: %s", t->name, strerror(errno));
+    return PF_OK;
+}
+
+pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, char *error, size_t n)
+{
+    static const pf_transport_ops ops = {
+        .fd = tls_fd,
+        .service = tls_service,
+        .read = tls_read,
+        .write = tls_write,
+        .room = tls_room,
+        .peer = tls_peer,
+        .name = tls_name,
+        .error = tls_error,
+        .close = tls_close,
+    };
+    pf_failure failure = {""};
+    tls *t = calloc(1, sizeof *t);
+    if (t == NULL)
+        return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "tls: no memory"), error, n);
+    t->epoll = t->listener = t->host.fd = -1;
+    for (int i = 0; i < GUESTS_MAX; i++)
+        t->guests[i].fd = -1;
+    t->trust = config->trust;
+    t->silence_ns = config->silence_ms * UINT64_C(1000000);
+    pf_status status = open_sockets(t, config);
+    if (status == PF_OK)
+        status = open_context(t);
+    if (status != PF_OK) {
+        pf_failure_copy(&t->failure, status, error, n);
+        tls_close(t);
+        return status;
+    }
+    transport->self = t;
+    transport->ops = &ops;
+    return PF_OK;
+}

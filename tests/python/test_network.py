@@ -1,0 +1,451 @@
+"""The device on a network: who gets in, what each role may do, and that who does not get in harms nobody."""
+
+import contextlib
+import hashlib
+import os
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+from crawler import Crawler, Store, find_daemon, wait_for_log, write_recording
+from pipefish import keys
+from pipefish import pipefish_pb2 as pb
+from pipefish.cli import main
+from pipefish.client import Client, Handlers, NoDevice
+from pipefish.errors import PipefishError
+from pipefish.flash import Flasher
+from pipefish.transport import Refused, TlsTransport
+
+
+@pytest.fixture(autouse=True)
+def own_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "host"))
+
+
+@pytest.fixture
+def device(tmp_path: Path):
+    """A daemon that serves until it is told to stop, with a small survey in its spool."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    crawler = Crawler(
+        tmp_path,
+        link__transport="tls",
+        link__trust=tmp_path / "trust",
+        link__keepalive_ms=200,
+        camera__profile_store=tmp_path / "profiles",
+        daemon__exit_when_done="false",
+        daemon__drain_s=0,
+    )
+    crawler.start()
+    wait_for_log(crawler, "127.0.0.1:")
+    yield crawler
+    if crawler.process.poll() is None:
+        crawler.kill()
+
+
+def let_in(crawler: Crawler, role: str, key: str | None = None, name: str = "tester") -> str:
+    """What the device's owner does on its console; returns the device's key, which this host then knows."""
+    out = subprocess.run(
+        [find_daemon(), "--config", crawler.config, "--pair", f"{role} {key or keys.host_key()} {name}"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    device = out.split("this device's key: ")[1].strip()
+    keys.remember_device(device, "crawler")
+    return device
+
+
+def another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """From now on we are somebody else; returns his key."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
+    return keys.host_key()
+
+
+def open_client(crawler: Crawler) -> Client:
+    client = Client(TlsTransport("127.0.0.1", crawler.port), Handlers())
+    client.open()
+    return client
+
+
+def network(crawler: Crawler, **wanted: int) -> dict:
+    """The counters of the status file, once those `wanted` are reached."""
+    end = time.monotonic() + 15
+    counters: dict = {}
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            counters = crawler.status()["network"]
+            if all(counters[key] >= value for key, value in wanted.items()):
+                return counters
+        time.sleep(0.05)
+    pytest.fail(f"wanted {wanted}, the device counts {counters}")
+
+
+def raw_tls(port: int, pem: Path | None = None, newest: ssl.TLSVersion = ssl.TLSVersion.TLSv1_3) -> ssl.SSLSocket:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    context.maximum_version = newest
+    if pem is not None:
+        context.load_cert_chain(pem)
+    wrapped = context.wrap_socket(socket.create_connection(("127.0.0.1", port), 5))
+    wrapped.settimeout(5)
+    return wrapped
+
+
+def connect_from(address: str, port: int) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port), 5, (address, 0))
+
+
+def own_certificate(path: Path, since: str, until: str) -> str:
+    """A P-256 key with a certificate of those years, as one PEM; returns its key."""
+    import datetime
+
+    key = generate_private_key(SECP256R1())
+    name = x509.Name([])
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(datetime.datetime.fromisoformat(since))
+        .not_valid_after(datetime.datetime.fromisoformat(until))
+        .sign(key, SHA256())
+    )
+    private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    path.write_bytes(private + certificate.public_bytes(Encoding.PEM))
+    return keys.certificate_key(certificate.public_bytes(Encoding.DER))
+
+
+def test_an_operator_takes_the_whole_survey_and_the_device_says_who_he_is(device: Crawler):
+    let_in(device, "operator")
+    store = Store(device.port, TlsTransport)
+    with store.client() as client:
+        client.run(lambda: store.ends, 20)
+        reply = client.answer_to(5, get_status=pb.Nothing())
+    assert [k.index for k in store.keyframes] == list(range(store.ends[0].keyframes)) and len(store.keyframes) > 5
+    assert reply.status.network.peer == "tester" and reply.status.network.role == "operator"
+    assert network(device, sessions=1)["refused_unknown"] == 0
+
+
+def test_a_viewer_sees_the_status_and_can_make_the_device_forget_nothing(device: Crawler):
+    let_in(device, "viewer")
+    store = Store(device.port, TlsTransport)
+    with store.client() as client:
+        client.answer_to(5, get_status=pb.Nothing())
+        with pytest.raises(PipefishError, match="role operator"):
+            client.answer_to(5, stop_survey=pb.Nothing())
+        with pytest.raises(PipefishError, match="role operator"):
+            client.answer_to(5, set_lamp=0.5)
+        with pytest.raises(PipefishError, match="role calibrator"):
+            client.answer_to(5, pair=pb.Pair(key=b"\1" * 32, role="calibrator", name="friend"))
+        end = time.monotonic() + 1
+        client.run(lambda: time.monotonic() > end, 5)
+    assert not store.objects
+    assert device.status()["spool"]["acknowledged"] == 0
+
+
+def test_objects_that_an_operator_left_halfway_are_not_offered_to_a_viewer(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "operator")
+
+    class Slow(Store):
+        def on_object(self, name: bytes, kind: int, data: bytes) -> None:
+            self.arrivals[name] += 1  # and it never says that it has it
+
+    slow = Slow(device.port, TlsTransport)
+    with slow.client() as client:
+        client.run(lambda: slow.arrivals, 10)
+    viewer = another_user(tmp_path / "viewer", monkeypatch)
+    let_in(device, "viewer", viewer, "visitor")
+    store = Store(device.port, TlsTransport)
+    with store.client() as client:
+        client.answer_to(5, get_status=pb.Nothing())
+        end = time.monotonic() + 1
+        client.run(lambda: time.monotonic() > end, 5)
+    assert not store.objects and device.status()["spool"]["acknowledged"] == 0
+
+
+def test_only_a_calibrator_may_flash(device: Crawler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    profile = b"no profile, but it must not even be looked at"
+    let_in(device, "operator")
+    with Flasher(TlsTransport("127.0.0.1", device.port), 5) as flasher:
+        with pytest.raises(PipefishError, match="refuses"):
+            flasher.send(profile)
+        with pytest.raises(PipefishError, match="role calibrator"):
+            flasher.revert()
+    let_in(device, "calibrator")
+    refused = pytest.raises(PipefishError, match="refuses the profile: the profile")
+    with Flasher(TlsTransport("127.0.0.1", device.port), 5) as flasher, refused:
+        flasher.send(profile)
+
+
+def test_an_unknown_host_is_sent_away_with_the_remedy_and_counted(device: Crawler):
+    keys.remember_device(let_in(device, "operator", "ab" * 32, "somebody"), "crawler")
+    client = open_client(device)  # the handshake of TLS 1.3 ends for the host before the device has looked at its key
+    with pytest.raises(Refused, match="pair first"):
+        client.run(lambda: client.up, 5)
+    client.close()
+    assert network(device, refused_unknown=1)["sessions"] == 0
+
+
+def test_a_device_with_another_key_gets_not_a_byte(device: Crawler):
+    let_in(device, "operator")
+    keys.forget_device("crawler")
+    keys.remember_device("cd" * 32, "crawler")
+    with pytest.raises(Refused, match="does not know"):
+        open_client(device)
+
+
+def test_a_revoked_key_ends_its_session_at_once_and_never_comes_back(device: Crawler, tmp_path: Path):
+    let_in(device, "operator")
+    client = open_client(device)
+    client.run(lambda: client.up, 5)
+    let_in(device, "revoked")
+    client.run(lambda: not client.up, 5)
+    with pytest.raises(Refused, match="revoked"):
+        client.run(lambda: client.up, 5)
+    client.close()
+    assert network(device, refused_revoked=1)
+    again = subprocess.run(
+        [find_daemon(), "--config", device.config, "--pair", f"operator {keys.host_key()} me"], capture_output=True
+    )
+    assert again.returncode == 1 and b"revoked" in again.stderr
+
+
+def test_no_certificate_an_old_tls_and_no_tls_at_all_are_refused(device: Crawler, tmp_path: Path):
+    let_in(device, "operator")
+    with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"), raw_tls(device.port) as s:
+        s.recv(1)
+    with pytest.raises(ssl.SSLError, match="PROTOCOL_VERSION"):
+        raw_tls(device.port, keys.host_key_file(), ssl.TLSVersion.TLSv1_2)
+    with socket.create_connection(("127.0.0.1", device.port), 5) as s:
+        s.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        s.settimeout(5)
+        with contextlib.suppress(ConnectionError):
+            while s.recv(4096):
+                pass
+    assert network(device, refused_handshake=3)["sessions"] == 0
+    client = open_client(device)
+    client.run(lambda: client.up, 5)
+    client.close()
+
+
+def test_dates_of_certificates_mean_nothing(device: Crawler, tmp_path: Path):
+    for name, since, until in (("past", "1990-01-01", "1991-01-01"), ("future", "2090-01-01", "2091-01-01")):
+        let_in(device, "operator", own_certificate(tmp_path / name, since, until), name)
+        with raw_tls(device.port, tmp_path / name) as s:
+            assert s.recv(1)  # the device begins to talk
+
+
+def test_a_recorded_session_cannot_be_played_again(device: Crawler):
+    let_in(device, "operator")
+    sent = bytearray()
+    with socket.create_server(("127.0.0.1", 0)) as proxy:
+
+        def carry() -> None:
+            near, _ = proxy.accept()
+            with near, socket.create_connection(("127.0.0.1", device.port)) as far:
+
+                def back() -> None:
+                    with contextlib.suppress(OSError):
+                        while data := far.recv(65536):
+                            near.sendall(data)
+
+                threading.Thread(target=back, daemon=True).start()
+                with contextlib.suppress(OSError):
+                    while data := near.recv(65536):
+                        sent.extend(data)
+                        far.sendall(data)
+
+        thread = threading.Thread(target=carry, daemon=True)
+        thread.start()
+        client = Client(TlsTransport("127.0.0.1", proxy.getsockname()[1]), Handlers())
+        client.open()
+        client.run(lambda: client.up, 5)
+        client.close()
+        thread.join(5)
+    before = network(device, sessions=1)["sessions"]
+    with socket.create_connection(("127.0.0.1", device.port), 5) as s:
+        s.sendall(bytes(sent))
+        s.settimeout(8)
+        with contextlib.suppress(OSError):
+            while s.recv(65536):
+                pass
+    counters = network(device, refused_handshake=1)
+    assert counters["sessions"] == before
+
+
+def test_slow_and_too_many_handshakes_do_not_keep_a_host_out(device: Crawler):
+    let_in(device, "operator")
+    loris = [connect_from("127.0.0.2", device.port) for _ in range(6)]
+    try:
+        for s in loris:
+            with contextlib.suppress(OSError):
+                s.sendall(b"\x16")
+        client = open_client(device)
+        client.run(lambda: client.up, 3)
+        client.close()
+        counters = network(device, refused_often=4, refused_late=2)
+        assert counters["sessions"] == 1
+    finally:
+        for s in loris:
+            s.close()
+
+
+def test_an_address_that_failed_five_times_waits_while_others_come_in(device: Crawler):
+    let_in(device, "operator")
+    for _ in range(8):
+        with (
+            contextlib.suppress(OSError),
+            socket.create_connection(("127.0.0.1", device.port), 5, ("127.0.0.3", 0)) as s,
+        ):
+            s.sendall(b"garbage\r\n\r\n")
+            s.settimeout(5)
+            while s.recv(100):
+                pass
+    counters = network(device, refused_often=3, refused_handshake=5)
+    assert counters["refused_handshake"] == 5
+    client = open_client(device)
+    client.run(lambda: client.up, 5)
+    client.close()
+
+
+def test_a_second_host_is_told_that_the_line_is_taken_and_the_first_goes_on(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "operator")
+    first = open_client(device)
+    first.run(lambda: first.up, 5)
+    running = True
+
+    def serve() -> None:
+        while running:
+            first.step(0.05)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        other = another_user(tmp_path / "other", monkeypatch)
+        let_in(device, "operator", other, "second")
+        second = open_client(device)
+        with pytest.raises(NoDevice, match="another host is connected"):
+            second.run(lambda: second.up, 1.5)
+        second.close()
+    finally:
+        running = False
+        thread.join()
+    assert first.up and first.reconnections == 0
+    assert network(device, refused_busy=1)
+    first.close()
+
+
+def test_a_host_that_lost_its_way_takes_its_own_place_over(device: Crawler):
+    let_in(device, "operator")
+    lost = open_client(device)
+    lost.run(lambda: lost.up, 5)
+    again = open_client(device)  # the device has not noticed yet that the first has gone
+    again.run(lambda: again.up, 5)
+    again.close()
+    lost.close()
+
+
+def test_a_host_that_falls_silent_makes_room_for_another(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "operator")
+    silent = open_client(device)
+    silent.run(lambda: silent.up, 5)
+    other = another_user(tmp_path / "other", monkeypatch)
+    let_in(device, "operator", other, "second")
+    time.sleep(4 * 0.2 + 0.3)
+    second = open_client(device)
+    second.run(lambda: second.up, 5)
+    second.close()
+    silent.close()
+
+
+def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawler):
+    let_in(device, "operator")
+    with raw_tls(device.port, keys.host_key_file()) as s:
+        block = hashlib.shake_256(b"garbage").digest(1 << 20)
+        with contextlib.suppress(OSError):
+            s.sendall(block)
+    client = open_client(device)
+    client.run(lambda: client.up, 5)
+    client.close()
+    assert device.process.poll() is None
+
+
+def test_pairing_by_the_cable_lets_a_host_in_and_remembers_the_device(tmp_path: Path, capsys):
+    write_recording(tmp_path / "survey.y4m", 10)
+    crawler = Crawler(tmp_path, link__trust=tmp_path / "trust", daemon__exit_when_done="false", daemon__drain_s=0)
+    crawler.start()
+    try:
+        wait_for_log(crawler, "127.0.0.1:")
+        cable = f"tcp://127.0.0.1:{crawler.port}"  # loopback: as trusted as the cable
+        assert main(["pair", cable, "--role", "viewer", "--device-name", "probe", "--name", "me and you"]) == 0
+        line = (tmp_path / "trust" / "peers").read_text()
+        assert line == f"viewer {keys.host_key()} me and you\n"
+        assert list(keys.known_devices().values()) == ["probe"]
+        assert main(["pair", cable, "--revoke", keys.host_key()]) == 0
+        assert (tmp_path / "trust" / "peers").read_text().startswith("revoked ")
+        assert main(["pair", cable, "--name", "again"]) == 1
+        assert "revoked" in capsys.readouterr().err
+    finally:
+        crawler.kill()
+
+
+def test_private_keys_are_for_their_owner_only(tmp_path: Path, device: Crawler):
+    let_in(device, "operator")
+    for path in (keys.host_key_file(), tmp_path / "trust" / "device.pem", tmp_path / "trust" / "peers"):
+        assert path.stat().st_mode & 0o777 == 0o600
+    os.chmod(keys.host_key_file(), 0o644)
+    with pytest.raises(PipefishError, match="others may read"):
+        open_client(device)
+    device.kill()
+    os.chmod(tmp_path / "trust" / "device.pem", 0o640)
+    device.start()
+    assert device.wait() == 1 and "others may read" in device.log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("operator", 'must be "role key name"'),
+        (f"king {'0' * 64} me", "role must be"),
+        (f"viewer {'0' * 63} me", "64 hexadecimal"),
+        (f"viewer {'0' * 64} ", "name must be"),
+        (f"viewer {'0' * 64} a\nviewer {'0' * 64} b", "line 2: this key is there already"),
+    ],
+)
+def test_a_damaged_file_of_hosts_stops_the_start_and_names_the_line(device: Crawler, tmp_path: Path, text, why):
+    let_in(device, "operator")
+    device.kill()
+    (tmp_path / "trust" / "peers").write_text(text + "\n")
+    device.start()
+    assert device.wait() == 1
+    assert "line " in device.log.read_text() and why in device.log.read_text()
+
+
+def test_a_file_of_hosts_that_is_damaged_while_the_device_runs_lets_nobody_in(device: Crawler, tmp_path: Path):
+    let_in(device, "operator")
+    (tmp_path / "trust" / "peers").write_text("nonsense\n")
+    client = open_client(device)
+    with pytest.raises(Refused):
+        client.run(lambda: client.up, 5)
+    client.close()
+
+
+def test_tcp_is_for_loopback_only_and_tls_needs_its_folder(tmp_path: Path):
+    write_recording(tmp_path / "survey.y4m", 2)
+    crawler = Crawler(tmp_path, link__address="0.0.0.0")
+    crawler.start()
+    assert crawler.wait() == 1 and "must be encrypted" in crawler.log.read_text()
+    crawler = Crawler(tmp_path, link__transport="tls")
+    crawler.start()
+    assert crawler.wait() == 1 and "link.trust" in crawler.log.read_text()
