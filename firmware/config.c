@@ -138,6 +138,12 @@ static const setting settings[] = {
      "JSON file with the status message's figures, replaced at intervals and at the end; empty = none"},
     {"daemon", "threads", INTEGER, AT(daemon.threads), "", "2", 1, 2, NULL,
      "2 = while a frame is tracked the next one is taken and the last one's keyframe made; the results are the same"},
+    {"daemon", "watchdog", TEXT, AT(daemon.watchdog), "", "", 0, 0, NULL,
+     "the board's watchdog, as /dev/watchdog, if the system does not feed it; empty = none"},
+    {"daemon", "watchdog_s", INTEGER, AT(daemon.watchdog_s), "s", "20", 2, 600, NULL,
+     "it resets the board after so long; a thread that works on one thing for half of it hangs, and no watchdog is "
+     "fed, the "
+     "service manager's neither"},
     {"daemon", "log_level", CHOICE, AT(daemon.log_level), "", "info", 0, 0, "error|warning|info|debug",
      "what goes to standard error"},
 };

@@ -65,7 +65,8 @@ typedef struct pf_config {
         uint32_t drain_s;
         bool exit_when_done;
         pf_config_text status_file;
-        uint32_t log_level, threads;
+        uint32_t log_level, threads, watchdog_s;
+        pf_config_text watchdog;
     } daemon;
     unsigned line[PF_CONFIG_KEYS_MAX]; /* where each key of the table was set; 0 = its default */
 } pf_config;

@@ -14,6 +14,7 @@
 #include "keeper.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
+#include "pulse.h"
 
 #define MS          UINT64_C(1000000) /* ns */
 #define PUBLISH_NS  (50 * MS)         /* the link's counters go to the status at most so often */
@@ -504,7 +505,9 @@ static void *run(void *argument)
 {
     pf_courier *c = argument;
     uint64_t quit_at = UINT64_MAX;
+    pf_pulse_begin(PF_PULSE_COURIER);
     for (;;) {
+        pf_pulse_work();
         uint64_t now = pf_now(), deadline;
         bool is_full;
         if (quit_at == UINT64_MAX && atomic_load(&c->is_quitting)) {
@@ -534,9 +537,11 @@ static void *run(void *argument)
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
         if (pf_link_is_up(c->link) && c->status_due < deadline)
             deadline = c->status_due;
+        pf_pulse_rest();
         wait_for_work(c, deadline, quit_at, is_full);
     }
     publish(c, pf_now());
+    pf_pulse_rest();
     return NULL;
 }
 

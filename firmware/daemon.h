@@ -50,6 +50,7 @@ typedef struct pf_counters {
 } pf_counters;
 
 typedef struct pf_keeper pf_keeper;
+typedef struct pf_recall pf_recall;
 
 typedef struct pf_daemon {
     pf_config config;
@@ -66,6 +67,7 @@ typedef struct pf_daemon {
     uint8_t profile_bytes[PF_PROFILE_BINARY_MAX];
     size_t profile_size;
     uint8_t profile_sha256[32];
+    pf_recall *recall;
     pf_keeper *keeper; /* of camera.profile_store; NULL = there is none */
     pf_store *store;
     int wake_fd;       /* eventfd: wakes the courier */

@@ -12,11 +12,13 @@
 
 #include "clock.h"
 #include "courier.h"
+#include "guard.h"
 #include "keeper.h"
 #include "log.h"
 #include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
+#include "recall.h"
 #include "utf8.h"
 
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
@@ -31,6 +33,8 @@ static const char usage[] =
     "\n"
     "  --config FILE            settings (default " DEFAULT_CONFIG ")\n"
     "  --set section.key=value  one setting, over the file's; may be repeated\n"
+    "  --state DIR              folder that remembers the settings that worked: they come back\n"
+    "                           when three starts in a row fail\n"
     "  --pair \"ROLE KEY NAME\"   let a host in over the network (viewer, operator, calibrator; revoked\n"
     "                           = never again), print this device's key; see `pipefish pair`\n"
     "  --check-config           check the settings and the profile, start nothing\n"
@@ -44,18 +48,22 @@ typedef struct options {
     const char *config;
     const char *override[OVERRIDES_MAX];
     int overrides;
-    const char *pair;
+    const char *pair, *state;
     bool check;
 } options;
 
 /* -1 = go on, else the exit code. */
 static int parse_options(int argc, char **argv, options *o)
 {
-    static const struct option known[] = {
-        {"config", required_argument, NULL, 'c'}, {"set", required_argument, NULL, 's'},
-        {"pair", required_argument, NULL, 'p'},   {"check-config", no_argument, NULL, 'k'},
-        {"help-config", no_argument, NULL, 'H'},  {"version", no_argument, NULL, 'V'},
-        {"help", no_argument, NULL, 'h'},         {NULL, 0, NULL, 0}};
+    static const struct option known[] = {{"config", required_argument, NULL, 'c'},
+                                          {"set", required_argument, NULL, 's'},
+                                          {"pair", required_argument, NULL, 'p'},
+                                          {"state", required_argument, NULL, 'S'},
+                                          {"check-config", no_argument, NULL, 'k'},
+                                          {"help-config", no_argument, NULL, 'H'},
+                                          {"version", no_argument, NULL, 'V'},
+                                          {"help", no_argument, NULL, 'h'},
+                                          {NULL, 0, NULL, 0}};
     int choice;
     while ((choice = getopt_long(argc, argv, "h", known, NULL)) != -1) {
         switch (choice) {
@@ -68,6 +76,9 @@ static int parse_options(int argc, char **argv, options *o)
                 return USAGE;
             }
             o->override[o->overrides++] = optarg;
+            break;
+        case 'S':
+            o->state = optarg;
             break;
         case 'p':
             o->pair = optarg;
@@ -94,6 +105,23 @@ static int parse_options(int argc, char **argv, options *o)
         return USAGE;
     }
     return -1;
+}
+
+/* The settings that worked last, in place of those that failed too often. */
+static bool recall_config(pf_recall *recall, const options *o, pf_config *config)
+{
+    char path[1024], error[1536];
+    if (!pf_recall_is_due(recall, path, sizeof path))
+        return false;
+    pf_config_defaults(config);
+    if (!pf_config_load(config, path, error, sizeof error) || !pf_config_check(config, path, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return false;
+    }
+    pf_log(PF_LOG_ERROR, "%u starts in a row failed with %s: the settings of the last good run are used, %s",
+           PF_RECALL_STARTS, o->config, path);
+    recall->is_recalled = true;
+    return true;
 }
 
 static bool load_config(const options *o, pf_config *config, char *error, size_t n)
@@ -198,7 +226,7 @@ static bool open_trust(pf_daemon *d, char *error, size_t n)
 /* Lets a host in without its cable: "role key name" as a line of the file of hosts. */
 static int pair(pf_daemon *d, const char *line, char *error, size_t n)
 {
-    char key[65], why[128];
+    char key[65], why[128] = "";
     pf_peers one;
     if (pf_peers_parse(&one, line, strlen(line), why, sizeof why) != PF_OK || one.count != 1) {
         (void)snprintf(error, n, "--pair: %s", one.count == 0 && why[0] == '\0' ? "nobody" : why);
@@ -302,7 +330,7 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
 }
 
 /* Returns when it is time to exit. */
-static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
+static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
     bool is_terminated = false, must_exit = false;
@@ -311,6 +339,9 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
         bool is_drained, had_to_exit = must_exit;
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
+        pf_guard_feed(guard, pf_now());
+        if (pf_now() - d->started_ns > PF_RECALL_GOOD_NS)
+            pf_recall_good(d->recall, &d->config);
         note_status(d, &status_due, false);
         if (d->keeper != NULL)
             pf_keeper_work(d->keeper);
@@ -342,6 +373,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;
     bool is_good = false;
+    pf_guard guard;
 
     if (c->spool.quota_mb > 0 && (double)store.capacity > c->spool.quota_mb * 1e6) {
         pf_log(PF_LOG_ERROR, "spool.quota_mb = %g: an object of this camera may have %.2f MB", c->spool.quota_mb,
@@ -352,17 +384,21 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
-    if (pf_courier_open(&courier, d, error, sizeof error) &&
+    if (pf_guard_open(&guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) &&
+        pf_courier_open(&courier, d, error, sizeof error) &&
         pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
                survey->boots, survey->is_resumed ? "goes on" : "begins");
         is_good = pf_pipeline_start(pipeline, error, sizeof error);
     }
-    if (is_good)
-        supervise(d, pipeline, signals);
-    else
+    if (is_good) {
+        pf_guard_ready(&guard);
+        supervise(d, pipeline, &guard, signals);
+    } else {
         pf_log(PF_LOG_ERROR, "%s", error);
+    }
+    pf_guard_close(&guard); /* what follows has its own limits, and the service manager's for stopping */
     /* The time to drain limits only the sending: every keyframe that was made, and the survey's end, are stored first.
      * The store ends last, for what the host acknowledges while the courier lingers must be removed. */
     pf_store_flush(d->store);
@@ -377,6 +413,8 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         pf_log(PF_LOG_WARNING, "%llu objects stay in the spool for the next start",
                (unsigned long long)stats.spool.objects);
     is_good = is_good && !stats.has_failed;
+    if (is_good)
+        pf_recall_good(d->recall, &d->config);
     pf_store_close(d->store);
     return is_good ? DONE : FAILED;
 }
@@ -423,6 +461,7 @@ static int open_and_run(pf_daemon *d, int signals)
 int main(int argc, char **argv)
 {
     static pf_daemon d; /* 100 kB of settings and counters: not for the stack */
+    static pf_recall recall;
     options o = {.config = DEFAULT_CONFIG};
     char error[1536] = "";
     sigset_t set;
@@ -431,7 +470,10 @@ int main(int argc, char **argv)
     if (code >= 0)
         return code;
     d.started_ns = pf_now();
-    if (!load_config(&o, &d.config, error, sizeof error)) {
+    d.recall = &recall;
+    if (!o.check && o.pair == NULL)
+        pf_recall_begin(&recall, o.state, o.config);
+    if (!recall_config(&recall, &o, &d.config) && !load_config(&o, &d.config, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }

@@ -7,6 +7,7 @@
 #include "log.h"
 #include "pipefish/drivers/jpeg.h"
 #include "pipefish/drivers/sha256.h"
+#include "pulse.h"
 #include "tracking.h"
 #include "utf8.h"
 #include "worker.h"
@@ -414,6 +415,7 @@ static void capture(pf_pipeline *p, char *reason, size_t reason_n)
     (void)snprintf(reason, reason_n, "end of recording");
     while (status == PF_OK || status == PF_ERR_AGAIN) {
         pf_frame frame;
+        pf_pulse_work(); /* next() waits for NEXT_TIMEOUT_MS at most */
         if (atomic_load(&d->stop) != PF_STOP_NO) {
             (void)snprintf(reason, reason_n, "%s",
                            atomic_load(&d->stop) == PF_STOP_TERMINATED ? "terminated" : "stopped by the operator");
@@ -500,12 +502,14 @@ static void *run(void *argument)
     pf_daemon *d = p->daemon;
     char reason[512];
 
+    pf_pulse_begin(PF_PULSE_CAPTURE);
     capture(p, reason, sizeof reason);
     (void)d->camera.ops->stop(d->camera.self);
     pf_utf8_clean(reason);
     atomic_store(&d->state, PF_STATE_DRAINING);
     pf_log(p->has_failed ? PF_LOG_ERROR : PF_LOG_INFO, "survey ends: %s; %u keyframes", reason, p->next_index);
     store_end(p, reason);
+    pf_pulse_rest();
     atomic_store(&p->is_done, true);
     return NULL;
 }

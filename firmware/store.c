@@ -12,6 +12,7 @@
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
+#include "pulse.h"
 
 #define HURRY_NS 2000000000u
 #define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
@@ -247,15 +248,18 @@ static bool do_round(pf_store *s)
 static void *run(void *argument)
 {
     pf_store *s = argument;
+    pf_pulse_begin(PF_PULSE_STORE);
     pthread_mutex_lock(&s->mutex);
     refresh_spool_stats(s);
     for (;;) {
+        pf_pulse_work();
         if (do_round(s)) {
             refresh_spool_stats(s);
             continue;
         }
         if (s->is_quitting)
             break;
+        pf_pulse_rest();
         if (s->is_blocked || s->is_failing) { /* room may come from elsewhere, too: someone cleans up a full disk */
             const struct timespec until = {(time_t)(s->retry_ns / 1000000000u), (long)(s->retry_ns % 1000000000u)};
             (void)pthread_cond_timedwait(&s->work, &s->mutex, &until);
@@ -266,6 +270,7 @@ static void *run(void *argument)
         }
     }
     pthread_mutex_unlock(&s->mutex);
+    pf_pulse_rest();
     return NULL;
 }
 
@@ -389,8 +394,10 @@ pf_job *pf_store_take(pf_store *s)
 {
     pf_job *job = NULL;
     pthread_mutex_lock(&s->mutex);
+    pf_pulse_rest(); /* for as long as no host makes room */
     while (s->free_count == 0 && s->config.is_patient && !s->is_hurried)
         pthread_cond_wait(&s->change, &s->mutex);
+    pf_pulse_work();
     if (s->config.is_patient) {
         /* In a hurry: the last keyframes may wait for a batch that is being written, not for a disk that hangs. */
         const uint64_t due = pf_now() + HURRY_NS;
@@ -459,8 +466,10 @@ void pf_store_flush(pf_store *s)
 void pf_store_settle(pf_store *s)
 {
     pthread_mutex_lock(&s->mutex);
+    pf_pulse_rest();
     while (s->queue_count > 0)
         pthread_cond_wait(&s->change, &s->mutex);
+    pf_pulse_work();
     pthread_mutex_unlock(&s->mutex);
 }
 

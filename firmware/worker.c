@@ -4,6 +4,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 
+#include "pulse.h"
+
 struct pf_worker {
     pthread_t thread;
     pthread_mutex_t mutex;
@@ -17,10 +19,13 @@ struct pf_worker {
 static void *run(void *argument)
 {
     pf_worker *w = argument;
+    pf_pulse_begin(PF_PULSE_TRACKING);
     pthread_mutex_lock(&w->mutex);
     for (;;) {
+        pf_pulse_rest();
         while (w->item == NULL && !w->is_over)
             pthread_cond_wait(&w->change, &w->mutex);
+        pf_pulse_work();
         if (w->item == NULL)
             break;
         pthread_mutex_unlock(&w->mutex);
@@ -30,6 +35,7 @@ static void *run(void *argument)
         pthread_cond_broadcast(&w->change);
     }
     pthread_mutex_unlock(&w->mutex);
+    pf_pulse_rest();
     return NULL;
 }
 

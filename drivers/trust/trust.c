@@ -1,10 +1,10 @@
 /* The folder that keeps the device's key and the hosts it knows. */
 #include "common/failure.h"
+#include "pipefish/drivers/file.h"
 #include "pipefish/drivers/sha256.h"
 #include "trust/private.h"
 
 #include <errno.h>
-#include <fcntl.h>
 #include <openssl/err.h>
 #include <openssl/pem.h>
 #include <openssl/rand.h>
@@ -46,47 +46,12 @@ static pf_status fail_crypto(pf_trust *t, const char *doing)
     return pf_fail(&t->failure, PF_ERR_IO, "%s: %s: %s", t->folder, doing, why);
 }
 
-/* ---- files that are there whole or not at all */
-
-static bool write_all(int fd, const char *bytes, size_t n)
-{
-    while (n > 0) {
-        ssize_t k = write(fd, bytes, n);
-        if (k < 0 && errno != EINTR)
-            return false;
-        if (k > 0) {
-            bytes += k;
-            n -= (size_t)k;
-        }
-    }
-    return true;
-}
-
-static bool sync_folder(const char *folder)
-{
-    int fd = open(folder, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-    bool ok = fd >= 0 && fsync(fd) == 0;
-    if (fd >= 0)
-        (void)close(fd);
-    return ok;
-}
-
 static pf_status replace_file(pf_trust *t, const char *file, const char *bytes, size_t n)
 {
-    char path[PATH_BYTES], draft[PATH_BYTES + 8];
+    char path[PATH_BYTES], why[sizeof t->failure.text];
     path_of(t, file, path);
-    (void)snprintf(draft, sizeof draft, "%s.new", path);
-    (void)unlink(draft); /* what a power cut left; it may have another mode */
-    int fd = open(draft, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
-    if (fd < 0)
-        return fail_errno(t, draft, "making it");
-    bool ok = write_all(fd, bytes, n) && fsync(fd) == 0;
-    ok = close(fd) == 0 && ok;
-    if (!ok || rename(draft, path) != 0 || !sync_folder(t->folder)) {
-        pf_status status = fail_errno(t, path, "writing");
-        (void)unlink(draft);
-        return status;
-    }
+    if (pf_file_replace(path, bytes, n, why, sizeof why) != PF_OK)
+        return pf_fail(&t->failure, PF_ERR_IO, "%s", why);
     return PF_OK;
 }
 

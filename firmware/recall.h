@@ -1,0 +1,31 @@
+/* What worked last. A daemon that did not come up three times in a row with the same settings takes those of its last
+ * good run. A start is good once it has run for a minute, or ended as it was meant to. A folder keeps
+ *   starts    how many starts in a row were not good, and the SHA-256 of the settings' file they had
+ *   good.ini  every setting of the last good run
+ */
+#ifndef PIPEFISHD_RECALL_H
+#define PIPEFISHD_RECALL_H
+
+#include "daemon.h"
+
+#define PF_RECALL_STARTS  3u
+#define PF_RECALL_GOOD_NS UINT64_C(60000000000)
+
+struct pf_recall {
+    char folder[PF_CONFIG_TEXT_MAX]; /* "" = nothing is kept */
+    char hash[65];                   /* of the settings' file */
+    unsigned starts;                 /* in a row that were not good, this one included */
+    bool has_good, is_done;
+    bool is_recalled; /* the settings in force are those of the last good run */
+};
+
+/* Notes a start with this file. What cannot be kept is logged, and is no reason not to start. */
+void pf_recall_begin(pf_recall *recall, const char *folder, const char *file);
+
+/* Whether this start is to take good.ini; path[n] becomes its name. */
+bool pf_recall_is_due(const pf_recall *recall, char *path, size_t n);
+
+/* The run with these settings was good. */
+void pf_recall_good(pf_recall *recall, const pf_config *config);
+
+#endif
