@@ -18,7 +18,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross size pytest
+.PHONY: build demo test bench accept deb format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross size pytest
 
 build: native $(STAMP)/python
 
@@ -91,6 +91,12 @@ bench: build $(STAMP)/venv-peers
 	@test -f build/peers/build.ninja || cmake --preset peers
 	@cmake --build --preset peers
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
+
+# Debian packages of the daemon and of the C library, in build/deb.
+deb: native
+	@cmake -E make_directory build/deb
+	@cd build/release && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb -D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log || { cat $(CURDIR)/build/deb/log; exit 1; }
+	@rm -rf build/deb/_CPack_Packages; ls build/deb/*.deb
 
 accept: build unit fuzz-build cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json
