@@ -16,16 +16,16 @@ STAMP := build/stamp
 UNITY_DIR = $(abspath $(wildcard $(VENV)/lib/python3*/site-packages/vyperling/c))
 ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type f)
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
-C_FILES = $(shell find lib drivers firmware host_tools/engine tests -name '*.[ch]' -o -name '*.[ch]pp')
+C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross size pytest
+.PHONY: build demo test bench accept deb format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross proof size pytest
 
 build: native $(STAMP)/python
 
 demo: build
 	@$(VENV)/bin/pipefish demo --out build/demo
 
-test: build lint unit fuzz-smoke cross pytest
+test: build lint unit fuzz-smoke proof cross pytest
 	@echo "all tests passed"
 
 packages-build:
@@ -70,6 +70,10 @@ fuzz-build: packages-test
 fuzz-smoke: fuzz-build
 	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
 	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
+
+# The protocols, in every state that small bounds reach (tests/proof).
+proof: packages-test
+	@tests/proof/prove build/proof
 
 # The same bits everywhere: one hash per room, under every compiler, set of flags and target (docs/targets.md).
 cross: unit fuzz-build
