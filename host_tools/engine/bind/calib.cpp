@@ -152,24 +152,17 @@ nb::tuple adjust(Bundle &bundle, int max_iterations, double cost_tolerance)
     return nb::make_tuple(names[static_cast<int>(summary.status)], summary.iterations, summary.final_cost);
 }
 
-nb::tuple uncertainty(Bundle &bundle)
+nb::object uncertainty(Bundle &bundle)
 {
-    Bundle::Uncertainty u;
+    Eigen::MatrixXd border;
     bundle.arrange();
     try {
         nb::gil_scoped_release release;
-        u = bundle.uncertainty();
+        border = bundle.uncertainty();
     } catch (const std::domain_error &error) {
         throw nb::value_error(error.what());
     }
-    const size_t width = static_cast<size_t>(u.border.rows()), count = u.slope.size();
-    std::unique_ptr<double[]> slope(new double[count * 6 * width + 1]), alone(new double[count * 36 + 1]);
-    for (size_t f = 0; f < count; f++) {
-        put(slope.get() + f * 6 * width, u.slope[f]);
-        put(alone.get() + f * 36, u.alone[f]);
-    }
-    return nb::make_tuple(matrix(u.border), numbers(std::move(slope), {count, 6, width}),
-                          numbers(std::move(alone), {count, 6, 6}));
+    return nb::cast(matrix(border));
 }
 
 nb::object view_pose_of(const Bundle &bundle, size_t index)
@@ -286,9 +279,7 @@ void bind_calib(nb::module_ &m)
         .def("adjust", &adjust, nb::arg("max_iterations") = 100, nb::arg("cost_tolerance") = 1e-12,
              "-> status, iterations, half the sum of squares; 'outside': a point has no projection at the start.")
         .def("predict", &predict, "-> pixels (N, 2), NaN outside the model, points in their camera's frame (N, 3)")
-        .def("uncertainty", &uncertainty,
-             "-> covariance of the border's unknowns (G, G), slopes of the frames' poses by them (F, 6, G), covariance "
-             "of each pose when they are known (F, 6, 6)")
+        .def("uncertainty", &uncertainty, "-> covariance of the border's unknowns (G, G)")
         .def("layout",
              [](Bundle &b) {
                  b.arrange();

@@ -512,9 +512,8 @@ optim::Summary Bundle::adjust(const optim::Options &options)
     return summary;
 }
 
-Bundle::Uncertainty Bundle::uncertainty() const
+Eigen::MatrixXd Bundle::uncertainty() const
 {
-    Uncertainty out;
     const Eigen::Index width = layout_.size;
     Eigen::MatrixXd reduced = Eigen::MatrixXd::Zero(width, width);
     using Wide = Eigen::Map<const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>>;
@@ -533,19 +532,17 @@ Bundle::Uncertainty Bundle::uncertainty() const
             throw std::domain_error("calibration: a view does not determine its pose");
         }
         const Eigen::MatrixXd cross_term = je.transpose() * jg;
-        out.slope.push_back(-llt.solve(cross_term));
-        out.alone.push_back(llt.solve(Eigen::Matrix<double, 6, 6>::Identity()));
-        reduced.noalias() += cross_term.transpose() * out.slope.back();
+        reduced.noalias() -= cross_term.transpose() * llt.solve(cross_term);
     }
     const Eigen::VectorXd scale = reduced.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
     const Eigen::LLT<Eigen::MatrixXd> llt(scale.asDiagonal() * reduced * scale.asDiagonal());
     if (width > 0 && (llt.info() != Eigen::Success || !(llt.rcond() > 1e-14))) {
         throw std::domain_error("calibration: the views do not determine all of the model");
     }
-    out.border = width > 0 ? Eigen::MatrixXd(scale.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(width, width)) *
-                                             scale.asDiagonal())
-                           : Eigen::MatrixXd(0, 0);
-    return out;
+    if (width == 0) {
+        return reduced;
+    }
+    return scale.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(width, width)) * scale.asDiagonal();
 }
 
 } // namespace pipefish::calib

@@ -87,14 +87,9 @@ public:
     // Views without a usable point in the image's domain are left where they are.
     optim::Summary adjust(const optim::Options &options);
 
-    struct Uncertainty {
-        Eigen::MatrixXd border;                                      // covariance of the border's unknowns
-        std::vector<Eigen::Matrix<double, 6, Eigen::Dynamic>> slope; // of a frame's pose by the border: -H_ee^-1 H_eg
-        std::vector<Eigen::Matrix<double, 6, 6>> alone;              // covariance of a frame's pose, border known
-    };
-    // Unscaled: of residuals whose standard deviation is exactly sigma. Throws std::domain_error where the data do not
-    // determine everything.
-    Uncertainty uncertainty() const;
+    // Covariance of the border's unknowns, unscaled: of residuals whose standard deviation is exactly sigma. Throws
+    // std::domain_error where the data do not determine everything.
+    Eigen::MatrixXd uncertainty() const;
 
     // Largest observed angle off the axis of a camera, radians.
     double theta_observed(int camera) const;
