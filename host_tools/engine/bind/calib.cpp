@@ -104,11 +104,12 @@ template <class Each> void each_point(Bundle &bundle, size_t given, const Each &
             each(point, i++);
 }
 
-void set_planes(Bundle &bundle, const Rows<3> &across, const Rows<3> &down)
+void set_sheets(Bundle &bundle, const Rows<3> &across, const Rows<3> &down, const Rows<3> &bend)
 {
     each_point(bundle, across.shape(0), [&](Observation &point, size_t i) {
         point.across = Eigen::Map<const Eigen::Vector3d>(across.data() + 3 * i);
         point.down = Eigen::Map<const Eigen::Vector3d>(down.data() + 3 * i);
+        point.bend = Eigen::Map<const Eigen::Vector3d>(bend.data() + 3 * i);
     });
 }
 
@@ -214,7 +215,8 @@ void bind_calib(nb::module_ &m)
         .def(nb::new_(&make), nb::arg("camera"), nb::arg("board"), nb::arg("frame"), nb::arg("first"),
              nb::arg("drawn").noconvert(), nb::arg("pixels").noconvert(), nb::arg("circle_radius") = 0.0)
         .def("copy", [](const Bundle &b) { return std::make_unique<Bundle>(b); })
-        .def("set_planes", &set_planes, nb::arg("across").noconvert(), nb::arg("down").noconvert())
+        .def("set_sheets", &set_sheets, nb::arg("across").noconvert(), nb::arg("down").noconvert(),
+             nb::arg("bend").noconvert())
         .def("set_used",
              [](Bundle &b, const Flags &used) {
                  each_point(b, used.shape(0), [&](Observation &p, size_t i) { p.used = used.data()[i]; });

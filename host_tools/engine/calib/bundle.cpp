@@ -261,6 +261,16 @@ bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, doubl
     return true;
 }
 
+Eigen::Vector3d Observation::on_sheet(double x, double y) const
+{
+    const double curvature = bend.norm(), angle = x * curvature;
+    if (curvature == 0.0) {
+        return drawn + x * across + y * down;
+    }
+    const double half = std::sin(0.5 * angle); // 1 - cos without cancelling
+    return drawn + std::sin(angle) / curvature * across + 2.0 * half * half / (curvature * curvature) * bend + y * down;
+}
+
 bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d &pixel, double *d_frame,
                      double *d_border) const
 {
@@ -273,7 +283,7 @@ bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d
     std::vector<double> jg(d_frame ? static_cast<size_t>(kRim * 2 * layout_.size) : 0);
     for (size_t i = 0; i < kRim; i++) {
         const Eigen::Vector3d edge =
-            point.drawn + circle_radius * (directions[i].x() * point.across + directions[i].y() * point.down);
+            point.on_sheet(circle_radius * directions[i].x(), circle_radius * directions[i].y());
         Eigen::Vector2d at;
         double *f = d_frame ? jf.data() + i * 12 : nullptr;
         double *g = d_frame ? jg.data() + i * static_cast<size_t>(2 * layout_.size) : nullptr;

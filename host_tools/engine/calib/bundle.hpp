@@ -28,7 +28,11 @@ struct Observation {
     double sigma = 1.0; // pixels, along each axis
     bool used = true;
     double parity = 0.0; // of a checkerboard's corner, +-1; 0: not a corner
-    Eigen::Vector3d across = Eigen::Vector3d::UnitX(), down = Eigen::Vector3d::UnitY(); // plane of a circle
+    Eigen::Vector3d across = Eigen::Vector3d::UnitX(), down = Eigen::Vector3d::UnitY(); // plane that touches a circle
+    Eigen::Vector3d bend = Eigen::Vector3d::Zero(); // of the sheet along `across`: to the bend's centre, 1 / metres
+
+    // A point of the sheet the circle is printed on, so far along `across` and `down`, metres.
+    Eigen::Vector3d on_sheet(double x, double y) const;
 };
 
 struct View {
