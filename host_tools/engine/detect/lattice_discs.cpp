@@ -11,20 +11,6 @@ namespace pipefish::detect
 namespace
 {
 
-// Index of the blob nearest to a place, within a distance; -1: none.
-int nearest(const std::vector<Blob> &blobs, const Eigen::Vector2d &place, double within)
-{
-    int best = -1;
-    for (size_t k = 0; k < blobs.size(); k++) {
-        const double far = (blobs[k].at - place).norm();
-        if (far < within) {
-            within = far;
-            best = static_cast<int>(k);
-        }
-    }
-    return best;
-}
-
 // How far apart two discs are, in radii: the ellipse of each is a unit circle in its own measure, whichever way the
 // sheet is turned; the mean of both measures cancels what perspective does to one. The same for all neighbours of a
 // lattice along a step, on a plane and on a pipe's wall.
@@ -42,10 +28,9 @@ bool alike(const Blob &a, const Blob &b)
 
 constexpr double kSameStep = 0.15; // of a step, in radii: 2 % is usual, in any lens and on a pipe's wall
 
-struct Seed { // a blob and its neighbours at (1, 0), (0, 1), (-1, 0), (0, -1); -1: not known
+struct Seed { // a blob and its neighbours at (1, 0) and (0, 1)
     int middle;
-    std::array<int, 4> beside;
-    bool by_ellipses; // neighbours are told by how far apart they are in radii: for steps that bend much
+    std::array<int, 2> beside;
 };
 
 // The blob that is as far from those beside a site, in radii, as the seed's are along the same step, and nearest to
@@ -86,9 +71,8 @@ Grid grow_blobs(const std::vector<Blob> &blobs, const Seed &seed)
         used.insert(k);
     };
     put({0, 0}, seed.middle);
-    for (size_t d = 0; d < 4; d++)
-        if (seed.beside[d] >= 0)
-            put(kSteps[d], seed.beside[d]);
+    put(kSteps[0], seed.beside[0]);
+    put(kSteps[1], seed.beside[1]);
     for (bool more = true; more;) {
         more = false;
         std::set<Site> border;
@@ -100,9 +84,7 @@ Grid grow_blobs(const std::vector<Blob> &blobs, const Seed &seed)
             const auto f = forecast(grid, site, 0, false);
             if (!f)
                 continue;
-            const double step = f->cell.colwise().norm().minCoeff();
-            const int k =
-                seed.by_ellipses ? by_steps(blobs, seed, grid, site, f->at) : nearest(blobs, f->at, 0.35 * step);
+            const int k = by_steps(blobs, seed, grid, site, f->at);
             if (k < 0 || used.contains(k))
                 continue;
             bool fits = true;
@@ -178,41 +160,8 @@ Grid with_short_steps(const Grid &grid)
     return out;
 }
 
-// Neighbours of a blob on both sides along two directions. off: how far, in steps, the neighbour on the other side may
-// be from where this side has it.
-std::optional<Seed> seed_of_lines(const std::vector<Blob> &blobs, int i, double off)
-{
-    const Blob &a = blobs[size_t(i)];
-    std::vector<std::pair<double, int>> near;
-    for (size_t j = 0; j < blobs.size(); j++)
-        if (static_cast<int>(j) != i && alike(a, blobs[j]))
-            near.push_back({(blobs[j].at - a.at).norm(), static_cast<int>(j)});
-    if (near.size() < 4)
-        return std::nullopt;
-    const size_t kept = std::min<size_t>(near.size(), 10);
-    std::partial_sort(near.begin(), near.begin() + static_cast<std::ptrdiff_t>(kept), near.end());
-    std::vector<std::array<int, 2>> pairs;
-    for (size_t k = 0; k < kept && pairs.size() < 3; k++) {
-        const Eigen::Vector2d way = blobs[size_t(near[k].second)].at - a.at;
-        const int back = nearest(blobs, a.at - way, off * way.norm());
-        const bool known = std::any_of(pairs.begin(), pairs.end(),
-                                       [&](const auto &p) { return p[1] == near[k].second || p[1] == back; });
-        if (back < 0 || back == i || known || !alike(a, blobs[size_t(back)]))
-            continue;
-        pairs.push_back({near[k].second, back});
-    }
-    for (size_t k = 1; k < pairs.size(); k++) {
-        const Eigen::Vector2d u = blobs[size_t(pairs[0][0])].at - a.at, v = blobs[size_t(pairs[k][0])].at - a.at;
-        if (std::abs(cross(u, v)) < 0.3 * u.norm() * v.norm())
-            continue;
-        const auto &one = cross(u, v) > 0 ? pairs[0] : pairs[k], &two = cross(u, v) > 0 ? pairs[k] : pairs[0];
-        return Seed{i, {one[0], two[0], one[1], two[1]}, false};
-    }
-    return std::nullopt;
-}
-
 // The two nearest neighbours of a blob, in radii, that lie well apart around it.
-std::optional<Seed> seed_of_ellipses(const std::vector<Blob> &blobs, int i)
+std::optional<Seed> seed_at(const std::vector<Blob> &blobs, int i)
 {
     const Blob &a = blobs[size_t(i)];
     const Eigen::Matrix2d to_circle = a.half_axes.inverse();
@@ -230,19 +179,22 @@ std::optional<Seed> seed_of_ellipses(const std::vector<Blob> &blobs, int i)
         if (std::abs(sine) < 0.75 || near[k].first > 1.5 * near[0].first)
             continue;
         const int one = near[0].second, two = near[k].second;
-        return sine > 0 ? Seed{i, {one, two, -1, -1}, true} : Seed{i, {two, one, -1, -1}, true};
+        return sine > 0 ? Seed{i, {one, two}} : Seed{i, {two, one}};
     }
     return std::nullopt;
 }
 
-Grid best_grid(const std::vector<Blob> &blobs, const std::function<std::optional<Seed>(int)> &seed_at, double &score)
+} // namespace
+
+Grid grid_of_blobs(const std::vector<Blob> &blobs)
 {
+    double score = 0.0;
     Grid best;
     const int n = static_cast<int>(blobs.size());
     std::set<int> covered;
     int tries = 0;
     for (int i = 0; i < n && tries < 60; i++) {
-        const std::optional<Seed> seed = covered.contains(i) ? std::nullopt : seed_at(i);
+        const std::optional<Seed> seed = covered.contains(i) ? std::nullopt : seed_at(blobs, i);
         if (!seed)
             continue;
         Grid grid = grow_blobs(blobs, *seed);
@@ -258,32 +210,6 @@ Grid best_grid(const std::vector<Blob> &blobs, const std::function<std::optional
             best = std::move(grid);
         }
     }
-    return best;
-}
-
-} // namespace
-
-Grid grid_of_blobs(const std::vector<Blob> &blobs)
-{
-    // Strict first: a wide view of the inside of a pipe shrinks steps by half from one ring to the next; and where only
-    // two rings are seen, or a ring bends as much as a step is long, no blob has neighbours on both sides in line.
-    double score = 0.0;
-    Grid best = best_grid(
-        blobs, [&](int i) { return seed_of_lines(blobs, i, 0.25); }, score);
-    double needed = 1.05 * score;
-    const auto better = [&](Grid grid, double now) {
-        if (now <= needed)
-            return;
-        needed = 1.05 * now;
-        best = std::move(grid);
-    };
-    double wide = 0.0, curved = 0.0;
-    Grid other = best_grid(
-        blobs, [&](int i) { return seed_of_lines(blobs, i, 0.45); }, wide);
-    better(std::move(other), wide);
-    other = best_grid(
-        blobs, [&](int i) { return seed_of_ellipses(blobs, i); }, curved);
-    better(std::move(other), curved);
     for (auto &[site, point] : best)
         point.code = 0;
     return with_short_steps(best);
