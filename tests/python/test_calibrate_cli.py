@@ -19,9 +19,10 @@ import pipefish as pf
 from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
-from pipefish.calib_input import load_target, load_views, natural
+from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
 from pipefish.calib_run import circle_around
+from pipefish.calib_run import run as run_pictures
 from pipefish.calib_verdict import verdict
 from synthetic import BOOT, SURVEY, keyframe, start
 from test_page import Outline, data_of
@@ -303,6 +304,25 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no pictures" in refused(empty)
+
+
+def test_an_ambiguous_picture_is_settled_by_a_first_model():
+    """The picture's edge, or the lens's, cuts a grid of discs: a model tells where it would show more of them."""
+    board = pf.Target("circles", 6, 8, 0.03)
+    seen, _ = pf.simulate_target_views(
+        board, {"preset": "fisheye-185", "width": 480, "height": 360}, 8, samples=34, seed=1
+    )
+    pictures = [Picture(f"p{i}", 0, f"p{i}", lambda v=v: v.image) for i, v in enumerate(seen)]
+    assert pf.detect_target(seen[4].image, board).status == "ambiguous"
+    target = Target3D("dots", board.points(), board.radius_m, board)
+    session = run_pictures(
+        Given(["camera"], [target], pictures, [], [(480, 360)]), model="p9", board="flat", tell=lambda *_: None
+    )
+    found = next(s for s in session.sightings if s.picture.name == "p4")
+    assert found.status == "partial" and len(found.ids) > 20 and not session.unseen
+    turned = len(board.points()) - 1 - found.ids  # the whole looks the same turned by 180 degrees
+    off = [np.linalg.norm(found.pixels - seen[4].centroids[ids], axis=1).max() for ids in (found.ids, turned)]
+    assert min(off) < 1.0
 
 
 def test_points_of_the_target_lie_inside_the_image_circle():
