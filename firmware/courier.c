@@ -35,6 +35,7 @@ struct pf_courier {
     uint64_t status_due, publish_due;
     pf_link_event profile;              /* one that the host has sent; its bytes are the link's until it is answered */
     bool has_profile, is_profile_asked; /* it waits for the keeper; the keeper has it */
+    const uint8_t *still;               /* name of the one that the link sends; NULL = none */
     uint8_t message[CONTROL_MAX];       /* status and replies */
     pthread_mutex_t preview_mutex;
     uint8_t preview[PF_PREVIEW_MAX];
@@ -153,6 +154,14 @@ static bool may_send(const pf_courier *c, uint32_t kind)
     return kind == PF_OBJECT_PROFILE && c->daemon->keeper != NULL && peer_role(c) >= PF_ROLE_CALIBRATOR;
 }
 
+static void ask_still(pf_courier *c, pf_msg_reply *reply)
+{
+    if (atomic_load(&c->daemon->state) != PF_STATE_SURVEYING)
+        reply->error = "still: the survey is over, the camera gives no frames";
+    else if (!pf_still_ask(c->daemon->still))
+        reply->error = "still: one is under way: try again";
+}
+
 static void take_profile(pf_courier *c, const pf_link_event *e)
 {
     uint8_t sha256[32];
@@ -202,6 +211,7 @@ static pf_role role_for(pf_request_what what)
     case PF_REQUEST_SET_LAMP:
     case PF_REQUEST_CLOCK_SYNC:
     case PF_REQUEST_SHUTDOWN:
+    case PF_REQUEST_GET_STILL: /* an object */
         return PF_ROLE_OPERATOR;
     case PF_REQUEST_CONFIRM_PROFILE:
     case PF_REQUEST_REVERT_PROFILE:
@@ -294,12 +304,48 @@ static void answer(pf_courier *c, const uint8_t *bytes, size_t size, uint64_t no
     case PF_REQUEST_REVERT_PROFILE:
         is_answered = ask_keeper(c, &request, &reply);
         break;
+    case PF_REQUEST_GET_STILL:
+        ask_still(c, &reply);
+        break;
     case PF_REQUEST_UNKNOWN:
         reply.error = "unknown request";
         break;
     }
     if (is_answered)
         send_reply(c, &reply);
+}
+
+/* ---- the still */
+
+static void drop_still(pf_courier *c)
+{
+    if (c->still != NULL)
+        (void)pf_link_cancel_object(c->link, c->still);
+    c->still = NULL;
+    pf_still_drop(c->daemon->still);
+}
+
+/* Whether the object was the still, which is done. */
+static bool end_still(pf_courier *c, const uint8_t name[32])
+{
+    if (c->still == NULL || memcmp(c->still, name, 32) != 0)
+        return false;
+    c->still = NULL;
+    pf_still_drop(c->daemon->still);
+    return true;
+}
+
+static void send_still(pf_courier *c)
+{
+    const uint8_t *bytes, *name;
+    size_t n;
+    if (!pf_still_next(c->daemon->still, &bytes, &n, &name))
+        return;
+    c->still = name;
+    if (pf_link_send_object(c->link, name, PF_OBJECT_RAW_FRAME, bytes, n) != PF_OK) {
+        pf_log(PF_LOG_ERROR, "the link does not take a still of %zu bytes", n);
+        drop_still(c);
+    }
 }
 
 /* ---- events */
@@ -309,6 +355,8 @@ static void take_event(pf_courier *c, const pf_link_event *e, uint64_t now)
     switch ((pf_link_event_type)e->type) {
     case PF_LINK_UP:
         pf_log(PF_LOG_INFO, "host is there%s", e->peer_restarted ? " (started anew)" : "");
+        if (e->peer_restarted)
+            drop_still(c); /* the host before asked for it */
         c->status_due = now;
         publish(c, now);
         break;
@@ -332,9 +380,12 @@ static void take_event(pf_courier *c, const pf_link_event *e, uint64_t now)
         take_profile(c, e);
         break;
     case PF_LINK_SENT:
-        pf_store_release_slot(c->daemon->store, e->name, false);
+        if (!end_still(c, e->name))
+            pf_store_release_slot(c->daemon->store, e->name, false);
         break;
     case PF_LINK_REFUSED:
+        if (end_still(c, e->name))
+            break;
         pf_log(PF_LOG_ERROR, "the host refuses an object of %u bytes, kind %u: removed", e->size, e->kind);
         pf_store_release_slot(c->daemon->store, e->name, true);
         break;
@@ -464,7 +515,8 @@ static void send_preview(pf_courier *c)
 
 static void send_objects(pf_courier *c)
 {
-    while (pf_link_free_send_slots(c->link) > 0) {
+    /* One slot is the still's. */
+    while (pf_link_free_send_slots(c->link) > (c->still == NULL ? 1u : 0u)) {
         pf_slot *slot = pf_store_next_slot(c->daemon->store);
         if (slot == NULL)
             return;
@@ -525,8 +577,10 @@ static void *run(void *argument)
                 send_status(c, now);
             send_preview(c);
         }
-        if (quit_at == UINT64_MAX)
+        if (quit_at == UINT64_MAX) {
+            send_still(c);
             send_objects(c);
+        }
         if (now >= c->publish_due)
             publish(c, now);
         is_full = write_stream(c, now);
@@ -545,15 +599,20 @@ static void *run(void *argument)
     return NULL;
 }
 
-void pf_courier_preview(pf_courier *c, const uint8_t *bytes, size_t n)
+void pf_courier_wake(pf_courier *c)
 {
     uint64_t one = 1;
+    if (write(c->daemon->wake_fd, &one, sizeof one) < 0)
+        pf_log(PF_LOG_ERROR, "cannot wake the courier");
+}
+
+void pf_courier_preview(pf_courier *c, const uint8_t *bytes, size_t n)
+{
     pthread_mutex_lock(&c->preview_mutex);
     memcpy(c->preview, bytes, n);
     c->preview_n = n;
     pthread_mutex_unlock(&c->preview_mutex);
-    if (write(c->daemon->wake_fd, &one, sizeof one) < 0)
-        pf_log(PF_LOG_ERROR, "cannot wake the courier");
+    pf_courier_wake(c);
 }
 
 static void release(pf_courier *c)
@@ -570,7 +629,9 @@ bool pf_courier_open(pf_courier **courier, pf_daemon *daemon, char *error, size_
                          .boot_id = daemon->boot_id,
                          .schema = PF_SCHEMA_VERSION,
                          .max_fragment = config->link.max_fragment,
-                         .send_slots = config->link.send_slots,
+                         .send_slots = config->link.send_slots < PF_LINK_SLOTS_MAX
+                                           ? config->link.send_slots + 1
+                                           : PF_LINK_SLOTS_MAX, /* the still's too */
                          .receive_slots = daemon->keeper != NULL ? 1 : 0,
                          .max_object = daemon->keeper != NULL ? PF_PROFILE_BINARY_MAX : 0,
                          .max_latest = PF_PREVIEW_MAX,
@@ -605,10 +666,8 @@ bool pf_courier_open(pf_courier **courier, pf_daemon *daemon, char *error, size_
 
 void pf_courier_close(pf_courier *c)
 {
-    uint64_t one = 1;
     atomic_store(&c->is_quitting, true);
-    if (write(c->daemon->wake_fd, &one, sizeof one) < 0)
-        pf_log(PF_LOG_ERROR, "cannot wake the courier");
+    pf_courier_wake(c);
     (void)pthread_join(c->thread, NULL);
     release(c);
 }

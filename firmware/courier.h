@@ -14,6 +14,9 @@ bool pf_courier_open(pf_courier **courier, pf_daemon *daemon, char *error, size_
 /* Hands over a Preview message (copied); it is sent with the next chance, a newer one replaces it. */
 void pf_courier_preview(pf_courier *courier, const uint8_t *bytes, size_t n);
 
+/* There is something new to be sent. */
+void pf_courier_wake(pf_courier *courier);
+
 /* Most bytes of a preview message. */
 #define PF_PREVIEW_MAX 16384u
 

@@ -15,6 +15,7 @@
 #include "pipefish/drivers/trust.h"
 #include "pipefish/messages.h"
 #include "pipefish/profile.h"
+#include "still.h"
 #include "store.h"
 
 #define PF_SOFTWARE "pipefishd 0.1.0"
@@ -70,6 +71,7 @@ typedef struct pf_daemon {
     pf_recall *recall;
     pf_keeper *keeper; /* of camera.profile_store; NULL = there is none */
     pf_store *store;
+    pf_still *still;
     int wake_fd;       /* eventfd: wakes the courier */
     _Atomic int stop;  /* pf_stop; set once, by pf_daemon_stop */
     _Atomic int state; /* pf_state */

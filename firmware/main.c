@@ -362,6 +362,7 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int 
 static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *before, int signals)
 {
     const pf_config *c = &d->config;
+    const pf_camera_info *camera = d->camera.ops->info(d->camera.self);
     char error[1024];
     pf_courier *courier = NULL;
     pf_pipeline *pipeline = NULL;
@@ -373,7 +374,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;
     bool is_good = false;
-    pf_guard guard;
+    pf_guard guard = {.manager = -1, .device = -1};
 
     if (c->spool.quota_mb > 0 && (double)store.capacity > c->spool.quota_mb * 1e6) {
         pf_log(PF_LOG_ERROR, "spool.quota_mb = %g: an object of this camera may have %.2f MB", c->spool.quota_mb,
@@ -384,9 +385,11 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
-    if (pf_guard_open(&guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) &&
-        pf_courier_open(&courier, d, error, sizeof error) &&
-        pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
+    if (!pf_still_open(&d->still, camera->width, camera->height))
+        (void)snprintf(error, sizeof error, "no memory for a still");
+    else if (pf_guard_open(&guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) &&
+             pf_courier_open(&courier, d, error, sizeof error) &&
+             pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
                survey->boots, survey->is_resumed ? "goes on" : "begins");
@@ -406,6 +409,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         is_good = pf_pipeline_close(pipeline) && is_good;
     if (courier != NULL)
         pf_courier_close(courier);
+    pf_still_close(d->still);
     pf_store_quit(d->store);
     note_status(d, &status_due, true);
     pf_store_get_stats(d->store, &stats);

@@ -335,11 +335,23 @@ static void make_preview(pf_pipeline *p, const pf_frame *frame)
 
 /* ---- before and after: by the capture thread */
 
+static void give_still(pf_pipeline *p, const pf_shot *shot, const pf_frame *frame)
+{
+    pf_daemon *d = p->daemon;
+    const pf_msg_raw_frame raw = {.time = {d->boot_id, frame->time_ns},
+                                  .frame_sequence = frame->sequence,
+                                  .image = frame->image,
+                                  .telemetry = shot->telemetry};
+    if (pf_still_take(d->still, &raw))
+        pf_courier_wake(p->courier);
+}
+
 /* Takes the driver's frame over and gives its buffer back at once. */
 static void take_shot(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
 {
     const pf_image *image = &frame->image;
     shot->telemetry = read_telemetry(p, frame);
+    give_still(p, shot, frame);
     const bool is_full = p->stretched[1] == 1 && p->stretched[254] == 254;
     for (uint32_t y = 0; y < image->height; y++) {
         const uint8_t *from = image->data + (size_t)y * image->stride;

@@ -115,7 +115,7 @@ def _determined(fit: Fit) -> bool:
     except CalibrationError:
         return False
     focal = [abs(fit.bundle.camera(c).f_u) for c in range(len(found))]
-    return all(math.sqrt(u.parameters()[0, 0]) < _DRIFT * f for u, f in zip(found, focal, strict=True))
+    return all(math.sqrt(u.covariance[0, 0]) < _DRIFT * f for u, f in zip(found, focal, strict=True))
 
 
 def _row(

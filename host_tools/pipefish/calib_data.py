@@ -182,8 +182,7 @@ class Data:
             bundle.set_shape(i, [0.0] * 41, *board.centre, board.half)
         bundle.set_parity(self.parity()[points])
         if self.circle_radius > 0:
-            across, down = self.disc_planes()
-            bundle.set_planes(np.ascontiguousarray(across[points]), np.ascontiguousarray(down[points]))
+            bundle.set_sheets(*(np.ascontiguousarray(vectors[points]) for vectors in self.disc_sheets()))
         return bundle
 
     def parity(self) -> Array:
@@ -203,10 +202,11 @@ class Data:
                 out[mine] = 1.0 - 2.0 * (np.round(cell).astype(int).sum(axis=1) % 2)
         return out
 
-    def disc_planes(self) -> tuple[Array, Array]:
-        """Two unit vectors (N, 3) in the plane of each disc: of the board, of the wall that a sleeve around its Z axis
-        lies on, or of the nearest discs."""
-        across, down = np.zeros_like(self.xyz), np.zeros_like(self.xyz)
+    def disc_sheets(self) -> tuple[Array, Array, Array]:
+        """Two unit vectors (N, 3) in the plane that touches each disc, and how the sheet bends along the first (to the
+        bend's centre, 1/metres): of the board, of the wall that a sleeve around its Z axis lies on, or of the nearest
+        discs."""
+        across, down, bend = np.zeros_like(self.xyz), np.zeros_like(self.xyz), np.zeros_like(self.xyz)
         across[:, 0], down[:, 1] = 1.0, 1.0
         for i, board in enumerate(self.boards):
             if board.planar:
@@ -214,7 +214,9 @@ class Data:
             mine = np.flatnonzero(self.board_of[self.view_of] == i)
             radius = np.hypot(board.points[:, 0], board.points[:, 1])
             if np.ptp(radius) < 1e-6 * radius.max():
-                x, y = (self.xyz[mine, :2] / np.hypot(*self.xyz[mine, :2].T)[:, None]).T
+                wall = np.hypot(*self.xyz[mine, :2].T)
+                x, y = (self.xyz[mine, :2] / wall[:, None]).T
+                bend[mine] = np.stack([-x / wall, -y / wall, 0 * x], axis=1)
                 across[mine] = np.stack([-y, x, 0 * x], axis=1)
                 down[mine] = [0.0, 0.0, 1.0]
                 continue
@@ -222,7 +224,7 @@ class Data:
                 near = np.argsort(((board.points - self.xyz[k]) ** 2).sum(axis=1))[:9]
                 _, _, axes = np.linalg.svd(board.points[near] - board.points[near].mean(axis=0))
                 across[k], down[k] = axes[0], axes[1]
-        return across, down
+        return across, down, bend
 
 
 def check_views(views: Sequence[View], sizes: Sequence[tuple[int, int]]) -> None:

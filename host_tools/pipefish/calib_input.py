@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp")
 CORNERS = (".csv", ".vnl", ".orpc")
 SURVEYS = (".mcap", ".partial")
+TELEMETRY = "telemetry.csv"  # of a recording: no corners
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +126,7 @@ def _files(path: Path) -> list[Path]:
         if path.suffix.lower() not in known:
             raise FormatError(path, None, f"not a picture, survey or corner file: none of {', '.join(known)}")
         return [path]
-    inside = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
+    inside = [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".") and p.name != TELEMETRY]
     for suffixes in (CORNERS, PICTURES, SURVEYS):  # corner lists often lie among their pictures
         found = [p for p in inside if p.suffix.lower() in suffixes]
         if found:

@@ -1,36 +1,29 @@
 """`pipefish calibrate --device`: views from a device that runs, with guidance where to hold the target next.
 
-A device sends no stills on request: its keyframes are whole pictures, so they are the views. They are received as
-`pipefish receive` does, into a survey file; what the device had to send anyway is not lost by calibrating.
+The views are stills: frames as the camera gave them, one after the other as fast as they can be searched. The device's
+survey stays on the device.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
 import math
 import sys
-from collections import deque
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from . import pipefish_pb2 as pb
 from .calib_data import CalibrationError, View
 from .calib_input import Target3D
 from .calib_run import one_radius
 from .calib_verdict import verdict
 from .calibration import calibrate
-from .client import STORED
 from .detect import detect_target
 from .errors import PipefishError
-from .receive import Receiver
-from .surveystore import SurveyStore
-from .surveywrite import OBJECT_KEYFRAME, partial_of
-from .transport import Transport, TransportClosed
+from .stills import StillFolder, Stills, SurveyOver
+from .transport import Transport
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +32,7 @@ _FIRST_MODEL = 6  # views before a camera is tried
 _EVERY = 3  # views between trials; each takes about a second
 _ENOUGH_VIEWS, _ENOUGH_SEEN = 15, 0.85  # views, share of the cells: then more tell little
 _SAME = 0.02  # of the picture's width: a target that moved less says nothing new
+_STILL = 0.003  # of the width, between two stills: 4 px of 1280 in half a second blur an exposure of 20 ms by 0.16 px
 _PLACES = (("top", "middle", "bottom"), ("left", "middle", "right"))
 
 
@@ -53,6 +47,7 @@ class Guide:
     advice: str = ""
     enough: bool = False
     seen: float = 0.0
+    _last: list[View] = dataclasses.field(default_factory=list)  # of the picture before
 
     def add(self, name: str, image: npt.NDArray[np.uint8]) -> str:
         """Takes a picture; -> one line about it."""
@@ -66,10 +61,16 @@ class Guide:
                 found.append(View(target.points[sighting.ids], sighting.pixels, board, 0, name))
             else:
                 reason = reason or sighting.reason
+        before, self._last = self._last, found
         if not found:
             return f"{name}: {reason or 'no target'}"
-        if all(self._as_before(v) for v in found):
-            return f"{name}: as in a view before; move the target"
+        moved = [m for view in found for other in before if (m := self._moved(view, other)) is not None]
+        if not moved or max(moved) > _STILL * self.size[0]:
+            return f"{name}: hold the target still"
+        if all(
+            any((m := self._moved(v, o)) is not None and m < _SAME * self.size[0] for o in self.views) for v in found
+        ):
+            return f"{name}: seen; move the target to another place"
         self.views += found
         self.names.append(name)
         self._think()
@@ -77,17 +78,17 @@ class Guide:
         of = sum(len(t.points) for t in self.targets)
         return f"{name}: view {len(self.names)}, {points} of {of} points; {100 * self.seen:.0f} % seen; {self.advice}"
 
-    def _as_before(self, view: View) -> bool:
+    @staticmethod
+    def _moved(view: View, other: View) -> float | None:
+        """By how many pixels the points that both show have moved, the median; None: fewer than four in common."""
+        if view.board != other.board:
+            return None
         key = {tuple(p): i for i, p in enumerate(np.round(view.board_xyz, 9))}
-        for other in self.views:
-            pairs = [(key[t], j) for j, p in enumerate(np.round(other.board_xyz, 9)) if (t := tuple(p)) in key]
-            if len(pairs) < 4 or other.board != view.board:
-                continue
-            mine, theirs = (list(x) for x in zip(*pairs, strict=True))
-            moved = np.linalg.norm(view.pixels[mine] - other.pixels[theirs], axis=1)
-            if np.median(moved) < _SAME * self.size[0]:
-                return True
-        return False
+        pairs = [(key[t], j) for j, p in enumerate(np.round(other.board_xyz, 9)) if (t := tuple(p)) in key]
+        if len(pairs) < 4:
+            return None
+        mine, theirs = (list(x) for x in zip(*pairs, strict=True))
+        return float(np.median(np.linalg.norm(view.pixels[mine] - other.pixels[theirs], axis=1)))
 
     def cells(self) -> npt.NDArray[np.int64]:
         """Points seen in each cell of the picture, (rows, columns)."""
@@ -135,80 +136,49 @@ class Guide:
         return "\n".join("".join(" .:#"[min(3, int(math.log(1 + n, 4)))] * 2 for n in row) for row in self.cells())
 
 
-class _Views(Receiver):
-    """Receives a survey and keeps the pictures that have just come."""
-
-    def __init__(self, transport: Transport, store: SurveyStore) -> None:
-        super().__init__(transport, store, quiet=True)
-        self.fresh: deque[tuple[int, bytes]] = deque()
-
-    def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
-        new = not self.store.has(name)
-        answer = super().on_object(name, kind, data)
-        if answer == STORED and kind == OBJECT_KEYFRAME and new:
-            keyframe = pb.Keyframe.FromString(data)
-            if self.store.primary in (None, keyframe.survey_id):
-                self.fresh.append((keyframe.index, keyframe.jpeg))
-        return answer
-
-
 def collect(
     transport: Transport,
     targets: list[Target3D],
-    recording: Path,
+    folder: Path,
     *,
     most: int = 60,
     timeout_s: float = 30.0,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Receives pictures until they suffice, there are `most`, the survey ends, or Ctrl-C. -> file, names of the
-    pictures with a new view, ended, seen.
+    """Takes stills until they suffice, there are `most` views, the survey ends, or Ctrl-C; those with a new view of the
+    target are kept in `folder`, which must be new. -> folder, views, ended, seen.
 
-    Raises PipefishError, also where fewer than three views came; what has arrived stays in the recording."""
-    from PIL import Image
-
+    Raises PipefishError, also where fewer than three views came; the folder stays."""
     if any(t.target is None for t in targets):
         raise PipefishError("--device needs a target that can be found: a JSON file of `pipefish target`")
-    store = SurveyStore(recording)
-    receiver = _Views(transport, store)
+    kept = StillFolder(folder)
     guide = Guide(targets)
     screen = Screen(quiet)
-
-    def enough() -> bool:
-        if receiver.fresh and not guide.enough:
-            index, jpeg = receiver.fresh.popleft()
-            with contextlib.suppress(OSError, SyntaxError, ValueError):  # a damaged picture is no view
-                line = guide.add(f"keyframe {index}", np.asarray(Image.open(io.BytesIO(jpeg)).convert("L")))
-                screen.show(line, guide)
-        return guide.enough or len(guide.names) >= most
-
-    ended = "enough has been seen"
     try:
-        with contextlib.suppress(TransportClosed):  # it may be about to start
-            receiver.client.open()
-        receiver.run(timeout_s, enough)
-        while receiver.fresh and not enough():  # the survey has ended; its last pictures count
-            pass
-        ended = ended if guide.enough else f"{most} views" if len(guide.names) >= most else "the survey ended"
+        with Stills(transport, timeout_s) as stills:
+            while not guide.enough and len(guide.names) < most:
+                still = stills.take()
+                count = len(guide.names)
+                line = guide.add(f"frame {still.sequence}", still.image)
+                if len(guide.names) > count:
+                    kept.add(still)
+                screen.show(line, guide)
+        ended = "enough has been seen" if guide.enough else f"{most} views"
     except KeyboardInterrupt:
         ended = "stopped by Ctrl-C"
+    except SurveyOver as error:
+        ended = str(error)
     except PipefishError as error:
-        while receiver.fresh and not enough():
-            pass
         if len(guide.names) < 3:
             raise
         ended = str(error)
     finally:
         screen.close()
-        receiver.client.close()
-        finished = store.finish_complete({})
-        store.close()
-    file = recording if recording in finished or recording.exists() else partial_of(recording)
     if len(guide.names) < 3:
         raise PipefishError(
             f"{len(guide.names)} views with the target came from the device ({ended}); at least 3 are needed"
         )
-    return {"file": str(file), "names": guide.names, "ended": ended, "seen": guide.seen}
+    return {"folder": str(folder), "views": len(guide.names), "ended": ended, "seen": guide.seen}
 
 
 class Screen:
@@ -217,6 +187,7 @@ class Screen:
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
         self._live: Any = None
+        self._said = ""
         if not quiet and sys.stderr.isatty():
             from rich.console import Console
             from rich.live import Live
@@ -232,7 +203,8 @@ class Screen:
 
             body = Text(guide.map_text() + f"\n\n{line}\nCtrl-C: calibrate with what has been seen")
             self._live.update(Panel.fit(body, title="seen in the picture"), refresh=True)
-        elif not self._quiet:
+        elif not self._quiet and line.partition(": ")[2] != self._said:
+            self._said = line.partition(": ")[2]
             print(line, file=sys.stderr, flush=True)
 
     def close(self) -> None:

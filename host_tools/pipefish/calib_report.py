@@ -21,33 +21,21 @@ _NEAR, _FAR = math.radians(30), math.radians(80)  # a wall point is seen at both
 
 @dataclasses.dataclass(eq=False)
 class Uncertainty:
-    """Covariance of one camera with the poses that it came from, for the uncertainty of projections.
+    """Covariance of one camera, and how the scene moves with it, for the uncertainty of projections.
 
-    border (G, G): covariance of the unknowns of cameras, rig and boards. parameter_slope (41, G): the parameters by
-    them. The frames' poses stand for the world, on average: a small motion (turn, shift) of it in the rig, motion_slope
-    (6, G) by the border's unknowns and motion_own (6, 6), the covariance of the rest. All scaled by the residuals.
+    parameters (41, 41): covariance of the camera's, scaled by the residuals. motion (6, 41): the turn and shift of the
+    scene, in the camera's frame, that takes most of a change of the parameters back over all the points of the targets:
+    what a change of pose can do is no uncertainty of the camera.
     """
 
-    border: Array
-    parameter_slope: Array
-    free: list[int]
-    rig: Array  #: camera from rig (3, 4)
-    rig_slope: Array  #: its motion by the border's unknowns, (6, G)
-    motion_slope: Array
-    motion_own: Array
+    covariance: Array
+    motion: Array
     distance: float  #: metres: of the boards, median
     scale: float  #: of the residuals to what their noise says
     camera: Camera | None = None
 
-    def parameters(self) -> Array:
-        """Covariance (n, n) over the free parameters."""
-        slope = self.parameter_slope[self.free]
-        out = slope @ self.border @ slope.T
-        return (out + out.T) / 2
-
-    def _slopes(self, pixels: Array, distance: Array | float | None) -> tuple[Array, Array]:
-        """Of where the points of pixels (N, 2) are seen: by the border's unknowns (N, 2, G), by the world's own motion
-        (N, 2, 6)."""
+    def _slopes(self, pixels: Array, distance: Array | float | None) -> Array:
+        """Of where the points of pixels (N, 2) are seen, by the camera's parameters (N, 2, 41)."""
         assert self.camera is not None
         rays, _ = self.camera.unproject(pixels)
         given = np.broadcast_to(np.asarray(self.distance if distance is None else distance, dtype=float), len(pixels))
@@ -55,27 +43,20 @@ class Uncertainty:
         points = rays * np.where(near, given, 1.0)[:, None] + self.camera.origins(pixels)
         _, _, by_point, by_parameter = self.camera.project_jacobian(np.nan_to_num(points, nan=1.0))
         by_point = np.where(np.isfinite(rays).all(axis=1)[:, None, None], by_point, np.nan)
-        rotation, shift = self.rig[:, :3], self.rig[:, 3] * near[:, None]
-
-        def moved(x: Array) -> Array:
-            return np.concatenate([-_cross(x), np.eye(3) * near[:, None, None]], axis=2)
-
-        by_motion = by_point @ rotation @ moved((points - shift) @ rotation)
-        by_border = by_parameter @ self.parameter_slope + by_motion @ self.motion_slope
-        return by_border + by_point @ moved(points - shift) @ self.rig_slope, by_motion
+        return by_parameter + by_point @ _moved(points, near) @ self.motion
 
     def joint(self, pixels: Array, distance: Array | float | None = None) -> Array:
         """Covariance (2N, 2N) of where the points of `pixels` (N, 2) at `distance` metres (boards' median, inf: at
-        infinity) are seen, by mrcal's definition: points fixed to the boards' frames, which stand for the world, move
-        with the poses; the camera sees them with its own error. NaN outside the model."""
-        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
-        m, k = m.reshape(2 * len(m), -1), k.reshape(2 * len(k), 6)
-        return m @ self.border @ m.T + k @ self.motion_own @ k.T
+        infinity) are seen, after the motion of the scene that fits best: mrcal's cross-reprojection. NaN outside the
+        model."""
+        m = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        m = m.reshape(2 * len(m), -1)
+        return m @ self.covariance @ m.T
 
     def covariances(self, pixels: Array, distance: Array | float | None = None) -> Array:
         """The blocks of `joint` of each pixel, (N, 2, 2)."""
-        m, k = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
-        return m @ self.border @ m.swapaxes(1, 2) + k @ self.motion_own @ k.swapaxes(1, 2)
+        m = self._slopes(np.atleast_2d(np.asarray(pixels, dtype=float)), distance)
+        return m @ self.covariance @ m.swapaxes(1, 2)
 
     def sigma(self, pixels: Array, distance: float | None = None) -> Array:
         """Standard deviation (N,) in the worst direction, pixels, of where points are seen; see `joint`."""
@@ -123,6 +104,11 @@ def _cross(v: Array) -> Array:
     return out - out.swapaxes(-1, -2)
 
 
+def _moved(points: Array, near: Array | bool = True) -> Array:
+    """How points (N, 3) answer to a small turn and shift, (N, 3, 6); those at infinity (near False) do not shift."""
+    return np.concatenate([-_cross(points), np.eye(3) * np.broadcast_to(near, len(points))[:, None, None]], axis=2)
+
+
 def covariance_of(fit: Fit) -> list[Uncertainty]:
     """Of every camera, from the state of a fit. Raises CalibrationError where the views leave something open."""
     data, bundle = fit.data, fit.bundle
@@ -131,14 +117,14 @@ def covariance_of(fit: Fit) -> list[Uncertainty]:
     bundle.set_sigma(fit.sigma)
     bundle.huber = 0.0
     frames = np.unique(data.frame_of[fit.used_views()])
-    camera_at, pose_at, _, _, _, size = bundle.layout()
+    camera_at, _, _, _, _, size = bundle.layout()
     whitened = fit.errors()[fit.used] / fit.sigma[fit.used]
     freedom = 2 * int(fit.used.sum()) - size - 6 * len(frames)
     if freedom <= 0:
         raise CalibrationError("fewer measurements than unknowns: give more views")
     square = float((whitened**2).sum()) / freedom
     try:
-        border, slopes, alone = bundle.uncertainty()
+        border = bundle.uncertainty() * square
     except ValueError:
         raise CalibrationError(
             "the views do not determine the camera: show the board from different sides, tilted, and near the rim too"
@@ -146,32 +132,27 @@ def covariance_of(fit: Fit) -> list[Uncertainty]:
     _, points = bundle.predict()
     out = []
     for c in range(len(data.cameras)):
-        parameter_slope = np.zeros((len(PARAMETERS), size))
+        slope = np.zeros((len(PARAMETERS), size))
         own = bundle.parameter_slope(c)
         if camera_at[c] >= 0:
-            parameter_slope[:, camera_at[c] : camera_at[c] + own.shape[1]] = own
-        rig_slope = np.zeros((6, size))
-        if pose_at[c] >= 0:
-            rig_slope[:, pose_at[c] : pose_at[c] + 6] = np.eye(6)
+            slope[:, camera_at[c] : camera_at[c] + own.shape[1]] = own
+        covariance = slope @ border @ slope.T
         mine = fit.used & (data.camera_of[data.view_of] == c)
-        seen = np.unique(data.frame_of[data.view_of[mine]])
-        # A pose turns about its own origin, which lies off the rig's.
-        arms = np.tile(np.eye(6), (len(seen), 1, 1))
-        arms[:, 3:, :3] = _cross(np.array([bundle.frame(int(f))[:, 3] for f in seen]))
+        seen = np.ascontiguousarray(points[mine])
+        _, fine, by_point, by_parameter = bundle.camera(c).project_jacobian(seen)
+        weight = np.where(fine, 1 / fit.sigma[mine], 0.0)[:, None, None]
+        by_point, by_parameter = np.nan_to_num(by_point), np.nan_to_num(by_parameter)
+        by_motion = (by_point @ _moved(seen) * weight).reshape(-1, 6)
+        motion = -np.linalg.lstsq(by_motion, (by_parameter * weight).reshape(len(by_motion), -1), rcond=None)[0]
         out.append(
             Uncertainty(
-                border=border * square,
-                parameter_slope=parameter_slope,
-                free=fit.model.parameters,
-                rig=bundle.camera_pose(c),
-                rig_slope=rig_slope,
-                motion_slope=(arms @ slopes[seen]).mean(axis=0),
-                motion_own=(arms @ alone[seen] @ arms.swapaxes(1, 2)).sum(axis=0) * square / len(seen) ** 2,
+                covariance=(covariance + covariance.T) / 2,
+                motion=motion,
                 distance=float(np.median(np.linalg.norm(points[mine], axis=1))),
                 scale=math.sqrt(square),
             )
         )
-        sigma_f = math.sqrt(max(out[-1].parameters()[0, 0], 0.0)) / abs(bundle.camera(c).f_u)
+        sigma_f = math.sqrt(max(out[-1].covariance[0, 0], 0.0)) / abs(bundle.camera(c).f_u)
         if not sigma_f < 0.05:
             raise CalibrationError(
                 f"the views leave the focal length open by {100 * sigma_f:.0f} %: they show the board in one pose, or "
@@ -257,8 +238,9 @@ def uncertainty_map(camera: Camera, uncertainty: Uncertainty, columns: int = 16)
 
 
 def halves_difference(fit: Fit) -> list[dict[str, float]]:
-    """Calibrations from every other frame, compared: their difference after the best rotation, and what their own
-    uncertainties expect of it; a ratio much above 1 is model error. One entry a camera."""
+    """Calibrations from every other frame, compared where the targets' points are: their difference after the motion of
+    the scene that fits each best, and what their own uncertainties expect of it; a ratio much above 1 is model error.
+    One entry a camera."""
     data = fit.data
     frames = np.unique(data.frame_of[fit.used_views()])
     frame_of_point = data.frame_of[data.view_of]
@@ -272,28 +254,39 @@ def halves_difference(fit: Fit) -> list[dict[str, float]]:
         except CalibrationError:  # half of the views may leave something open
             return []
         cameras.append([_bounded(part, c) for c in range(len(data.cameras))])
+    predicted, points = fit.bundle.predict()
     out = []
     for c in range(len(data.cameras)):
-        mine = fit.used & (data.camera_of[data.view_of] == c)
-        pixels = data.pixels[mine][:: max(1, int(mine.sum()) // 400)]
-        first, second = cameras[0][c], cameras[1][c]
-        rays, ok = first.unproject(np.ascontiguousarray(pixels))
-        rotation = np.eye(3)
-        for _ in range(5):
-            turned = np.ascontiguousarray(np.where(ok[:, None], rays, [0.0, 0.0, 1.0]) @ rotation.T)
-            seen, fine, by_point, _ = second.project_jacobian(turned)
-            use = ok & fine
-            slope = np.einsum("nij,njk->nik", by_point[use], -_cross(turned[use])).reshape(-1, 3)
-            residual = (pixels - seen)[use]
-            step = np.linalg.lstsq(slope, residual.reshape(-1), rcond=None)[0]
-            angle = float(np.linalg.norm(step)) or 1e-300
-            k = _cross(step / angle)
-            rotation = (np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k) @ rotation
-        expected = [_marginal(uncertainties[h][c], cameras[h][c], pixels[use], fit, c) for h in range(2)]
-        difference = float(np.sqrt(np.mean(residual**2)))
-        predicted = float(np.sqrt(np.mean(expected[0] + expected[1])))
-        out.append({"rms_px": difference, "expected_px": predicted, "ratio": difference / predicted})
+        mine = np.flatnonzero(fit.used & (data.camera_of[data.view_of] == c))
+        mine = mine[:: max(1, len(mine) // 1000)]
+        seen, weight = points[mine], 1 / fit.sigma[mine]
+        first, second = (_aligned(cameras[h][c], seen, predicted[mine], weight) for h in range(2))
+        use = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        distance = np.linalg.norm(seen[use], axis=1)
+        expected = [
+            _variance(uncertainties[h][c], cameras[h][c], predicted[mine][use], distance, fit, c) for h in (0, 1)
+        ]
+        difference = float(np.sqrt(np.mean((first - second)[use] ** 2)))
+        predicted_difference = float(np.sqrt(expected[0] + expected[1]))
+        out.append(
+            {"rms_px": difference, "expected_px": predicted_difference, "ratio": difference / predicted_difference}
+        )
     return out
+
+
+def _aligned(profile: Any, points: Array, pixels: Array, weight: Array) -> Array:
+    """Where a camera sees points (N, 3) after the motion that brings them nearest to `pixels`; NaN outside."""
+    points = np.ascontiguousarray(points)
+    for _ in range(5):
+        seen, fine, by_point, _ = profile.project_jacobian(points)
+        slope = (by_point @ _moved(points) * weight[:, None, None])[fine].reshape(-1, 6)
+        step = np.linalg.lstsq(slope, ((pixels - seen) * weight[:, None])[fine].reshape(-1), rcond=None)[0]
+        angle = float(np.linalg.norm(step[:3])) or 1e-300
+        k = _cross(step[:3] / angle)
+        rotation = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+        points = np.ascontiguousarray(points @ rotation.T + step[3:])
+    seen, fine, _, _ = profile.project_jacobian(points)
+    return np.where(fine[:, None], seen, np.nan)
 
 
 def _bounded(fit: Fit, index: int) -> Any:
@@ -304,8 +297,8 @@ def _bounded(fit: Fit, index: int) -> Any:
     return profile
 
 
-def _marginal(uncertainty: Uncertainty, profile: Any, pixels: Array, fit: Fit, index: int) -> Array:
-    """Variance of projections at infinity along an axis, mean of both, (N,)."""
+def _variance(uncertainty: Uncertainty, profile: Any, pixels: Array, distance: Array, fit: Fit, index: int) -> float:
+    """Variance of projections along an axis: the mean over both and over the pixels (N, 2), points at (N,) metres."""
     width, height = fit.data.size[index]
     keys = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1")
     arrays = ("asym_radial_theta", "asym_radial_phi", "asym_tangential_theta", "asym_tangential_phi", "cpoly")
@@ -318,9 +311,8 @@ def _marginal(uncertainty: Uncertainty, profile: Any, pixels: Array, fit: Fit, i
         except ProfileError:  # not proved one-to-one
             continue
     if uncertainty.camera is None:
-        return np.full(len(pixels), np.nan)
-    variance = np.trace(uncertainty.covariances(pixels, math.inf), axis1=1, axis2=2) / 2
-    return np.array([np.nanmean(variance)])
+        return math.nan
+    return float(np.nanmean(np.trace(uncertainty.covariances(pixels, distance), axis1=1, axis2=2) / 2))
 
 
 # ---------------------------------------------------------------------- the report

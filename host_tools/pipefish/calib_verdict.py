@@ -109,9 +109,11 @@ def _cautions(
     elif held_out > _OVERFIT * report["rms_px"]:
         said.append(f"views that it was not made from fit worse, {held_out:.3f} px rms: take more views")
     if halves is not None and halves > 1.5:
+        two = camera["halves"]
         said.append(
-            f"two halves of the views differ {halves:.1f} times as much as noise explains: the lens is not quite what "
-            "the model can be, or focus or target have changed; the bounds above are widened by that"
+            f"calibrated from either half of the views the camera differs by {two['rms_px']:.2g} px, of which noise "
+            f"explains {two['expected_px']:.2g} px; the rest is in model, target or focus, and the bounds above hold "
+            f"it: they are {halves:.1f} times what noise alone gives"
         )
     if covered < _NARROW:
         said.append(

@@ -465,7 +465,7 @@ def _camera(
             held_out_views=views if table else 0,
         ),
         "covariance_parameters": tuple(PARAMETERS[p] for p in free),
-        "covariance": uncertainty.parameters(),
+        "covariance": uncertainty.covariance[np.ix_(free, free)],
     }
     wanted = _engine.rising_end(profile, min(_image_end(profile, width, height, image_circle), _BEYOND * covered))
     error: ProfileError | None = None

@@ -525,12 +525,14 @@ def build_parser() -> argparse.ArgumentParser:
     from pipefish.cli_homography import add_homography
     from pipefish.cli_pair import add_pair
     from pipefish.cli_profile import add_profile, add_profile_input
+    from pipefish.cli_record import add_record
     from pipefish.cli_target import add_target
 
     add_profile(commands)
     add_target(commands)
     add_pair(commands)
     add_calibrate(commands)
+    add_record(commands)
     add_homography(commands)
 
     from pipefish.cli_match import add_match

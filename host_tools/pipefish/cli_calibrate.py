@@ -42,7 +42,7 @@ def run_calibrate(args: argparse.Namespace) -> Result:
             timeout_s=args.timeout,
             quiet=args.json,
         )
-        sources = {"camera": [Path(live["file"])]}
+        sources = {"camera": [Path(live["folder"])]}
     elif args.camera:
         sources = {}
         for name, path in args.camera:
@@ -56,8 +56,6 @@ def run_calibrate(args: argparse.Namespace) -> Result:
 
         tell("reading", 0.0)
         given = load_views(sources, targets, args.size)
-        if live:
-            given.pictures = [p for p in given.pictures if p.name in live["names"]]
         session = run(given, model=args.model, board=args.board, tell=tell)
         tell("report", 0.98)
         return _written(args, session, live)
@@ -65,8 +63,9 @@ def run_calibrate(args: argparse.Namespace) -> Result:
 
 def _recording(args: argparse.Namespace) -> Path:
     """Where the pictures of a device go. Raises UsageError if that is there already."""
-    path = Path(args.recording) if args.recording else Path(args.output).with_suffix(".mcap")
-    if path.exists():
+    output = Path(args.output)
+    path = Path(args.recording) if args.recording else output.with_name(f"{output.stem}-shots")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UsageError(
             f"calibrate: {path} exists already: name another with --recording, or calibrate from it: "
             f"pipefish calibrate {path} ..."
@@ -306,7 +305,7 @@ def add_calibrate(commands: Any) -> None:
     group.add_argument("--device", metavar="DEVICE", help=DEVICE_HELP)
     group.add_argument("--baud", type=positive, help=f"speed of a serial line [{DEFAULT_BAUD}]")
     group.add_argument(
-        "--recording", metavar="FILE.mcap", help="where its pictures are kept [the profile's name .mcap]"
+        "--recording", metavar="FOLDER", help="where its pictures are kept [the profile's name with -shots]"
     )
     group.add_argument("--most", type=positive, default=60, metavar="N", help="stop after N views with a target [60]")
     group.add_argument(

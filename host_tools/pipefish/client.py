@@ -18,8 +18,6 @@ from pipefish.surveywrite import BootClock
 from pipefish.transport import Transport, TransportClosed
 
 SCHEMA_VERSION = 1  # of pipefish.proto
-MAX_OBJECT = 8 << 20  # bytes; a keyframe of a 20-megapixel camera stays well below
-RECEIVE_SLOTS = 4
 ROLE_HOST = 2
 
 # pf_link_event_type, pf_link_answer and pf_topic
@@ -59,11 +57,15 @@ class Handlers:
 
 
 class ObjectHandlers(Handlers, abc.ABC):
-    """What a client does that takes the device's objects too."""
+    """What a client does that takes the device's objects too: so many at once, so many bytes at most each."""
+
+    receive_slots = 4
+    max_object = 8 << 20  # a keyframe of a 20-megapixel camera stays well below
 
     @abc.abstractmethod
-    def on_offer(self, name: bytes, kind: int, size: int) -> int:
-        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused."""
+    def on_offer(self, name: bytes, kind: int, size: int) -> int | None:
+        """Answer (ACCEPT, STORED, REFUSE) to an object the device wants to send. The device drops what is refused; None
+        leaves it there, and its receive slot taken."""
 
     @abc.abstractmethod
     def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
@@ -88,8 +90,8 @@ class Client:
                 role=ROLE_HOST,
                 nonce=secrets.randbits(32) | 1,
                 schema=SCHEMA_VERSION,
-                max_object=MAX_OBJECT if self._takes_objects else 0,
-                receive_slots=RECEIVE_SLOTS if self._takes_objects else 0,
+                max_object=self._takes_objects.max_object if self._takes_objects else 0,
+                receive_slots=self._takes_objects.receive_slots if self._takes_objects else 0,
                 max_latest=65536,
                 max_control=1000,
             )
@@ -202,7 +204,9 @@ class Client:
             case x if x == LATEST:
                 self._latest(event.topic, event.data)
             case x if x == OFFER and self._takes_objects:
-                self.link.answer_object(event.slot, self._takes_objects.on_offer(event.name, event.kind, event.size))
+                answer = self._takes_objects.on_offer(event.name, event.kind, event.size)
+                if answer is not None:
+                    self.link.answer_object(event.slot, answer)
             case x if x == SENT:
                 self.handlers.on_sent(event.name)
             case x if x == REFUSED:

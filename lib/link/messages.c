@@ -435,6 +435,35 @@ pf_status pf_msg_encode_preview(const pf_msg_preview *p, uint8_t *out, size_t ca
     return encode(pipefish_v1_Preview_fields, &m, out, capacity, n);
 }
 
+/* "mono8": the rows without what the stride puts between them. */
+static bool write_pixels(pb_ostream_t *stream, const pb_field_t *field, void *const *arg)
+{
+    const pf_image *image = *arg;
+    if (!pb_encode_tag_for_field(stream, field) || !pb_encode_varint(stream, (uint64_t)image->width * image->height))
+        return false;
+    for (uint32_t y = 0; y < image->height; y++)
+        if (!pb_write(stream, image->data + (size_t)y * image->stride, image->width))
+            return false;
+    return true;
+}
+
+pf_status pf_msg_encode_raw_frame(const pf_msg_raw_frame *f, uint8_t *out, size_t capacity, size_t *n)
+{
+    pipefish_v1_RawFrame m = pipefish_v1_RawFrame_init_zero;
+    pf_image image = f->image;
+    m.has_time = true;
+    m.time = device_time(&f->time);
+    m.frame_sequence = f->frame_sequence;
+    m.width = image.width;
+    m.height = image.height;
+    m.encoding = text("mono8");
+    m.pixels.funcs.encode = write_pixels;
+    m.pixels.arg = &image;
+    m.has_telemetry = true;
+    set_telemetry(&m.telemetry, &f->telemetry);
+    return encode(pipefish_v1_RawFrame_fields, &m, out, capacity, n);
+}
+
 pf_status pf_msg_encode_reply(const pf_msg_reply *r, uint8_t *out, size_t capacity, size_t *n)
 {
     pipefish_v1_Reply m = pipefish_v1_Reply_init_zero;
@@ -483,6 +512,7 @@ _Static_assert((int)PF_REQUEST_GET_STATUS == pipefish_v1_Request_get_status_tag 
                    (int)PF_REQUEST_GET_PROFILE == pipefish_v1_Request_get_profile_tag &&
                    (int)PF_REQUEST_CONFIRM_PROFILE == pipefish_v1_Request_confirm_profile_tag &&
                    (int)PF_REQUEST_REVERT_PROFILE == pipefish_v1_Request_revert_profile_tag &&
+                   (int)PF_REQUEST_GET_STILL == pipefish_v1_Request_get_still_tag &&
                    (int)PF_REQUEST_PAIR == pipefish_v1_Request_pair_tag,
                "pf_msg_decode_request copies the number");
 

@@ -57,7 +57,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
     pf_status status = pf_msg_decode_request(data, n, &request);
     if (status == PF_OK) {
         if (request.what != PF_REQUEST_UNKNOWN &&
-            (request.what < PF_REQUEST_GET_STATUS || request.what > PF_REQUEST_REVERT_PROFILE))
+            (request.what < PF_REQUEST_GET_STATUS || request.what > PF_REQUEST_GET_STILL))
             abort();
     } else if (status != PF_ERR_FORMAT) {
         abort();

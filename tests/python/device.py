@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import select
 import socket
 import sys
 import threading
 import time
+from collections.abc import Sequence
 
 from pipefish._engine import Link
 
@@ -25,6 +27,7 @@ class Device(threading.Thread):
     corrupt_every  one byte in so many is flipped on its way to the host
     survey_id      what Info and Status tell; b"" tells nothing
     state          what Status tells
+    stills         RawFrame messages, sent one for each get_still; then the survey is over
     most           so many objects are given to the link, over all connections; may be raised at any time
     """
 
@@ -38,6 +41,7 @@ class Device(threading.Thread):
         corrupt_every: int = 0,
         nonce: int = 7,
         state: str = "draining",
+        stills: Sequence[bytes] = (),
     ) -> None:
         super().__init__(daemon=True)
         self.spool = {name: (kind, data) for name, kind, data in objects}
@@ -46,6 +50,7 @@ class Device(threading.Thread):
         self.survey_id, self.boot = survey_id, boot
         self.cut_after, self.corrupt_every = cut_after, corrupt_every
         self.state = state
+        self.stills = list(stills)
         self.most = sys.maxsize
         self.clock: pb.ClockSync | None = None
         self.connections = 0
@@ -139,6 +144,13 @@ class Device(threading.Thread):
                 reply.status.CopyFrom(self.status())
             case "clock_sync":
                 self.clock = request.clock_sync
+            case "get_still" if any(kind == 5 for kind, _ in self.spool.values()):
+                reply.error = "still: one is under way: try again"
+            case "get_still" if self.stills:
+                data = self.stills.pop(0)
+                self.spool[hashlib.sha256(data).digest()] = (5, data)
+            case "get_still":
+                reply.error = "still: the survey is over, the camera gives no frames"
             case _:
                 reply.error = "this device cannot do that"
         self.link.send_control(reply.SerializeToString())

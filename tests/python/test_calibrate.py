@@ -10,7 +10,10 @@ import pytest
 
 import pipefish as pf
 from calib_scenes import RADII, Lens, bearing_error, board, random_lens, turn, views_of
-from pipefish import _engine
+from pipefish import _engine, calibration
+from pipefish.calib_data import Data
+from pipefish.calib_model import Model
+from pipefish.calib_report import _aligned
 from pipefish.calibration import Calibration, CalibrationError, View, calibrate
 
 LENS = Lens("equidistant", 1280, 800, 330.0, (645.0, 395.0), 1.001, (-0.02, 0.002), math.radians(93))
@@ -197,11 +200,12 @@ def sleeve_views(target: pf.Target, count: int, noise: float, radius: float) -> 
         if seen.sum() < 20:
             continue
         if radius:
-            spin = 2 * np.pi * np.arange(64) / 64
-            for i in np.flatnonzero(seen):  # discs drawn on a tangent plane; area by Green over a fine rim
-                out = points[i] * [1, 1, 0] / np.hypot(*points[i, :2])
-                across, down = np.cross(out, [0, 0, 1.0]), np.array([0, 0, 1.0])
-                rim = points[i] + radius * (np.outer(np.cos(spin), across) + np.outer(np.sin(spin), down))
+            spin = 2 * np.pi * np.arange(512) / 512
+            for i in np.flatnonzero(seen):  # printed on a sheet that lies on the wall; area by Green over a fine rim
+                wall, clock = np.hypot(*points[i, :2]), np.arctan2(points[i, 1], points[i, 0])
+                around = clock + radius * np.cos(spin) / wall
+                along = points[i, 2] + radius * np.sin(spin)
+                rim = np.stack([wall * np.cos(around), wall * np.sin(around), along], axis=1)
                 u, v = (LENS.project(rim @ pose[:, :3].T + pose[:, 3])[0] - pixels[i]).T
                 next_u, next_v = np.roll(u, -1), np.roll(v, -1)
                 part = u * next_v - next_u * v
@@ -226,14 +230,14 @@ def test_a_sleeve_around_the_inside_of_a_pipe_calibrates_without_a_guess() -> No
     assert bearing_error(result.camera, LENS, views, poses) * LENS.f < 0.1
 
 
-def test_discs_of_a_sleeve_lie_in_the_wall() -> None:
-    """Their planes come from their neighbours: a disc in another plane has another centroid."""
+def test_discs_of_a_sleeve_lie_on_the_wall() -> None:
+    """They bend with it: discs taken as flat would leave 0.01 px and more, 512 chords of a rim leave 1e-4."""
     target = pf.Target("sleeve", 5, 16, 0.05, diameter_m=0.3)
     views, _ = sleeve_views(target, 8, 0.0, 0.012)
     right = calibrate(views, SIZE, "p9", circle_radius=0.012)
     points = calibrate(views, SIZE, "p9")
-    assert right.rms < 0.1 * points.rms
-    assert abs(right.camera.f_u - 330) < 0.2 * abs(points.camera.f_u - 330)
+    assert right.rms < 5e-4 < 0.01 * points.rms
+    assert right.camera.f_u == pytest.approx(330, abs=1e-3)
 
 
 def test_outliers_are_left_out_and_named() -> None:
@@ -420,13 +424,10 @@ def test_cameras_and_boards_of_a_rig_share_their_poses() -> None:
 def test_intervals_hold_the_truth_and_the_squares_add_up() -> None:
     """24 sets of noise on the same views: chi square of 8 parameters is 8 on average, and Paper II's measurement^2 =
     residual^2 + estimation^2. tests/accept_calib.py takes 300."""
-    clean, poses = scene(77, 12, 0.0)
+    clean, _ = scene(77, 12, 0.0)
     truth = np.array([330, 330 * 1.001, 645, 395, -0.02, 0.002, 0, 0])
     exact = np.concatenate([v.pixels for v in clean])
-    chi, squares, z = [], [], []
-    spots = np.array([[645.0, 395.0], [300.0, 200.0], [1000.0, 600.0]])
-    ideal = calibrate(clean, SIZE, "p9", "flat")
-    rays, _ = ideal.camera.unproject(spots)
+    chi, squares = [], []
     for seed in range(24):
         random = np.random.default_rng(seed)
         views = [View(v.board_xyz, v.pixels + random.normal(0, 0.1, v.pixels.shape)) for v in clean]
@@ -437,20 +438,35 @@ def test_intervals_hold_the_truth_and_the_squares_add_up() -> None:
         residual = np.array(result.report["residuals"]["residual"])
         measured = np.concatenate([v.pixels for v in views])
         squares.append([np.mean(d**2) for d in (measured - exact, residual, measured - residual - exact)])
-        # Projections: points that stand still in the boards' frames, as mrcal defines their uncertainty.
-        moved = np.mean([_through(rays * 0.4, old, new) for old, new in zip(poses, result.poses, strict=True)], axis=0)
-        z.append((c.project(moved)[0] - spots) / result.uncertainty[0].sigma(spots, 0.4)[:, None])
     # 24 draws of chi square with 8 degrees: 8 +- 4 / sqrt(24), four deviations.
     assert abs(np.mean(chi) - 8) < 4 * 4 / math.sqrt(24)
     measurement, residual, estimation = np.mean(squares, axis=0)
     assert measurement == pytest.approx(residual + estimation, rel=0.03)
-    # sigma is of the worst direction: scaled errors below one on average, and not by much.
-    assert 0.4 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
 
 
-def _through(points: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Points fixed to a board whose pose was `old`, seen under `new`."""
-    return ((points - old[:, 3]) @ old[:, :3]) @ new[:, :3].T + new[:, 3]
+@pytest.mark.parametrize("model", [Model(), Model(shape="z6xy", pupil="e1")], ids=lambda m: m.name)
+def test_the_map_of_uncertainty_is_the_scatter_of_projections(model: Model) -> None:
+    """Chi square of where three points are seen, after the motion of the scene that fits best (mrcal's
+    cross-reprojection), by their joint covariance: 6 on average, also where a pupil shift and a board's shape are free,
+    which poses can nearly make up for."""
+    clean, poses = scene(77, 12, 0.0)
+    exact = np.concatenate([v.pixels for v in clean])
+    seen = np.concatenate([v.board_xyz @ p[:, :3].T + p[:, 3] for v, p in zip(clean, poses, strict=True)])
+    spots = np.array([[645.0, 395.0], [300.0, 200.0], [1000.0, 600.0]])
+    rays, _ = calibrate(clean, SIZE, "p9", "flat").camera.unproject(spots)
+    points, pixels = np.concatenate([seen, 0.3 * rays]), np.concatenate([exact, spots])
+    weight = np.repeat([1.0, 0.0], [len(seen), len(rays)])
+    chi = []
+    for seed in range(16):
+        random = np.random.default_rng(seed)
+        views = [View(v.board_xyz, v.pixels + random.normal(0, 0.1, v.pixels.shape)) for v in clean]
+        fit = calibration._start(Data(views, [SIZE]), None)
+        for m in (Model(), model):
+            calibration._settle(fit, m, "uniform", False)
+        result = calibration._result(fit, fit, [], [], "uniform", False, None, "")
+        off = (_aligned(fit.bundle.camera(0), points, pixels, weight) - pixels)[-len(spots) :].ravel()
+        chi.append(off @ np.linalg.solve(result.uncertainty[0].joint(spots, 0.3), off))
+    assert abs(np.mean(chi) - 6) < 4 * math.sqrt(12 / 16)
 
 
 def test_more_views_make_pipes_more_certain_and_the_report_is_plain() -> None:

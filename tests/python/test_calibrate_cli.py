@@ -19,11 +19,12 @@ import pipefish as pf
 from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
-from pipefish.calib_input import load_target, load_views, natural
+from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
 from pipefish.calib_run import circle_around
+from pipefish.calib_run import run as run_pictures
 from pipefish.calib_verdict import verdict
-from synthetic import SURVEY, Object, as_object, end, keyframe, start
+from synthetic import BOOT, SURVEY, keyframe, start
 from test_page import Outline, data_of
 
 TARGET = pf.Target("checkerboard", 9, 12, 0.03)
@@ -305,6 +306,25 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     assert "no pictures" in refused(empty)
 
 
+def test_an_ambiguous_picture_is_settled_by_a_first_model():
+    """The picture's edge, or the lens's, cuts a grid of discs: a model tells where it would show more of them."""
+    board = pf.Target("circles", 6, 8, 0.03)
+    seen, _ = pf.simulate_target_views(
+        board, {"preset": "fisheye-185", "width": 480, "height": 360}, 8, samples=34, seed=1
+    )
+    pictures = [Picture(f"p{i}", 0, f"p{i}", lambda v=v: v.image) for i, v in enumerate(seen)]
+    assert pf.detect_target(seen[4].image, board).status == "ambiguous"
+    target = Target3D("dots", board.points(), board.radius_m, board)
+    session = run_pictures(
+        Given(["camera"], [target], pictures, [], [(480, 360)]), model="p9", board="flat", tell=lambda *_: None
+    )
+    found = next(s for s in session.sightings if s.picture.name == "p4")
+    assert found.status == "partial" and len(found.ids) > 20 and not session.unseen
+    turned = len(board.points()) - 1 - found.ids  # the whole looks the same turned by 180 degrees
+    off = [np.linalg.norm(found.pixels - seen[4].centroids[ids], axis=1).max() for ids in (found.ids, turned)]
+    assert min(off) < 1.0
+
+
 def test_points_of_the_target_lie_inside_the_image_circle():
     v, u = np.mgrid[:480, :640]
     lit = np.where(np.hypot(u - 325.3, v - 236.8) < 225.4, 160, 6).astype(np.uint8)
@@ -318,43 +338,44 @@ def test_points_of_the_target_lie_inside_the_image_circle():
 # ---------------------------------------------------------------------- from a device
 
 
-def device_objects(folder) -> list[Object]:
-    """A survey whose keyframes are the pictures of a folder, the first one twice."""
-    objects = [start()]
+def stills_of(folder) -> list[bytes]:
+    """Each picture of a folder as a still, twice, as of a target held still for a moment; the first thrice."""
     files = sorted(folder.iterdir(), key=lambda p: natural(p.name))
-    files = [files[0], *files]
-    for i, path in enumerate(files):
-        message = pb.Keyframe.FromString(keyframe(i)[2])
-        out = io.BytesIO()
-        Image.open(path).save(out, "JPEG", quality=92)
-        message.jpeg, message.width, message.height = out.getvalue(), 480, 360
-        objects.append(as_object(2, message))
-    return [*objects, end(len(files))]
+    messages = []
+    for i, path in enumerate([files[0], *(f for f in files for _ in range(2))]):
+        pixels = np.array(Image.open(path))
+        frame = pb.RawFrame(frame_sequence=i, width=480, height=360, encoding="mono8", pixels=pixels.tobytes())
+        frame.time.boot_id = BOOT
+        messages.append(frame.SerializeToString())
+    return messages
 
 
-def test_a_device_is_calibrated_from_its_keyframes_and_they_are_kept(pictures, tmp_path, capsys):
+def test_a_device_is_calibrated_from_stills_and_they_are_kept(pictures, tmp_path, capsys):
     folder, target, _ = pictures
     out = tmp_path / "c.json"
-    with Device(device_objects(folder), SURVEY) as device:
+    with Device([start(), keyframe(0)], SURVEY, state="surveying", stills=stills_of(folder)) as device:
         arguments = ["--device", device.address, "--target", target, "-o", out, "--model", "p9"]
         assert run(*arguments) == 0
+        assert sorted(kind for kind, _ in device.spool.values() if kind != 5) == [1, 2]  # the survey is still there
     text = capsys.readouterr()
     assert f"pipefish flash {device.address} {out}" in text.out
     lines = text.err.splitlines()
-    assert "keyframe 0: view 1, " in lines[0] and "next: " in lines[0]
-    assert lines[1] == "keyframe 1: as in a view before; move the target"
-    assert any(line.startswith("keyframe 10: ") and "view" not in line for line in lines)  # the one without a target
+    assert lines[0] == "frame 0: hold the target still"
+    assert "frame 1: view 1, " in lines[1] and "next: " in lines[1]
+    assert lines[2] == "frame 2: seen; move the target to another place"
     assert pf.Camera.load(out).provenance.views == 9
-    survey = pf.Survey.open(out.with_suffix(".mcap"))
-    assert survey.complete and len(survey.keyframes) == 11
-    assert not device.spool
+    kept = tmp_path / "c-shots"
+    assert len(list(kept.glob("shot*.png"))) == 9
+    first = np.array(Image.open(folder / "shot0.png"))
+    np.testing.assert_array_equal(np.array(Image.open(kept / "shot1.png")), first)
     assert run(*arguments) == 2 and "calibrate from it" in capsys.readouterr().err
 
 
 def test_a_device_that_shows_no_target_is_told_so(tmp_path, target, capsys):
-    with Device([start(), keyframe(0), keyframe(1), end(2)], SURVEY) as device:
+    frame = pb.RawFrame(width=64, height=48, encoding="mono8", pixels=bytes(64 * 48)).SerializeToString()
+    with Device([], SURVEY, state="surveying", stills=[frame]) as device:
         assert run("--device", device.address, "--target", target, "-o", tmp_path / "c.json") == 1
-    assert "0 views with the target came from the device (the survey ended)" in capsys.readouterr().err
+    assert re.search("0 views with the target came from the device .*the survey is over", capsys.readouterr().err)
 
 
 def test_guidance_points_where_nothing_was_seen(target):

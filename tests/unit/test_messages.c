@@ -399,6 +399,32 @@ static void test_survey_end_status_and_preview_round_trip(void)
     TEST_ASSERT_EQUAL_MEMORY(jpeg, bytes(m, 5).data, sizeof jpeg);
 }
 
+/* Proves: a raw frame's pixels come without what the stride puts between the rows, and within the bound stated. */
+static void test_raw_frame_round_trip(void)
+{
+    static const uint8_t pixels[] = {1, 2, 3, 99, 4, 5, 6, 99}, packed[] = {1, 2, 3, 4, 5, 6};
+    uint8_t out[PF_MSG_RAW_FRAME_MAX(6)];
+    size_t n = 0;
+    pf_msg_raw_frame f = {.time = {UINT64_MAX, UINT64_MAX},
+                          .frame_sequence = UINT64_MAX,
+                          .image = {pixels, 3, 2, 4},
+                          .telemetry = sample_status().telemetry};
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_raw_frame(&f, out, sizeof out, &n));
+    const view m = {out, n};
+    TEST_ASSERT_EQUAL_UINT64(UINT64_MAX, number(bytes(m, 1), 2));
+    TEST_ASSERT_EQUAL_UINT64(UINT64_MAX, number(m, 2));
+    TEST_ASSERT_EQUAL_UINT64(3, number(m, 3));
+    TEST_ASSERT_EQUAL_UINT64(2, number(m, 4));
+    check_text("mono8", bytes(m, 5));
+    TEST_ASSERT_EQUAL_size_t(sizeof packed, bytes(m, 6).n);
+    TEST_ASSERT_EQUAL_MEMORY(packed, bytes(m, 6).data, sizeof packed);
+    TEST_ASSERT_TRUE(has(m, 7));
+    for (size_t capacity = 0; capacity < n; capacity++) {
+        size_t unused;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_encode_raw_frame(&f, out, capacity, &unused));
+    }
+}
+
 static void test_reply_round_trip(void)
 {
     uint8_t out[1024];
@@ -580,10 +606,11 @@ static void test_requests_are_decoded(void)
 {
     static const uint8_t lamp[] = {0x08, 0x96, 0x01, 0x2D, 0x00, 0x00, 0x00, 0x3F}; /* id 150, set_lamp 0.5 */
     static const uint8_t clock[] = {0x08, 0x01, 0x32, 0x0D, 0x09, 1, 2, 3, 4, 5, 6, 7, 8, 0x10, 0x09, 0x18, 0x07};
-    static const uint8_t nothing[][4] = {{0x08, 2, 0x12, 0}, {0x08, 2, 0x1A, 0}, {0x08, 2, 0x22, 0},
-                                         {0x08, 2, 0x3A, 0}, {0x08, 2, 0x42, 0}, {0x08, 2, 0x52, 0}};
+    static const uint8_t nothing[][4] = {{0x08, 2, 0x12, 0}, {0x08, 2, 0x1A, 0}, {0x08, 2, 0x22, 0}, {0x08, 2, 0x3A, 0},
+                                         {0x08, 2, 0x42, 0}, {0x08, 2, 0x52, 0}, {0x08, 2, 0x5A, 0}};
     static const pf_request_what what[] = {PF_REQUEST_GET_STATUS, PF_REQUEST_GET_INFO,    PF_REQUEST_STOP_SURVEY,
-                                           PF_REQUEST_SHUTDOWN,   PF_REQUEST_GET_PROFILE, PF_REQUEST_REVERT_PROFILE};
+                                           PF_REQUEST_SHUTDOWN,   PF_REQUEST_GET_PROFILE, PF_REQUEST_REVERT_PROFILE,
+                                           PF_REQUEST_GET_STILL};
     uint8_t confirm[36] = {0x08, 3, 0x4A, 32}, sha256[32];
     static const uint8_t newer[] = {0x08, 0x05, 0xA2, 0x06, 0x01, 0x61}; /* id 5, unknown field 100 */
     pf_msg_request r;
@@ -596,7 +623,7 @@ static void test_requests_are_decoded(void)
     TEST_ASSERT_EQUAL_HEX64(0x0807060504030201u, r.clock.boot_id);
     TEST_ASSERT_EQUAL_INT64(-5, r.clock.offset_ns);
     TEST_ASSERT_EQUAL_UINT64(7, r.clock.error_ns);
-    for (size_t i = 0; i < 6; i++) {
+    for (size_t i = 0; i < 7; i++) {
         TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_decode_request(nothing[i], 4, &r));
         TEST_ASSERT_EQUAL_INT(what[i], r.what);
     }
@@ -644,6 +671,7 @@ int main(void)
     RUN_TEST(test_unmeasured_telemetry_is_absent);
     RUN_TEST(test_survey_start_round_trip);
     RUN_TEST(test_survey_end_status_and_preview_round_trip);
+    RUN_TEST(test_raw_frame_round_trip);
     RUN_TEST(test_reply_round_trip);
     RUN_TEST(test_largest_status_fits_a_control_message);
     RUN_TEST(test_too_small_a_buffer_is_an_error_at_every_size);

@@ -104,11 +104,12 @@ template <class Each> void each_point(Bundle &bundle, size_t given, const Each &
             each(point, i++);
 }
 
-void set_planes(Bundle &bundle, const Rows<3> &across, const Rows<3> &down)
+void set_sheets(Bundle &bundle, const Rows<3> &across, const Rows<3> &down, const Rows<3> &bend)
 {
     each_point(bundle, across.shape(0), [&](Observation &point, size_t i) {
         point.across = Eigen::Map<const Eigen::Vector3d>(across.data() + 3 * i);
         point.down = Eigen::Map<const Eigen::Vector3d>(down.data() + 3 * i);
+        point.bend = Eigen::Map<const Eigen::Vector3d>(bend.data() + 3 * i);
     });
 }
 
@@ -152,24 +153,17 @@ nb::tuple adjust(Bundle &bundle, int max_iterations, double cost_tolerance)
     return nb::make_tuple(names[static_cast<int>(summary.status)], summary.iterations, summary.final_cost);
 }
 
-nb::tuple uncertainty(Bundle &bundle)
+nb::object uncertainty(Bundle &bundle)
 {
-    Bundle::Uncertainty u;
+    Eigen::MatrixXd border;
     bundle.arrange();
     try {
         nb::gil_scoped_release release;
-        u = bundle.uncertainty();
+        border = bundle.uncertainty();
     } catch (const std::domain_error &error) {
         throw nb::value_error(error.what());
     }
-    const size_t width = static_cast<size_t>(u.border.rows()), count = u.slope.size();
-    std::unique_ptr<double[]> slope(new double[count * 6 * width + 1]), alone(new double[count * 36 + 1]);
-    for (size_t f = 0; f < count; f++) {
-        put(slope.get() + f * 6 * width, u.slope[f]);
-        put(alone.get() + f * 36, u.alone[f]);
-    }
-    return nb::make_tuple(matrix(u.border), numbers(std::move(slope), {count, 6, width}),
-                          numbers(std::move(alone), {count, 6, 6}));
+    return nb::cast(matrix(border));
 }
 
 nb::object view_pose_of(const Bundle &bundle, size_t index)
@@ -221,7 +215,8 @@ void bind_calib(nb::module_ &m)
         .def(nb::new_(&make), nb::arg("camera"), nb::arg("board"), nb::arg("frame"), nb::arg("first"),
              nb::arg("drawn").noconvert(), nb::arg("pixels").noconvert(), nb::arg("circle_radius") = 0.0)
         .def("copy", [](const Bundle &b) { return std::make_unique<Bundle>(b); })
-        .def("set_planes", &set_planes, nb::arg("across").noconvert(), nb::arg("down").noconvert())
+        .def("set_sheets", &set_sheets, nb::arg("across").noconvert(), nb::arg("down").noconvert(),
+             nb::arg("bend").noconvert())
         .def("set_used",
              [](Bundle &b, const Flags &used) {
                  each_point(b, used.shape(0), [&](Observation &p, size_t i) { p.used = used.data()[i]; });
@@ -286,9 +281,7 @@ void bind_calib(nb::module_ &m)
         .def("adjust", &adjust, nb::arg("max_iterations") = 100, nb::arg("cost_tolerance") = 1e-12,
              "-> status, iterations, half the sum of squares; 'outside': a point has no projection at the start.")
         .def("predict", &predict, "-> pixels (N, 2), NaN outside the model, points in their camera's frame (N, 3)")
-        .def("uncertainty", &uncertainty,
-             "-> covariance of the border's unknowns (G, G), slopes of the frames' poses by them (F, 6, G), covariance "
-             "of each pose when they are known (F, 6, 6)")
+        .def("uncertainty", &uncertainty, "-> covariance of the border's unknowns (G, G)")
         .def("layout",
              [](Bundle &b) {
                  b.arrange();

@@ -261,6 +261,16 @@ bool Bundle::project_point(const View &view, const Eigen::Vector3d &drawn, doubl
     return true;
 }
 
+Eigen::Vector3d Observation::on_sheet(double x, double y) const
+{
+    const double curvature = bend.norm(), angle = x * curvature;
+    if (curvature == 0.0) {
+        return drawn + x * across + y * down;
+    }
+    const double half = std::sin(0.5 * angle); // 1 - cos without cancelling
+    return drawn + std::sin(angle) / curvature * across + 2.0 * half * half / (curvature * curvature) * bend + y * down;
+}
+
 bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d &pixel, double *d_frame,
                      double *d_border) const
 {
@@ -273,7 +283,7 @@ bool Bundle::project(const View &view, const Observation &point, Eigen::Vector2d
     std::vector<double> jg(d_frame ? static_cast<size_t>(kRim * 2 * layout_.size) : 0);
     for (size_t i = 0; i < kRim; i++) {
         const Eigen::Vector3d edge =
-            point.drawn + circle_radius * (directions[i].x() * point.across + directions[i].y() * point.down);
+            point.on_sheet(circle_radius * directions[i].x(), circle_radius * directions[i].y());
         Eigen::Vector2d at;
         double *f = d_frame ? jf.data() + i * 12 : nullptr;
         double *g = d_frame ? jg.data() + i * static_cast<size_t>(2 * layout_.size) : nullptr;
@@ -512,9 +522,8 @@ optim::Summary Bundle::adjust(const optim::Options &options)
     return summary;
 }
 
-Bundle::Uncertainty Bundle::uncertainty() const
+Eigen::MatrixXd Bundle::uncertainty() const
 {
-    Uncertainty out;
     const Eigen::Index width = layout_.size;
     Eigen::MatrixXd reduced = Eigen::MatrixXd::Zero(width, width);
     using Wide = Eigen::Map<const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>>;
@@ -533,19 +542,17 @@ Bundle::Uncertainty Bundle::uncertainty() const
             throw std::domain_error("calibration: a view does not determine its pose");
         }
         const Eigen::MatrixXd cross_term = je.transpose() * jg;
-        out.slope.push_back(-llt.solve(cross_term));
-        out.alone.push_back(llt.solve(Eigen::Matrix<double, 6, 6>::Identity()));
-        reduced.noalias() += cross_term.transpose() * out.slope.back();
+        reduced.noalias() -= cross_term.transpose() * llt.solve(cross_term);
     }
     const Eigen::VectorXd scale = reduced.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
     const Eigen::LLT<Eigen::MatrixXd> llt(scale.asDiagonal() * reduced * scale.asDiagonal());
     if (width > 0 && (llt.info() != Eigen::Success || !(llt.rcond() > 1e-14))) {
         throw std::domain_error("calibration: the views do not determine all of the model");
     }
-    out.border = width > 0 ? Eigen::MatrixXd(scale.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(width, width)) *
-                                             scale.asDiagonal())
-                           : Eigen::MatrixXd(0, 0);
-    return out;
+    if (width == 0) {
+        return reduced;
+    }
+    return scale.asDiagonal() * llt.solve(Eigen::MatrixXd::Identity(width, width)) * scale.asDiagonal();
 }
 
 } // namespace pipefish::calib

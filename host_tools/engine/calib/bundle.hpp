@@ -28,7 +28,11 @@ struct Observation {
     double sigma = 1.0; // pixels, along each axis
     bool used = true;
     double parity = 0.0; // of a checkerboard's corner, +-1; 0: not a corner
-    Eigen::Vector3d across = Eigen::Vector3d::UnitX(), down = Eigen::Vector3d::UnitY(); // plane of a circle
+    Eigen::Vector3d across = Eigen::Vector3d::UnitX(), down = Eigen::Vector3d::UnitY(); // plane that touches a circle
+    Eigen::Vector3d bend = Eigen::Vector3d::Zero(); // of the sheet along `across`: to the bend's centre, 1 / metres
+
+    // A point of the sheet the circle is printed on, so far along `across` and `down`, metres.
+    Eigen::Vector3d on_sheet(double x, double y) const;
 };
 
 struct View {
@@ -87,14 +91,9 @@ public:
     // Views without a usable point in the image's domain are left where they are.
     optim::Summary adjust(const optim::Options &options);
 
-    struct Uncertainty {
-        Eigen::MatrixXd border;                                      // covariance of the border's unknowns
-        std::vector<Eigen::Matrix<double, 6, Eigen::Dynamic>> slope; // of a frame's pose by the border: -H_ee^-1 H_eg
-        std::vector<Eigen::Matrix<double, 6, 6>> alone;              // covariance of a frame's pose, border known
-    };
-    // Unscaled: of residuals whose standard deviation is exactly sigma. Throws std::domain_error where the data do not
-    // determine everything.
-    Uncertainty uncertainty() const;
+    // Covariance of the border's unknowns, unscaled: of residuals whose standard deviation is exactly sigma. Throws
+    // std::domain_error where the data do not determine everything.
+    Eigen::MatrixXd uncertainty() const;
 
     // Largest observed angle off the axis of a camera, radians.
     double theta_observed(int camera) const;

@@ -223,7 +223,7 @@ void finish(const cv::Mat &image, const Board &board, Placed placed, Detection &
     if (placed.placement.ways > placed.placement.turns) {
         out.status = Status::ambiguous;
         out.reason += ": board ordering ambiguous, " + std::to_string(placed.placement.ways) +
-                      " places on the board look the same";
+                      " places on the board look the same; show more of its edge";
     } else if (out.turns > 1) {
         out.reason += (out.reason.empty() ? "" : "; ");
         out.reason += "the target looks the same when turned (" + std::to_string(out.turns) +

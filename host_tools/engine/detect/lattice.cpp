@@ -1,4 +1,4 @@
-#include "lattice.hpp"
+#include "lattice_steps.hpp"
 
 #include "disc.hpp"
 
@@ -12,18 +12,6 @@ namespace pipefish::detect
 {
 namespace
 {
-
-const std::array<Site, 4> kSteps = {{{1, 0}, {0, 1}, {-1, 0}, {0, -1}}};
-
-Site plus(const Site &a, const Site &b)
-{
-    return {a[0] + b[0], a[1] + b[1]};
-}
-
-double cross(const Eigen::Vector2d &a, const Eigen::Vector2d &b)
-{
-    return a.x() * b.y() - a.y() * b.x();
-}
 
 Eigen::Vector2d direction(const Corner &c, int d)
 {
@@ -88,7 +76,8 @@ std::vector<std::array<Link, 4>> link_corners(const cv::Mat &image, const std::v
     return links;
 }
 
-// Drops what is not where its neighbours on both sides say, the worst first.
+} // namespace
+
 void prune(Grid &grid)
 {
     while (grid.size() > 4) {
@@ -116,8 +105,6 @@ void prune(Grid &grid)
         grid.erase(at);
     }
 }
-
-} // namespace
 
 Grid grid_of_corners(const cv::Mat &image, const std::vector<Corner> &corners)
 {
@@ -163,202 +150,6 @@ Grid grid_of_corners(const cv::Mat &image, const std::vector<Corner> &corners)
     }
     prune(best);
     return best;
-}
-
-namespace
-{
-
-// Index of the blob nearest to a place, within a distance; -1: none.
-int nearest(const std::vector<Blob> &blobs, const Eigen::Vector2d &place, double within)
-{
-    int best = -1;
-    for (size_t k = 0; k < blobs.size(); k++) {
-        const double far = (blobs[k].at - place).norm();
-        if (far < within) {
-            within = far;
-            best = static_cast<int>(k);
-        }
-    }
-    return best;
-}
-
-bool alike(const Blob &a, const Blob &b)
-{
-    const double ratio = std::abs(a.half_axes.determinant() / b.half_axes.determinant());
-    return ratio > 0.35 && ratio < 2.8;
-}
-
-// From a blob and its neighbours on both sides along two directions: (1, 0), (-1, 0), (0, 1), (0, -1).
-Grid grow_blobs(const std::vector<Blob> &blobs, int seed, const std::array<int, 4> &beside)
-{
-    Grid grid;
-    std::set<int> used;
-    const auto put = [&](const Site &site, int k) {
-        Point p;
-        p.at = blobs[size_t(k)].at;
-        p.code = k; // which blob, until the grid is chosen
-        grid[site] = p;
-        used.insert(k);
-    };
-    put({0, 0}, seed);
-    put({1, 0}, beside[0]);
-    put({-1, 0}, beside[1]);
-    put({0, 1}, beside[2]);
-    put({0, -1}, beside[3]);
-    for (bool more = true; more;) {
-        more = false;
-        std::set<Site> border;
-        for (const auto &[site, point] : grid)
-            for (const Site &step : kSteps)
-                if (!grid.contains(plus(site, step)))
-                    border.insert(plus(site, step));
-        for (const Site &site : border) {
-            const auto f = forecast(grid, site, 0, false);
-            if (!f)
-                continue;
-            const double step = f->cell.colwise().norm().minCoeff();
-            const int k = nearest(blobs, f->at, 0.35 * step);
-            if (k < 0 || used.contains(k))
-                continue;
-            bool fits = true;
-            for (const Site &s : kSteps)
-                if (const auto near = grid.find(plus(site, s)); near != grid.end())
-                    fits = fits && alike(blobs[size_t(k)], blobs[size_t(near->second.code)]);
-            if (!fits)
-                continue;
-            put(site, k);
-            more = true;
-        }
-    }
-    return grid;
-}
-
-// How far points are from midway between their neighbours, in steps: the mean.
-double roughness(const Grid &grid)
-{
-    double sum = 0.0;
-    int count = 0;
-    for (const auto &[site, point] : grid)
-        for (size_t d = 0; d < 2; d++) {
-            const auto before = grid.find(plus(site, kSteps[d + 2])), after = grid.find(plus(site, kSteps[d]));
-            if (before == grid.end() || after == grid.end())
-                continue;
-            const Eigen::Vector2d off = 0.5 * (after->second.at + before->second.at) - point.at;
-            sum += 2.0 * off.norm() / ((after->second.at - before->second.at).norm() + 1e-9);
-            count++;
-        }
-    return count ? sum / count : 1.0;
-}
-
-// The change of base that makes steps u, v as short as they can be (Gauss's reduction): new site = m * site.
-std::array<int, 4> shortening(Eigen::Vector2d u, Eigen::Vector2d v)
-{
-    std::array<int, 4> m = {1, 0, 0, 1};
-    for (int round = 0; round < 20; round++) {
-        // Sites are i u + j v: where u loses v, j gains i.
-        const int k = static_cast<int>(std::lround(u.dot(v) / v.squaredNorm()));
-        const int l = k ? 0 : static_cast<int>(std::lround(u.dot(v) / u.squaredNorm()));
-        if (!k && !l)
-            break;
-        u -= k * v;
-        m = {m[0], m[1], m[2] + k * m[0], m[3] + k * m[1]};
-        v -= l * u;
-        m = {m[0] + l * m[2], m[1] + l * m[3], m[2], m[3]};
-    }
-    return m;
-}
-
-// The same grid on the lattice's shortest base, by a vote of its sites: a seed at the border of a grid may have found a
-// slanted one.
-Grid with_short_steps(const Grid &grid)
-{
-    std::map<std::array<int, 4>, int> votes;
-    for (const auto &[site, point] : grid)
-        if (const auto f = forecast(grid, site, 0, true))
-            votes[shortening(f->cell.col(0), f->cell.col(1))]++;
-    std::array<int, 4> m = {1, 0, 0, 1};
-    int most = 0;
-    for (const auto &[matrix, count] : votes)
-        if (count > most) {
-            most = count;
-            m = matrix;
-        }
-    Grid out;
-    for (const auto &[site, point] : grid)
-        out[{m[0] * site[0] + m[1] * site[1], m[2] * site[0] + m[3] * site[1]}] = point;
-    return out;
-}
-
-} // namespace
-
-namespace
-{
-
-// off: how far, in steps, the neighbour on the other side may be from where this side has it.
-Grid best_grid(const std::vector<Blob> &blobs, double off, double &score)
-{
-    Grid best;
-    const int n = static_cast<int>(blobs.size());
-    std::set<int> covered;
-    int tries = 0;
-    for (int i = 0; i < n && tries < 60; i++) {
-        if (covered.contains(i))
-            continue;
-        const Blob &a = blobs[size_t(i)];
-        std::vector<std::pair<double, int>> near;
-        for (int j = 0; j < n; j++)
-            if (j != i && alike(a, blobs[size_t(j)]))
-                near.push_back({(blobs[size_t(j)].at - a.at).norm(), j});
-        if (near.size() < 4)
-            continue;
-        const size_t kept = std::min<size_t>(near.size(), 10);
-        std::partial_sort(near.begin(), near.begin() + static_cast<std::ptrdiff_t>(kept), near.end());
-        // A blob inside the grid has neighbours on both sides, along two directions.
-        std::vector<std::array<int, 2>> pairs;
-        for (size_t k = 0; k < kept && pairs.size() < 3; k++) {
-            const Eigen::Vector2d way = blobs[size_t(near[k].second)].at - a.at;
-            const int back = nearest(blobs, a.at - way, off * way.norm());
-            const bool known = std::any_of(pairs.begin(), pairs.end(),
-                                           [&](const auto &p) { return p[1] == near[k].second || p[1] == back; });
-            if (back < 0 || back == i || known || !alike(a, blobs[size_t(back)]))
-                continue;
-            pairs.push_back({near[k].second, back});
-        }
-        for (size_t k = 1; k < pairs.size(); k++) {
-            const Eigen::Vector2d u = blobs[size_t(pairs[0][0])].at - a.at, v = blobs[size_t(pairs[k][0])].at - a.at;
-            if (std::abs(cross(u, v)) < 0.3 * u.norm() * v.norm())
-                continue;
-            const auto &one = cross(u, v) > 0 ? pairs[0] : pairs[k], &two = cross(u, v) > 0 ? pairs[k] : pairs[0];
-            Grid grid = grow_blobs(blobs, i, {one[0], one[1], two[0], two[1]});
-            tries++;
-            prune(grid);
-            // Larger is better, and smoother: a wrong start may string the same blobs together askew.
-            const double now = static_cast<double>(grid.size()) * std::max(0.0, 1.0 - 3.0 * roughness(grid));
-            if (now > score) {
-                score = now;
-                covered.clear();
-                for (const auto &[site, point] : grid)
-                    covered.insert(point.code);
-                best = std::move(grid);
-            }
-            break;
-        }
-    }
-    return best;
-}
-
-} // namespace
-
-Grid grid_of_blobs(const std::vector<Blob> &blobs)
-{
-    // Strict first: a wide view of the inside of a pipe shrinks steps by half from one ring to the next.
-    double score = 0.0, wide_score = 0.0;
-    Grid best = best_grid(blobs, 0.25, score), wide = best_grid(blobs, 0.45, wide_score);
-    if (wide_score > 1.05 * score)
-        best = std::move(wide);
-    for (auto &[site, point] : best)
-        point.code = 0;
-    return with_short_steps(best);
 }
 
 std::optional<Forecast> forecast(const Grid &grid, const Site &site, int columns, bool with_itself)

@@ -148,6 +148,16 @@ typedef struct pf_msg_preview {
     size_t jpeg_size;
 } pf_msg_preview;
 
+typedef struct pf_msg_raw_frame {
+    pf_msg_time time;
+    uint64_t frame_sequence;
+    pf_image image; /* as the camera gave it */
+    pf_msg_telemetry telemetry;
+} pf_msg_raw_frame;
+
+/* Most bytes that a raw frame with so many pixels takes. */
+#define PF_MSG_RAW_FRAME_MAX(pixels) ((size_t)512 + (size_t)(pixels))
+
 typedef struct pf_msg_info {
     const char *software, *source;
     uint64_t boot_id;
@@ -184,6 +194,7 @@ typedef enum pf_request_what {
     PF_REQUEST_GET_PROFILE = 8,
     PF_REQUEST_CONFIRM_PROFILE = 9,
     PF_REQUEST_REVERT_PROFILE = 10,
+    PF_REQUEST_GET_STILL = 11,
     PF_REQUEST_PAIR = 20,
 } pf_request_what;
 
@@ -210,6 +221,7 @@ pf_status pf_msg_encode_survey_start(const pf_msg_survey_start *start, uint8_t *
 pf_status pf_msg_encode_survey_end(const pf_msg_survey_end *end, uint8_t *out, size_t capacity, size_t *n);
 pf_status pf_msg_encode_status(const pf_msg_status *status, uint8_t *out, size_t capacity, size_t *n);
 pf_status pf_msg_encode_preview(const pf_msg_preview *preview, uint8_t *out, size_t capacity, size_t *n);
+pf_status pf_msg_encode_raw_frame(const pf_msg_raw_frame *frame, uint8_t *out, size_t capacity, size_t *n);
 /* PF_ERR_ARGUMENT: both status and info. */
 pf_status pf_msg_encode_reply(const pf_msg_reply *reply, uint8_t *out, size_t capacity, size_t *n);
 
