@@ -113,6 +113,14 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
                   t->quality_median, t->static_blocks);
 }
 
+static void print_camera(FILE *out, const pf_camera_stats *c)
+{
+    (void)fprintf(out,
+                  "  \"camera\": {\"there\": %s, \"damaged\": %" PRIu64 ", \"restarts\": %" PRIu64
+                  ", \"reopens\": %" PRIu64 ", \"bad_stamps\": %" PRIu64 "},\n",
+                  c->is_there ? "true" : "false", c->damaged, c->restarts, c->reopens, c->bad_stamps);
+}
+
 static void print_problem(FILE *out, const char *text)
 {
     (void)fputs(",\n  \"profile_problem\": \"", out);
@@ -121,7 +129,8 @@ static void print_problem(FILE *out, const char *text)
     (void)fputc('"', out);
 }
 
-static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const char *problem)
+static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const pf_camera_stats *camera,
+                         const char *problem)
 {
     (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
                   PF_SOFTWARE, s->time.boot_id);
@@ -144,6 +153,7 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
                   s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
                   store->refused);
+    print_camera(out, camera);
     print_tracking(out, &s->tracking);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
@@ -177,6 +187,7 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     pf_store_stats store;
     pf_msg_profile_state profile;
     pf_keeper_texts texts = {.problem = ""};
+    pf_camera_stats camera;
     FILE *out;
     bool ok;
     (void)snprintf(draft, sizeof draft, "%s.new", path);
@@ -186,7 +197,10 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
         pf_store_get_stats(d->store, &store);
         if (d->keeper != NULL)
             pf_keeper_state(d->keeper, &profile, &texts);
-        print_status(out, &status, &store, texts.problem);
+        pthread_mutex_lock(&d->counters.mutex);
+        camera = d->counters.camera;
+        pthread_mutex_unlock(&d->counters.mutex);
+        print_status(out, &status, &store, &camera, texts.problem);
         ok = ferror(out) == 0;
         ok = fclose(out) == 0 && ok;
         if (ok && rename(draft, path) == 0)

@@ -17,6 +17,7 @@
 #include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
+#include "tracking.h"
 #include "utf8.h"
 
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
@@ -137,17 +138,44 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
     return pf_sha256(bytes, d->profile_size, d->profile_sha256) == PF_OK;
 }
 
-static bool open_camera(pf_daemon *d, char *error, size_t n)
+static pf_status open_v4l2(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
-    const pf_camera_info *info;
+    double u = 0, v = 0, radius = pf_tracking_circle(d, &u, &v);
+    bool has_circle = radius > 0 && u > 0 && v > 0;
+    return pf_v4l2_open(&d->camera,
+                        &(pf_v4l2_config){.device = c->camera.device,
+                                          .width = c->camera.width,
+                                          .height = c->camera.height,
+                                          .frame_rate = c->camera.frame_rate,
+                                          .format = c->camera.format,
+                                          .mode = (pf_exposure_mode)c->camera.exposure,
+                                          .exposure_us = c->camera.exposure_us,
+                                          .gain = c->camera.gain,
+                                          .exposure_max_us = c->camera.exposure_max_us,
+                                          .circle_u = has_circle ? (uint32_t)u : 0,
+                                          .circle_v = has_circle ? (uint32_t)v : 0,
+                                          .circle_radius = has_circle ? (uint32_t)radius : 0},
+                        error, n);
+}
+
+static pf_status open_replay(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
     pf_replay_config replay = {.path = c->camera.path,
                                .csv = c->camera.csv[0] ? c->camera.csv : NULL,
                                .speed = c->camera.speed == PF_SPEED_FAST ? PF_REPLAY_FAST : PF_REPLAY_RECORDED,
                                .loops = c->camera.loops,
                                .loop_gap = (uint64_t)c->tracker.reset_gap + 1, /* tracks must not go on */
                                .frame_rate = c->camera.frame_rate};
-    if (pf_replay_open(&d->camera, &replay, error, n) != PF_OK)
+    return pf_replay_open(&d->camera, &replay, error, n);
+}
+
+static bool open_camera(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    const pf_camera_info *info;
+    if ((c->camera.driver == PF_CAMERA_V4L2 ? open_v4l2 : open_replay)(d, error, n) != PF_OK)
         return false;
     info = d->camera.ops->info(d->camera.self);
     (void)snprintf(d->source, sizeof d->source, "%s", info->source);
@@ -285,7 +313,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     pf_store_config store = {.jobs = c->keyframe.queue,
                              .slots = c->link.send_slots,
                              .capacity = pf_pipeline_object_max(d),
-                             .is_patient = c->camera.speed == PF_SPEED_FAST,
+                             .is_patient = c->camera.driver == PF_CAMERA_REPLAY && c->camera.speed == PF_SPEED_FAST,
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;
     bool is_good = false;
