@@ -23,7 +23,7 @@ static void detach(pf_v4l2 *c)
     c->fd = -1;
 }
 
-/* Opens and negotiates. *is_absent: nothing is plugged in under this path. */
+/* Opens and negotiates. *is_absent: nothing is plugged in under this path, or it has no picture to give yet. */
 static pf_status attach(pf_v4l2 *c, bool *is_absent)
 {
     c->fd = c->io.open(c->io.self, c->device);
@@ -33,6 +33,7 @@ static pf_status attach(pf_v4l2 *c, bool *is_absent)
     pf_status status = pf_v4l2_negotiate(c);
     if (status == PF_OK)
         status = pf_v4l2_controls_open(c);
+    *is_absent = status == PF_ERR_AGAIN;
     if (status != PF_OK)
         detach(c);
     else if (c->info.frame_rate > 0)

@@ -155,19 +155,24 @@ pf_status pf_v4l2_negotiate(pf_v4l2 *c)
     if (status != PF_OK)
         return status;
     struct v4l2_format f = {.type = c->type};
-    status = pf_v4l2_call(c, VIDIOC_G_FMT, &f, "has no format yet");
-    if (status != PF_OK)
-        return status;
-    shape s = read_shape(c, &f);
+    shape s = {0};
+    if (c->width == 0) {
+        status = pf_v4l2_call(c, VIDIOC_G_FMT, &f, "has no format yet");
+        if (status != PF_OK)
+            return status;
+        s = read_shape(c, &f);
+    }
     uint32_t width = c->width != 0 ? c->width : s.width, height = c->height != 0 ? c->height : s.height;
     status = check_size(c, width, height);
     if (status != PF_OK)
         return status;
     const pf_pixel_format *format = choose(c, width, height, has, sizeof has);
+    if (has[0] == '\0') /* a receiver without a signal, a loopback that nobody writes to */
+        return pf_fail(&c->failure, PF_ERR_AGAIN, "%s: has no format now", c->device);
     if (format == NULL)
         return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: cannot make frames of %u x %u%s%s; it has:%s", c->device,
                        width, height, c->wanted ? " as " : " in a format that is read",
-                       c->wanted ? c->wanted->name : "", has[0] != '\0' ? has : " none");
+                       c->wanted ? c->wanted->name : "", has);
     f = make_format(c, format->fourcc, width, height);
     status = pf_v4l2_call(c, VIDIOC_S_FMT, &f, "the format cannot be set");
     if (status != PF_OK)

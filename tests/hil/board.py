@@ -1,4 +1,4 @@
-"""An emulated arm64 board with Debian's kernel: boots, takes commands, loses power, and has a USB serial line to unplug."""
+"""An emulated arm64 board with Debian's kernel: takes commands, loses power; its USB serial line can be unplugged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class BoardError(AssertionError):
 
 
 class UsbSerial:
-    """The host's end of the board's USB serial adapter: a pseudo-terminal that stays while the adapter comes and goes."""
+    """The host's end of the board's USB serial adapter: a pseudo-terminal that stays while the adapter is unplugged."""
 
     def __init__(self, socket_path: Path) -> None:
         self.socket_path = socket_path
@@ -186,6 +186,7 @@ class Board:
 
     def spawn(self, command: str, log: str) -> int:
         """Starts a command in the background, its output in the shared folder; returns its process id."""
+        (self.share / log).touch()
         return int(self.run(f"({command}) >/mnt/{shlex.quote(log)} 2>&1 & echo $!"))
 
     def is_running(self, process: int) -> bool:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
 from board import CACHE, PROGRAMS, ROOT, Board
 from crawl import HOST_DAEMON, PIPEFISH, Crawl, Recording, Result, free_port
 

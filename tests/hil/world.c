@@ -215,7 +215,8 @@ int main(int argc, char **argv)
         open_encoder(&w, argv + 7);
     if (w.n_counts > first) /* the wheel stands where the survey begins */
         w.count = first > 0 ? w.counts[first - 1] : w.counts[0];
-    const double begin = now();
+    const double begin =
+        now() + 1; /* the camera has a picture from now on; whoever waits for it gets the first frame */
     for (uint32_t i = 0; i < count; i++) {
         const double due = begin + i * period;
         read_frame(&w, first + i);
