@@ -46,6 +46,8 @@ static const setting settings[] = {
     {"camera", "height", INTEGER, AT(camera.height), "px", "0", 0, 16384, NULL, "v4l2: together with width"},
     {"camera", "format", TEXT, AT(camera.format), "", "", 0, 0, NULL,
      "v4l2: GREY NV12 NM12 NV21 YU12 Y10P Y12P Y10 Y12 YUYV UYVY MJPG or JPEG; empty = the first of these it has"},
+    {"camera", "buffers", INTEGER, AT(camera.buffers), "", "6", 4, 32, NULL,
+     "v4l2: frames that the kernel has room for, three of them in use here; more = longer pauses are bridged"},
     {"camera", "exposure", CHOICE, AT(camera.exposure), "", "auto", 0, 0, "auto|hold|fixed|device",
      "v4l2: auto = ours, for a lamp-lit pipe; hold = auto until it has settled, then fixed: for calibration; fixed = "
      "as "

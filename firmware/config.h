@@ -30,7 +30,7 @@ typedef struct pf_config {
         uint32_t driver, speed;
         pf_config_text path, csv, profile, profile_store, device, format, index;
         uint32_t loops, trial_starts, black_level, white_level;
-        uint32_t width, height, exposure, exposure_us, exposure_max_us;
+        uint32_t width, height, buffers, exposure, exposure_us, exposure_max_us;
         double frame_rate, gain;
         bool zero_copy;
     } camera;

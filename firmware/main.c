@@ -149,6 +149,7 @@ static pf_status open_v4l2(pf_daemon *d, char *error, size_t n)
                                           .height = c->camera.height,
                                           .frame_rate = c->camera.frame_rate,
                                           .format = c->camera.format,
+                                          .buffers = c->camera.buffers,
                                           .mode = (pf_exposure_mode)c->camera.exposure,
                                           .exposure_us = c->camera.exposure_us,
                                           .gain = c->camera.gain,

@@ -7,6 +7,8 @@
 #include <string.h>
 #include <turbojpeg.h>
 
+#define DEFAULT_BUFFERS 6u /* those held, and as many to be filled meanwhile */
+
 pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const char *what)
 {
     if (c->io.ioctl(c->io.self, c->fd, request, argument) == 0)
@@ -272,6 +274,9 @@ static pf_status check(pf_v4l2 *c, const pf_v4l2_config *config)
         return pf_fail(&c->failure, PF_ERR_ARGUMENT, "v4l2: no device");
     if ((config->width == 0) != (config->height == 0))
         return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: width and height go together", config->device);
+    if (config->buffers != 0 && (config->buffers < PF_V4L2_BUFFERS_MIN || config->buffers > PF_V4L2_BUFFERS_MAX))
+        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: %u buffers: must be %u..%u", config->device, config->buffers,
+                       PF_V4L2_BUFFERS_MIN, PF_V4L2_BUFFERS_MAX);
     if (config->format != NULL && config->format[0] != '\0') {
         c->wanted = pf_pixel_format_named(config->format);
         if (c->wanted == NULL)
@@ -330,6 +335,7 @@ pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_v4l2_config *conf
     c->width = config->width;
     c->height = config->height;
     c->frame_rate = config->frame_rate;
+    c->buffers = config->buffers != 0 ? config->buffers : DEFAULT_BUFFERS;
     c->mode = config->mode;
     c->exposure_us = config->exposure_us;
     c->exposure_max_us = config->exposure_max_us;

@@ -68,7 +68,7 @@ pf_status pf_v4l2_stream_begin(pf_v4l2 *c)
             s = &c->stream[i];
     if (s == NULL) /* each old one holds a frame, and there are more of them than frames may be held */
         return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: too many frames are held", c->device);
-    struct v4l2_requestbuffers r = {.count = PF_V4L2_BUFFERS, .type = c->type, .memory = V4L2_MEMORY_MMAP};
+    struct v4l2_requestbuffers r = {.count = c->buffers, .type = c->type, .memory = V4L2_MEMORY_MMAP};
     pf_status status = pf_v4l2_call(c, VIDIOC_REQBUFS, &r, "gives no buffers");
     if (status != PF_OK)
         return status;

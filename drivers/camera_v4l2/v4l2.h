@@ -29,9 +29,8 @@ extern const pf_v4l2_io pf_v4l2_kernel;
 pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_v4l2_config *config, const pf_v4l2_io *io, char *error,
                             size_t n);
 
-#define PF_V4L2_BUFFERS     6u                       /* asked for: those held, and three to be filled meanwhile */
 #define PF_V4L2_BUFFERS_MIN (PF_CAMERA_HELD_MAX + 1) /* with fewer nothing would be left to fill */
-#define PF_V4L2_BUFFERS_MAX 16u
+#define PF_V4L2_BUFFERS_MAX 32u
 #define PF_V4L2_STREAMS     (PF_CAMERA_HELD_MAX + 1) /* a live one, and old ones of which frames are held still */
 
 typedef struct pf_v4l2_buffer {
@@ -65,6 +64,7 @@ typedef struct pf_v4l2 {
     char *device;
     const pf_pixel_format *wanted; /* NULL = any */
     uint32_t width, height;        /* configured; 0 = as the device is set */
+    uint32_t buffers;
     double frame_rate;
     pf_exposure_mode mode;
     uint32_t exposure_us, exposure_max_us;

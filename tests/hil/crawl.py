@@ -209,7 +209,7 @@ class Crawl:
         (folder / "empty.ini").touch()
         command = [HOST_DAEMON, "--config", folder / "empty.ini"]
         for argument in self._arguments(settings, str(self.board.share)):
-            if not argument.startswith(("gpio.", "link.device", "link.baud", "camera.device", "camera.format")):
+            if not argument.startswith(("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")):
                 command += ["--set", argument]
         with (folder / "daemon.log").open("wb") as log:
             daemon = subprocess.Popen(command, stderr=log)

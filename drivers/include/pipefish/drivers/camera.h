@@ -118,6 +118,7 @@ typedef struct pf_v4l2_config {
     double frame_rate;      /* 1/s; 0 = as the device is set */
     const char *format;     /* GREY, NV12, NM12, NV21, YU12, Y10P, Y12P, Y10, Y12, YUYV, UYVY, MJPG, JPEG; NULL or "" =
                                the best that the camera has */
+    uint32_t buffers;       /* 4..32; 0 = 6: the held ones, and three that the camera can fill while nobody looks */
     pf_exposure_mode mode;
     uint32_t exposure_us;                       /* FIXED; 0 = as it is */
     double gain;                                /* FIXED, in the camera's units; 0 = as it is */
