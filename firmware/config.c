@@ -121,6 +121,25 @@ static const setting settings[] = {
     {"encoder", "noise", NUMBER, AT(encoder.noise), "m/sqrt(m)", "0.005", 0, 1, NULL,
      "random error of the distance over one metre"},
 
+    {"gpio", "lamp", TEXT, AT(gpio.lamp), "", "", 0, 0, NULL,
+     "line of the lamp, as LAMP or gpiochip0:17 (! before it: active low), or a folder of /sys/class/leds, which can "
+     "be "
+     "dimmed; empty = none, as for all lines below"},
+    {"gpio", "lamp_level", NUMBER, AT(gpio.lamp_level), "", "1", 0, 1, NULL, "of the lamp at the start"},
+    {"gpio", "led", TEXT, AT(gpio.led), "", "", 0, 0, NULL,
+     "status LED: on = survey, slow blinking = sending the rest, fast = no camera, or emergency stop"},
+    {"gpio", "stop", TEXT, AT(gpio.stop), "", "", 0, 0, NULL,
+     "line of the emergency stop: lamp off until the daemon starts anew with the button released"},
+    {"gpio", "limit_front", TEXT, AT(gpio.limit_front), "", "", 0, 0, NULL, "line of the front limit switch"},
+    {"gpio", "limit_rear", TEXT, AT(gpio.limit_rear), "", "", 0, 0, NULL, "line of the rear limit switch"},
+    {"gpio", "encoder", TEXT, AT(gpio.encoder), "", "", 0, 0, NULL,
+     "lines = encoder_a and encoder_b; a file /sys/bus/counter/devices/counter0/count0/count; an input device "
+     "/dev/input/event0; auto = the first of counter, rotary input, lines that there is"},
+    {"gpio", "encoder_a", TEXT, AT(gpio.encoder_a), "", "", 0, 0, NULL,
+     "line A of the wheel encoder; forwards, A leads"},
+    {"gpio", "encoder_b", TEXT, AT(gpio.encoder_b), "", "", 0, 0, NULL, "line B, of the same chip"},
+    {"gpio", "pull", CHOICE, AT(gpio.pull), "", "none", 0, 0, "none|up|down", "resistor in the chip, of all inputs"},
+
     {"link", "transport", CHOICE, AT(link.transport), "", "tcp", 0, 0, "serial|tcp", "how the host is reached"},
     {"link", "device", TEXT, AT(link.device), "", "", 0, 0, NULL, "serial: the device, as /dev/ttyS0; required"},
     {"link", "baud", INTEGER, AT(link.baud), "baud", "921600", 9600, 4000000, NULL, "serial: the rate"},

@@ -11,7 +11,7 @@
 
 #define PF_CONFIG_TEXT_MAX 512u /* bytes of a text setting, with its zero */
 #define PF_CONFIG_LINE_MAX 640u /* bytes of "section.key = value", with its zero */
-#define PF_CONFIG_KEYS_MAX 112u
+#define PF_CONFIG_KEYS_MAX 128u
 
 enum { PF_CAMERA_REPLAY = 0, PF_CAMERA_V4L2 = 1 };
 enum { PF_SPEED_RECORDED = 0, PF_SPEED_FAST = 1 };
@@ -49,6 +49,11 @@ typedef struct pf_config {
     struct {
         double metres_per_count, sigma, noise;
     } encoder;
+    struct {
+        pf_config_text lamp, led, stop, limit_front, limit_rear, encoder, encoder_a, encoder_b;
+        uint32_t pull;
+        double lamp_level;
+    } gpio;
     struct {
         uint32_t transport;
         pf_config_text device, address;

@@ -8,6 +8,7 @@
 #include "clock.h"
 #include "keeper.h"
 #include "pipefish/profile_integers.h"
+#include "utf8.h"
 
 void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 {
@@ -113,6 +114,16 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
                   t->quality_median, t->static_blocks);
 }
 
+static void print_gpio(FILE *out, const pf_gpio_state *g)
+{
+    (void)fprintf(out,
+                  "  \"gpio\": {\"encoder\": \"%s\", \"missed\": %u, \"repeated\": %u, \"illegal\": %u, \"stop\": %s, "
+                  "\"limit_front\": %s, \"limit_rear\": %s, \"broken\": %s},\n",
+                  g->encoder, g->missed, g->repeated, g->illegal, g->is_stopped ? "true" : "false",
+                  g->limits & PF_LIMIT_FRONT ? "true" : "false", g->limits & PF_LIMIT_REAR ? "true" : "false",
+                  g->is_broken ? "true" : "false");
+}
+
 static void print_camera(FILE *out, const pf_camera_stats *c)
 {
     (void)fprintf(out,
@@ -130,7 +141,7 @@ static void print_problem(FILE *out, const char *text)
 }
 
 static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const pf_camera_stats *camera,
-                         const char *problem)
+                         const pf_gpio_state *gpio, const char *problem)
 {
     (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
                   PF_SOFTWARE, s->time.boot_id);
@@ -154,6 +165,7 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
                   store->refused);
     print_camera(out, camera);
+    print_gpio(out, gpio);
     print_tracking(out, &s->tracking);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
@@ -188,6 +200,7 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     pf_msg_profile_state profile;
     pf_keeper_texts texts = {.problem = ""};
     pf_camera_stats camera;
+    pf_gpio_state gpio;
     FILE *out;
     bool ok;
     (void)snprintf(draft, sizeof draft, "%s.new", path);
@@ -200,7 +213,9 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
         pthread_mutex_lock(&d->counters.mutex);
         camera = d->counters.camera;
         pthread_mutex_unlock(&d->counters.mutex);
-        print_status(out, &status, &store, &camera, texts.problem);
+        d->gpio.ops->state(d->gpio.self, &gpio);
+        pf_utf8_clean(gpio.encoder);
+        print_status(out, &status, &store, &camera, &gpio, texts.problem);
         ok = ferror(out) == 0;
         ok = fclose(out) == 0 && ok;
         if (ok && rename(draft, path) == 0)

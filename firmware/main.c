@@ -192,6 +192,48 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
     return true;
 }
 
+static bool open_gpio(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    const char *const lines[] = {c->gpio.lamp,       c->gpio.led,         c->gpio.stop,
+                                 c->gpio.limit_rear, c->gpio.limit_front, c->gpio.encoder};
+    bool has_any = false;
+    for (size_t i = 0; i < sizeof lines / sizeof lines[0]; i++)
+        has_any = has_any || lines[i][0] != '\0';
+    if (!has_any)
+        return pf_gpio_none_open(&d->gpio) == PF_OK;
+    return pf_gpio_board_open(&d->gpio,
+                              &(pf_gpio_config){.lamp = c->gpio.lamp,
+                                                .led = c->gpio.led,
+                                                .stop = c->gpio.stop,
+                                                .limit_front = c->gpio.limit_front,
+                                                .limit_rear = c->gpio.limit_rear,
+                                                .encoder = c->gpio.encoder,
+                                                .encoder_a = c->gpio.encoder_a,
+                                                .encoder_b = c->gpio.encoder_b,
+                                                .pull = (pf_gpio_pull)c->gpio.pull,
+                                                .lamp_level = c->gpio.lamp_level},
+                              error, n) == PF_OK;
+}
+
+/* Says once what a button or a lost chip has done. */
+static void note_gpio(pf_daemon *d, pf_gpio_state *before)
+{
+    pf_gpio_state now;
+    d->gpio.ops->state(d->gpio.self, &now);
+    if (now.is_stopped && !before->is_stopped)
+        pf_log(PF_LOG_WARNING, "emergency stop: the lamp is off until the daemon starts anew");
+    for (uint32_t bit = PF_LIMIT_FRONT; bit <= PF_LIMIT_REAR; bit <<= 1)
+        if ((now.limits ^ before->limits) & bit)
+            pf_log(PF_LOG_INFO, "%s limit switch %s", bit == PF_LIMIT_FRONT ? "front" : "rear",
+                   now.limits & bit ? "pressed" : "released");
+    if (now.missed != before->missed)
+        pf_log(PF_LOG_WARNING, "wheel encoder: %u edges lost so far", now.missed);
+    if (now.is_broken && !before->is_broken)
+        pf_log(PF_LOG_ERROR, "a chip or device of [gpio] has gone");
+    *before = now;
+}
+
 /* A stored profile that the pipeline cannot open with must not end the daemon, or the host could never send another.
  * The settings' own mistakes are not the profile's: they fail without it too. */
 static void settle_profile(pf_daemon *d)
@@ -282,12 +324,14 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
     bool is_terminated = false, must_exit = false;
+    pf_gpio_state gpio = {0};
     for (;;) {
         struct pollfd fd = {.fd = signals, .events = POLLIN};
         bool is_drained, had_to_exit = must_exit;
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         note_status(d, &status_due, false);
+        note_gpio(d, &gpio);
         if (d->keeper != NULL)
             pf_keeper_work(d->keeper);
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
@@ -374,7 +418,7 @@ static int open_and_run(pf_daemon *d, int signals)
     settle_profile(d);
     if (!hash_setup(d, setup))
         (void)snprintf(error, sizeof error, "the setup cannot be hashed");
-    else if (pf_gpio_none_open(&d->gpio) == PF_OK) {
+    else if (open_gpio(d, error, sizeof error)) {
         if (open_transport(d, error, sizeof error)) {
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
                 if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {

@@ -252,7 +252,8 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
                           .lamp = (float)t->lamp};
     double lamp;
     if (!m.has_encoder)
-        m.has_encoder = d->gpio.ops->encoder(d->gpio.self, &m.encoder_count, &m.encoder_missed) == PF_OK;
+        m.has_encoder =
+            d->gpio.ops->encoder(d->gpio.self, frame->time_ns, &m.encoder_count, &m.encoder_missed) == PF_OK;
     if (!m.has_lamp && d->gpio.ops->lamp(d->gpio.self, &lamp) == PF_OK) {
         m.has_lamp = true;
         m.lamp = (float)lamp;
@@ -437,6 +438,7 @@ static void watch_camera(pf_pipeline *p, pf_status status)
         pf_log(PF_LOG_INFO, "the camera is there");
     if (status == PF_OK || status == PF_ERR_CLOSED)
         p->is_gone = status == PF_ERR_CLOSED;
+    d->gpio.ops->indicate(d->gpio.self, p->is_gone ? PF_INDICATE_TROUBLE : PF_INDICATE_WORK);
     d->camera.ops->stats(d->camera.self, &stats);
     pthread_mutex_lock(&d->counters.mutex);
     d->counters.camera = stats;
@@ -554,6 +556,7 @@ static void *run(void *argument)
     (void)d->camera.ops->stop(d->camera.self);
     pf_utf8_clean(reason);
     atomic_store(&d->state, PF_STATE_DRAINING);
+    d->gpio.ops->indicate(d->gpio.self, PF_INDICATE_SEND);
     pf_log(p->has_failed ? PF_LOG_ERROR : PF_LOG_INFO, "survey ends: %s; %u keyframes", reason, p->next_index);
     store_end(p, reason);
     atomic_store(&p->is_done, true);

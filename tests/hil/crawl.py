@@ -25,7 +25,7 @@ HOST_DAEMON = ROOT / "build" / "release" / "firmware" / "pipefishd"
 FRAME = b"FRAME\n"
 SETTINGS = {
     "camera.profile": "{folder}/crawl.profile",
-    "tracker.max_tracks": "150",
+    "tracker.max_tracks": "80",
     "keyframe.parallax_deg": "3",
     "keyframe.min_interval": "1",
     "survey.nominal_diameter_mm": "200",
@@ -164,7 +164,8 @@ class Crawl:
         except subprocess.TimeoutExpired as error:
             raise AssertionError(f"the survey does not end\n{self._texts()}") from error
         assert code == 0, self._texts()
-        return Survey.open(self.output)
+        self.received = Survey.open(self.output)
+        return self.received
 
     def _texts(self) -> str:
         return f"{(self.folder / 'receive.log').read_text()[-2000:]}\n{self.board.logs()}\n{self.board.console()}"
@@ -209,7 +210,9 @@ class Crawl:
         (folder / "empty.ini").touch()
         command = [HOST_DAEMON, "--config", folder / "empty.ini"]
         for argument in self._arguments(settings, str(self.board.share)):
-            if not argument.startswith(("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")):
+            if not argument.startswith(
+                ("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")
+            ):
                 command += ["--set", argument]
         with (folder / "daemon.log").open("wb") as log:
             daemon = subprocess.Popen(command, stderr=log)

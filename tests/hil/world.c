@@ -19,7 +19,8 @@
 #include <time.h>
 #include <unistd.h>
 
-#define BUFFERS 4u
+#define BUFFERS     4u
+#define LEAST_GAP_S 0.004 /* between two edges: gpio-sim merges what comes faster than its threads */
 
 typedef struct world {
     FILE *y4m;
@@ -197,6 +198,7 @@ static void drive(world *w, uint32_t i, double begin, double seconds)
     for (int64_t k = 0; k < steps; k++) {
         sleep_until(begin + seconds * (double)k / (double)steps);
         turn(w, way < 0 ? -1 : 1);
+        sleep_until(now() + LEAST_GAP_S); /* also when it is late */
     }
 }
 
