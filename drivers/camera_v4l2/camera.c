@@ -152,15 +152,9 @@ static pf_status make_frame(pf_v4l2 *c, pf_v4l2_buffer *b, const struct v4l2_buf
     return status;
 }
 
-static pf_status v4l2_next(void *self, uint32_t timeout_ms, pf_frame *frame)
+/* Waits for a frame until `end`. */
+static pf_status wait_for_frame(pf_v4l2 *c, uint64_t now, uint64_t end, pf_frame *frame)
 {
-    pf_v4l2 *c = self;
-    uint64_t now = c->io.now(c->io.self);
-    const uint64_t end = now + (uint64_t)timeout_ms * 1000000u;
-    if (!c->is_started)
-        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: not started", c->device);
-    if (c->held >= PF_CAMERA_HELD_MAX)
-        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: %u frames are held already", c->device, PF_CAMERA_HELD_MAX);
     for (;; now = c->io.now(c->io.self)) {
         pf_v4l2_buffer *buffer;
         struct v4l2_buffer taken;
@@ -197,6 +191,21 @@ static pf_status v4l2_next(void *self, uint32_t timeout_ms, pf_frame *frame)
         if (now >= end)
             return PF_ERR_AGAIN;
     }
+}
+
+static pf_status v4l2_next(void *self, uint32_t timeout_ms, pf_frame *frame)
+{
+    pf_v4l2 *c = self;
+    const uint64_t now = c->io.now(c->io.self);
+    if (!c->is_started)
+        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: not started", c->device);
+    if (c->held >= PF_CAMERA_HELD_MAX)
+        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: %u frames are held already", c->device, PF_CAMERA_HELD_MAX);
+    if (c->is_streaming)
+        pf_recovery_pause(&c->recovery, now - c->left_ns);
+    pf_status status = wait_for_frame(c, now, now + (uint64_t)timeout_ms * 1000000u, frame);
+    c->left_ns = c->io.now(c->io.self);
+    return status;
 }
 
 static void v4l2_release(void *self, pf_frame *frame)

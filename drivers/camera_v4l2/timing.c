@@ -82,6 +82,11 @@ pf_recovery_action pf_recovery_next(pf_recovery *r, uint64_t now_ns)
     return r->was_restarted ? PF_RECOVERY_REOPEN : PF_RECOVERY_RESTART;
 }
 
+void pf_recovery_pause(pf_recovery *r, uint64_t elapsed_ns)
+{
+    r->since_ns += elapsed_ns;
+}
+
 static void begin(pf_recovery *r, uint64_t now_ns)
 {
     r->is_open = true;

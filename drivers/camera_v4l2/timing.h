@@ -61,6 +61,9 @@ void pf_recovery_init(pf_recovery *recovery, uint64_t period_ns, uint64_t now_ns
  * is reopened. */
 pf_recovery_action pf_recovery_next(pf_recovery *recovery, uint64_t now_ns);
 
+/* Nobody asked for frames for so long: that is no silence of the camera's. */
+void pf_recovery_pause(pf_recovery *recovery, uint64_t elapsed_ns);
+
 /* What came of it. */
 void pf_recovery_opened(pf_recovery *recovery, uint64_t now_ns);
 void pf_recovery_restarted(pf_recovery *recovery, uint64_t now_ns);

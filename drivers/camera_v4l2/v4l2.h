@@ -85,6 +85,7 @@ typedef struct pf_v4l2 {
     pf_numbering numbering;
     pf_recovery recovery;
     uint64_t damaged;
+    uint64_t left_ns; /* when next() returned last */
     pf_failure failure;
 } pf_v4l2;
 

@@ -17,7 +17,7 @@ import tty
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-CACHE = Path(os.environ.get("PIPEFISH_BOARD", ROOT / "build" / "board"))
+CACHE = ROOT / "build" / "board"
 PROGRAMS = ROOT / "build" / "arm64"
 BOOT_S, COMMAND_S = 25, 60
 DISK_BYTES = 256 << 20
