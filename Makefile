@@ -2,6 +2,7 @@
 #
 #   make demo     a whole survey, simulated, through the daemon and the link, to build/demo/index.html
 #   make test     everything that needs no special data
+#   make hil      the daemon on an emulated arm64 board with Debian's kernel (part of make test)
 #   make build    pipefishd and friends in build/release, the `pipefish` command in build/venv/bin
 #   make bench    figures into build/bench.json (ONLY=track for some of them)
 #   make accept   the long tests, resumable, into build/accept.json
@@ -18,14 +19,14 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb format clean packages-build packages-test native unit lint fuzz-build fuzz-smoke cross proof size pytest
+.PHONY: build demo test bench accept deb format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
 
 build: native $(STAMP)/python
 
 demo: build
 	@$(VENV)/bin/pipefish demo --out build/demo
 
-test: build lint unit fuzz-smoke proof cross pytest
+test: build lint unit fuzz-smoke proof cross pytest hil
 	@echo "all tests passed"
 
 packages-build:
@@ -33,6 +34,9 @@ packages-build:
 
 packages-test:
 	@tools/install-packages build test
+
+packages-board:
+	@tools/install-packages build test board
 
 native: packages-build
 	@test -f build/release/build.ninja || cmake --preset release
@@ -89,6 +93,16 @@ size: cross
 
 pytest: build
 	@$(PY) -m pytest -q
+
+# Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
+# scenarios are skipped and say so.
+hil: build packages-board
+	@if tools/board-image; then \
+	    test -f build/arm64/build.ninja || cmake --preset board && cmake --build --preset board; \
+	else \
+	    echo "NO EMULATED BOARD: tests/hil are skipped"; \
+	fi
+	@$(PY) -m pytest -q tests/hil
 
 bench: build $(STAMP)/venv-peers
 	@tools/install-packages bench

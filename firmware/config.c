@@ -27,10 +27,10 @@ static const setting settings[] = {
     {"survey", "nominal_diameter_mm", NUMBER, AT(survey.nominal_diameter_mm), "mm", "0", 0, 20000, NULL,
      "of the pipe; 0 = unknown"},
 
-    {"camera", "driver", CHOICE, AT(camera.driver), "", "replay", 0, 0, "replay",
-     "where frames come from; replay plays a recording"},
+    {"camera", "driver", CHOICE, AT(camera.driver), "", "replay", 0, 0, "replay|v4l2",
+     "where frames come from; replay plays a recording, v4l2 is a camera of the kernel's"},
     {"camera", "path", TEXT, AT(camera.path), "", "", 0, 0, NULL,
-     "the recording: a .y4m file, or a folder of PNG, JPEG or PGM images; required"},
+     "replay: the recording: a .y4m file, or a folder of PNG, JPEG or PGM images; required"},
     {"camera", "csv", TEXT, AT(camera.csv), "", "", 0, 0, NULL,
      "its telemetry; empty = beside it (path with .csv, or telemetry.csv in the folder), if it is there"},
     {"camera", "speed", CHOICE, AT(camera.speed), "", "recorded", 0, 0, "recorded|fast",
@@ -38,7 +38,30 @@ static const setting settings[] = {
     {"camera", "loops", INTEGER, AT(camera.loops), "", "1", 0, 1000000, NULL,
      "play it so often; 0 = for ever; each begins with a marked break"},
     {"camera", "frame_rate", NUMBER, AT(camera.frame_rate), "1/s", "0", 0, 10000, NULL,
-     "of a recording without times; 0 = 10"},
+     "replay: of a recording without times; 0 = 10. v4l2: to ask for; 0 = as the camera is set"},
+    {"camera", "device", TEXT, AT(camera.device), "", "/dev/video0", 0, 0, NULL,
+     "v4l2: the camera; a link in /dev/v4l/by-path stays the same when it is plugged in again"},
+    {"camera", "width", INTEGER, AT(camera.width), "px", "0", 0, 16384, NULL,
+     "v4l2: of the frames; 0 = as the camera is set. If it is given the daemon starts without the camera and waits"},
+    {"camera", "height", INTEGER, AT(camera.height), "px", "0", 0, 16384, NULL, "v4l2: together with width"},
+    {"camera", "format", TEXT, AT(camera.format), "", "", 0, 0, NULL,
+     "v4l2: GREY NV12 NM12 NV21 YU12 Y10P Y12P Y10 Y12 YUYV UYVY MJPG or JPEG; empty = the first of these it has"},
+    {"camera", "buffers", INTEGER, AT(camera.buffers), "", "6", 4, 32, NULL,
+     "v4l2: frames that the kernel has room for, three of them in use here; more = longer pauses are bridged"},
+    {"camera", "exposure", CHOICE, AT(camera.exposure), "", "auto", 0, 0, "auto|hold|fixed|device",
+     "v4l2: auto = ours, for a lamp-lit pipe; hold = auto until it has settled, then fixed: for calibration; fixed = "
+     "as "
+     "set here; device = the camera's own"},
+    {"camera", "exposure_us", INTEGER, AT(camera.exposure_us), "us", "0", 0, 1000000, NULL,
+     "v4l2: with exposure = fixed; 0 = as the camera is set"},
+    {"camera", "gain", NUMBER, AT(camera.gain), "", "0", 0, 1000000, NULL,
+     "v4l2: with exposure = fixed, in the camera's own units; 0 = as the camera is set"},
+    {"camera", "exposure_max_us", INTEGER, AT(camera.exposure_max_us), "us", "10000", 0, 1000000, NULL,
+     "v4l2: longest exposure of auto and hold, against motion blur; 0 = the camera's limit"},
+    {"camera", "zero_copy", SWITCH, AT(camera.zero_copy), "", "true", 0, 0, NULL,
+     "track frames where the driver put them; false = copy each first, for boards that read such memory slowly"},
+    {"camera", "index", TEXT, AT(camera.index), "", "", 0, 0, NULL,
+     "folder for an index of the frames taken, with their hashes: a CSV a start, to replay from; empty = none"},
     {"camera", "profile", TEXT, AT(camera.profile), "", "", 0, 0, NULL,
      "binary calibration profile; empty = none: no bearings, keyframes by encoder and common tracks only"},
     {"camera", "profile_store", TEXT, AT(camera.profile_store), "", "", 0, 0, NULL,
@@ -97,6 +120,25 @@ static const setting settings[] = {
     {"encoder", "sigma", NUMBER, AT(encoder.sigma), "m", "0", 0, 1, NULL, "standard deviation of metres_per_count"},
     {"encoder", "noise", NUMBER, AT(encoder.noise), "m/sqrt(m)", "0.005", 0, 1, NULL,
      "random error of the distance over one metre"},
+
+    {"gpio", "lamp", TEXT, AT(gpio.lamp), "", "", 0, 0, NULL,
+     "line of the lamp, as LAMP or gpiochip0:17 (! before it: active low), or a folder of /sys/class/leds, which can "
+     "be "
+     "dimmed; empty = none, as for all lines below"},
+    {"gpio", "lamp_level", NUMBER, AT(gpio.lamp_level), "", "1", 0, 1, NULL, "of the lamp at the start"},
+    {"gpio", "led", TEXT, AT(gpio.led), "", "", 0, 0, NULL,
+     "status LED: on = survey, slow blinking = sending the rest, fast = no camera, or emergency stop"},
+    {"gpio", "stop", TEXT, AT(gpio.stop), "", "", 0, 0, NULL,
+     "line of the emergency stop: lamp off until the daemon starts anew with the button released"},
+    {"gpio", "limit_front", TEXT, AT(gpio.limit_front), "", "", 0, 0, NULL, "line of the front limit switch"},
+    {"gpio", "limit_rear", TEXT, AT(gpio.limit_rear), "", "", 0, 0, NULL, "line of the rear limit switch"},
+    {"gpio", "encoder", TEXT, AT(gpio.encoder), "", "", 0, 0, NULL,
+     "lines = encoder_a and encoder_b; a file /sys/bus/counter/devices/counter0/count0/count; an input device "
+     "/dev/input/event0; auto = the first of counter, rotary input, lines that there is"},
+    {"gpio", "encoder_a", TEXT, AT(gpio.encoder_a), "", "", 0, 0, NULL,
+     "line A of the wheel encoder; forwards, A leads"},
+    {"gpio", "encoder_b", TEXT, AT(gpio.encoder_b), "", "", 0, 0, NULL, "line B, of the same chip"},
+    {"gpio", "pull", CHOICE, AT(gpio.pull), "", "none", 0, 0, "none|up|down", "resistor in the chip, of all inputs"},
 
     {"link", "transport", CHOICE, AT(link.transport), "", "tcp", 0, 0, "serial|tcp|tls",
      "how the host is reached; tcp is not encrypted, and on this machine only"},
@@ -354,8 +396,12 @@ bool pf_config_override(pf_config *config, const char *assignment, char *error, 
 bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n)
 {
     const char *why = NULL;
-    if (c->camera.path[0] == '\0')
+    if (c->camera.driver == PF_CAMERA_REPLAY && c->camera.path[0] == '\0')
         why = "camera.path: must be set: the recording to play";
+    else if (c->camera.driver == PF_CAMERA_V4L2 && c->camera.device[0] == '\0')
+        why = "camera.device: must be set";
+    else if ((c->camera.width == 0) != (c->camera.height == 0))
+        why = "camera.width and camera.height: both or neither";
     else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')
         why = "camera.profile_store: not together with camera.profile";
     else if (c->camera.black_level >= c->camera.white_level)

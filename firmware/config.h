@@ -11,9 +11,9 @@
 
 #define PF_CONFIG_TEXT_MAX 512u /* bytes of a text setting, with its zero */
 #define PF_CONFIG_LINE_MAX 640u /* bytes of "section.key = value", with its zero */
-#define PF_CONFIG_KEYS_MAX 96u
+#define PF_CONFIG_KEYS_MAX 128u
 
-enum { PF_CAMERA_REPLAY = 0 };
+enum { PF_CAMERA_REPLAY = 0, PF_CAMERA_V4L2 = 1 };
 enum { PF_SPEED_RECORDED = 0, PF_SPEED_FAST = 1 };
 enum { PF_CELLS_GRID = 0, PF_CELLS_POLAR = 1 };
 enum { PF_TRANSPORT_SERIAL = 0, PF_TRANSPORT_TCP = 1, PF_TRANSPORT_TLS = 2 };
@@ -28,9 +28,11 @@ typedef struct pf_config {
     } survey;
     struct {
         uint32_t driver, speed;
-        pf_config_text path, csv, profile, profile_store;
+        pf_config_text path, csv, profile, profile_store, device, format, index;
         uint32_t loops, trial_starts, black_level, white_level;
-        double frame_rate;
+        uint32_t width, height, buffers, exposure, exposure_us, exposure_max_us;
+        double frame_rate, gain;
+        bool zero_copy;
     } camera;
     struct {
         uint32_t max_tracks, levels, window, iterations, cell, min_eigen;
@@ -47,6 +49,11 @@ typedef struct pf_config {
     struct {
         double metres_per_count, sigma, noise;
     } encoder;
+    struct {
+        pf_config_text lamp, led, stop, limit_front, limit_rear, encoder, encoder_a, encoder_b;
+        uint32_t pull;
+        double lamp_level;
+    } gpio;
     struct {
         uint32_t transport;
         pf_config_text device, address, trust;

@@ -83,6 +83,8 @@ static void set_lamp(pf_courier *c, float level, pf_msg_reply *reply)
     status = gpio->ops->set_lamp(gpio->self, (double)level);
     if (status == PF_ERR_UNSUPPORTED)
         reply->error = "lamp: this crawler has none that can be set";
+    else if (status == PF_ERR_CLOSED)
+        reply->error = "lamp: off, for the emergency stop has been pressed";
     else if (status != PF_OK)
         reply->error = pf_status_text(status);
 }

@@ -8,6 +8,7 @@
 #include "clock.h"
 #include "keeper.h"
 #include "pipefish/profile_integers.h"
+#include "utf8.h"
 
 void pf_daemon_stop(pf_daemon *d, pf_stop stop)
 {
@@ -124,6 +125,24 @@ static void print_tracking(FILE *out, const pf_msg_tracking *t)
                   t->quality_median, t->static_blocks);
 }
 
+static void print_gpio(FILE *out, const pf_gpio_state *g)
+{
+    (void)fprintf(out,
+                  "  \"gpio\": {\"encoder\": \"%s\", \"missed\": %u, \"repeated\": %u, \"illegal\": %u, \"stop\": %s, "
+                  "\"limit_front\": %s, \"limit_rear\": %s, \"broken\": %s},\n",
+                  g->encoder, g->missed, g->repeated, g->illegal, g->is_stopped ? "true" : "false",
+                  g->limits & PF_LIMIT_FRONT ? "true" : "false", g->limits & PF_LIMIT_REAR ? "true" : "false",
+                  g->is_broken ? "true" : "false");
+}
+
+static void print_camera(FILE *out, const pf_camera_stats *c)
+{
+    (void)fprintf(out,
+                  "  \"camera\": {\"there\": %s, \"damaged\": %" PRIu64 ", \"restarts\": %" PRIu64
+                  ", \"reopens\": %" PRIu64 ", \"bad_stamps\": %" PRIu64 "},\n",
+                  c->is_there ? "true" : "false", c->damaged, c->restarts, c->reopens, c->bad_stamps);
+}
+
 static void print_text(FILE *out, const char *key, const char *text)
 {
     (void)fprintf(out, ",\n  \"%s\": \"", key);
@@ -143,7 +162,8 @@ static void print_network(FILE *out, const pf_msg_network *w)
                   w->refused_often, w->refused_busy);
 }
 
-static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const char *problem)
+static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const pf_camera_stats *camera,
+                         const pf_gpio_state *gpio, const char *problem)
 {
     (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
                   PF_SOFTWARE, s->time.boot_id);
@@ -166,6 +186,8 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
                   s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
                   store->refused);
+    print_camera(out, camera);
+    print_gpio(out, gpio);
     print_tracking(out, &s->tracking);
     (void)fprintf(out,
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
@@ -202,6 +224,8 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     pf_store_stats store;
     pf_msg_profile_state profile;
     pf_keeper_texts texts = {.problem = ""};
+    pf_camera_stats camera;
+    pf_gpio_state gpio;
     FILE *out;
     bool ok;
     (void)snprintf(draft, sizeof draft, "%s.new", path);
@@ -211,7 +235,12 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
         pf_store_get_stats(d->store, &store);
         if (d->keeper != NULL)
             pf_keeper_state(d->keeper, &profile, &texts);
-        print_status(out, &status, &store, texts.problem);
+        pthread_mutex_lock(&d->counters.mutex);
+        camera = d->counters.camera;
+        pthread_mutex_unlock(&d->counters.mutex);
+        d->gpio.ops->state(d->gpio.self, &gpio);
+        pf_utf8_clean(gpio.encoder);
+        print_status(out, &status, &store, &camera, &gpio, texts.problem);
         ok = ferror(out) == 0;
         ok = fclose(out) == 0 && ok;
         if (ok && rename(draft, path) == 0)

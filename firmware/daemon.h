@@ -34,6 +34,7 @@ typedef enum pf_state { PF_STATE_SURVEYING = 0, PF_STATE_DRAINING = 1, PF_STATE_
 typedef struct pf_counters {
     pthread_mutex_t mutex;
     uint64_t frames, frames_dropped, frames_tracked;
+    pf_camera_stats camera;
     uint32_t tracks_live, tracks_new, tracks_lost;
     uint64_t keyframes;
     uint64_t capture_ns, stage_ns[PF_STAGES], keyframe_ns, frame_max_ns; /* sums; the slowest frame */

@@ -19,6 +19,7 @@
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
 #include "recall.h"
+#include "tracking.h"
 #include "utf8.h"
 
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
@@ -171,17 +172,45 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
     return pf_sha256(bytes, d->profile_size, d->profile_sha256) == PF_OK;
 }
 
-static bool open_camera(pf_daemon *d, char *error, size_t n)
+static pf_status open_v4l2(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
-    const pf_camera_info *info;
+    double u = 0, v = 0, radius = pf_tracking_circle(d, &u, &v);
+    bool has_circle = radius > 0 && u > 0 && v > 0;
+    return pf_v4l2_open(&d->camera,
+                        &(pf_v4l2_config){.device = c->camera.device,
+                                          .width = c->camera.width,
+                                          .height = c->camera.height,
+                                          .frame_rate = c->camera.frame_rate,
+                                          .format = c->camera.format,
+                                          .buffers = c->camera.buffers,
+                                          .mode = (pf_exposure_mode)c->camera.exposure,
+                                          .exposure_us = c->camera.exposure_us,
+                                          .gain = c->camera.gain,
+                                          .exposure_max_us = c->camera.exposure_max_us,
+                                          .circle_u = has_circle ? (uint32_t)u : 0,
+                                          .circle_v = has_circle ? (uint32_t)v : 0,
+                                          .circle_radius = has_circle ? (uint32_t)radius : 0},
+                        error, n);
+}
+
+static pf_status open_replay(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
     pf_replay_config replay = {.path = c->camera.path,
                                .csv = c->camera.csv[0] ? c->camera.csv : NULL,
                                .speed = c->camera.speed == PF_SPEED_FAST ? PF_REPLAY_FAST : PF_REPLAY_RECORDED,
                                .loops = c->camera.loops,
                                .loop_gap = (uint64_t)c->tracker.reset_gap + 1, /* tracks must not go on */
                                .frame_rate = c->camera.frame_rate};
-    if (pf_replay_open(&d->camera, &replay, error, n) != PF_OK)
+    return pf_replay_open(&d->camera, &replay, error, n);
+}
+
+static bool open_camera(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    const pf_camera_info *info;
+    if ((c->camera.driver == PF_CAMERA_V4L2 ? open_v4l2 : open_replay)(d, error, n) != PF_OK)
         return false;
     info = d->camera.ops->info(d->camera.self);
     (void)snprintf(d->source, sizeof d->source, "%s", info->source);
@@ -195,6 +224,48 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
         return false;
     }
     return true;
+}
+
+static bool open_gpio(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    const char *const lines[] = {c->gpio.lamp,       c->gpio.led,         c->gpio.stop,
+                                 c->gpio.limit_rear, c->gpio.limit_front, c->gpio.encoder};
+    bool has_any = false;
+    for (size_t i = 0; i < sizeof lines / sizeof lines[0]; i++)
+        has_any = has_any || lines[i][0] != '\0';
+    if (!has_any)
+        return pf_gpio_none_open(&d->gpio) == PF_OK;
+    return pf_gpio_board_open(&d->gpio,
+                              &(pf_gpio_config){.lamp = c->gpio.lamp,
+                                                .led = c->gpio.led,
+                                                .stop = c->gpio.stop,
+                                                .limit_front = c->gpio.limit_front,
+                                                .limit_rear = c->gpio.limit_rear,
+                                                .encoder = c->gpio.encoder,
+                                                .encoder_a = c->gpio.encoder_a,
+                                                .encoder_b = c->gpio.encoder_b,
+                                                .pull = (pf_gpio_pull)c->gpio.pull,
+                                                .lamp_level = c->gpio.lamp_level},
+                              error, n) == PF_OK;
+}
+
+/* Says once what a button or a lost chip has done. */
+static void note_gpio(pf_daemon *d, pf_gpio_state *before)
+{
+    pf_gpio_state now;
+    d->gpio.ops->state(d->gpio.self, &now);
+    if (now.is_stopped && !before->is_stopped)
+        pf_log(PF_LOG_WARNING, "emergency stop: the lamp is off until the daemon starts anew");
+    for (uint32_t bit = PF_LIMIT_FRONT; bit <= PF_LIMIT_REAR; bit <<= 1)
+        if ((now.limits ^ before->limits) & bit)
+            pf_log(PF_LOG_INFO, "%s limit switch %s", bit == PF_LIMIT_FRONT ? "front" : "rear",
+                   now.limits & bit ? "pressed" : "released");
+    if (now.missed != before->missed)
+        pf_log(PF_LOG_WARNING, "wheel encoder: %u edges lost so far", now.missed);
+    if (now.is_broken && !before->is_broken)
+        pf_log(PF_LOG_ERROR, "a chip or device of [gpio] has gone");
+    *before = now;
 }
 
 /* A stored profile that the pipeline cannot open with must not end the daemon, or the host could never send another.
@@ -334,6 +405,7 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int 
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
     bool is_terminated = false, must_exit = false;
+    pf_gpio_state gpio = {0};
     for (;;) {
         struct pollfd fd = {.fd = signals, .events = POLLIN};
         bool is_drained, had_to_exit = must_exit;
@@ -343,6 +415,7 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int 
         if (pf_now() - d->started_ns > PF_RECALL_GOOD_NS)
             pf_recall_good(d->recall, &d->config);
         note_status(d, &status_due, false);
+        note_gpio(d, &gpio);
         if (d->keeper != NULL)
             pf_keeper_work(d->keeper);
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
@@ -370,7 +443,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     pf_store_config store = {.jobs = c->keyframe.queue,
                              .slots = c->link.send_slots,
                              .capacity = pf_pipeline_object_max(d),
-                             .is_patient = c->camera.speed == PF_SPEED_FAST,
+                             .is_patient = c->camera.driver == PF_CAMERA_REPLAY && c->camera.speed == PF_SPEED_FAST,
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;
     bool is_good = false;
@@ -440,7 +513,7 @@ static int open_and_run(pf_daemon *d, int signals)
     settle_profile(d);
     if (!hash_setup(d, setup))
         (void)snprintf(error, sizeof error, "the setup cannot be hashed");
-    else if (pf_gpio_none_open(&d->gpio) == PF_OK) {
+    else if (open_gpio(d, error, sizeof error)) {
         if (open_transport(d, error, sizeof error)) {
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
                 if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {

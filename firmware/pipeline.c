@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "clock.h"
+#include "index.h"
 #include "log.h"
 #include "pipefish/drivers/jpeg.h"
 #include "pipefish/drivers/sha256.h"
@@ -16,7 +17,7 @@
 #define NEXT_TIMEOUT_MS  100u /* how long a stop may go unnoticed while the camera is silent */
 #define START_MAX        (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
 
-#define SHOTS 3u /* the tracker's reference, the frame being tracked, the one that is being taken */
+#define SHOTS PF_CAMERA_HELD_MAX /* the tracker's reference, the frame being tracked, the one that is being taken */
 
 struct pf_pipeline {
     pf_daemon *daemon;
@@ -31,6 +32,9 @@ struct pf_pipeline {
     pf_jpeg *jpeg;
     uint8_t preview[PF_PREVIEW_MAX];
     uint64_t preview_due;
+    bool is_stretched;                        /* ... or they are the same */
+    bool is_gone;                             /* the camera */
+    pf_index *index;                          /* of frames; NULL = none */
     uint8_t stretched[256];                   /* grey levels of the camera -> 0..255 */
     uint32_t preview_quality, preview_shrink; /* of the last preview */
     uint32_t next_index;
@@ -57,14 +61,16 @@ static bool open_shots(pf_pipeline *p, char *error, size_t n)
 {
     const pf_camera_info *info = p->daemon->camera.ops->info(p->daemon->camera.self);
     for (uint32_t i = 0; i < SHOTS; i++) {
-        p->shot[i].pixels = malloc((size_t)info->width * info->height);
-        p->shot[i].tracks = calloc(2 * (size_t)p->daemon->config.tracker.max_tracks, sizeof *p->shot[i].tracks);
-        if (p->shot[i].pixels == NULL || p->shot[i].tracks == NULL) {
-            (void)snprintf(error, n, "no memory for frames");
-            return false;
+        if (p->is_stretched || !p->daemon->config.camera.zero_copy) {
+            p->shot[i].pixels = malloc((size_t)info->width * info->height);
+            if (p->shot[i].pixels == NULL)
+                break;
         }
+        p->shot[i].tracks = calloc(2 * (size_t)p->daemon->config.tracker.max_tracks, sizeof *p->shot[i].tracks);
     }
-    return true;
+    if (p->shot[SHOTS - 1].tracks == NULL)
+        (void)snprintf(error, n, "no memory for frames");
+    return p->shot[SHOTS - 1].tracks != NULL;
 }
 
 /* A camera of limited range would never be dark, nor saturated, to any of the tracker's limits. */
@@ -75,6 +81,7 @@ static void open_levels(pf_pipeline *p)
         const uint32_t above = v > black ? v - black : 0;
         p->stretched[v] = (uint8_t)(above >= range ? 255u : (255u * above + range / 2) / range);
     }
+    p->is_stretched = black != 0 || range != 255;
 }
 
 static bool open_jpeg(pf_pipeline *p, char *error, size_t n)
@@ -171,6 +178,7 @@ static void release(pf_pipeline *p)
         free(p->shot[i].pixels);
         free(p->shot[i].tracks);
     }
+    pf_index_close(p->index);
     pf_tracking_close(p->tracking);
     free(p);
 }
@@ -190,6 +198,7 @@ bool pf_pipeline_can_open(pf_daemon *daemon, char *error, size_t n)
         return false;
     }
     p->daemon = daemon;
+    open_levels(p);
     bool can = open_parts(p, error, n);
     release(p);
     return can;
@@ -212,8 +221,10 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     if (survey->next_index > 0) /* else no boot before came to make a keyframe */
         (void)snprintf(p->break_reason, sizeof p->break_reason, "restart");
     open_levels(p);
-    if (!open_parts(p, error, n) || (before->boots > 0 && !store_end_of(p, before, error, n)) ||
-        !store_start(p, error, n)) {
+    if (!open_parts(p, error, n) ||
+        (daemon->config.camera.index[0] != '\0' &&
+         !pf_index_open(&p->index, daemon->config.camera.index, survey->id, survey->boots, error, n)) ||
+        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
         release(p);
         return false;
     }
@@ -242,7 +253,8 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
                           .lamp = (float)t->lamp};
     double lamp;
     if (!m.has_encoder)
-        m.has_encoder = d->gpio.ops->encoder(d->gpio.self, &m.encoder_count, &m.encoder_missed) == PF_OK;
+        m.has_encoder =
+            d->gpio.ops->encoder(d->gpio.self, frame->time_ns, &m.encoder_count, &m.encoder_missed) == PF_OK;
     if (!m.has_lamp && d->gpio.ops->lamp(d->gpio.self, &lamp) == PF_OK) {
         m.has_lamp = true;
         m.lamp = (float)lamp;
@@ -346,25 +358,44 @@ static void give_still(pf_pipeline *p, const pf_shot *shot, const pf_frame *fram
         pf_courier_wake(p->courier);
 }
 
-/* Takes the driver's frame over and gives its buffer back at once. */
-static void take_shot(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
+/* Gives back what a slot holds of the driver's. */
+static void drop_shot(pf_pipeline *p, pf_shot *shot)
+{
+    if (shot->frame.handle != NULL)
+        p->daemon->camera.ops->release(p->daemon->camera.self, &shot->frame);
+    shot->frame.handle = NULL;
+}
+
+/* Copies the pixels, with their levels stretched, and gives the driver's buffer back at once. */
+static void copy_pixels(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
 {
     const pf_image *image = &frame->image;
-    shot->telemetry = read_telemetry(p, frame);
-    give_still(p, shot, frame);
-    const bool is_full = p->stretched[1] == 1 && p->stretched[254] == 254;
     for (uint32_t y = 0; y < image->height; y++) {
         const uint8_t *from = image->data + (size_t)y * image->stride;
         uint8_t *to = shot->pixels + (size_t)y * image->width;
-        if (is_full)
+        if (!p->is_stretched)
             memcpy(to, from, image->width);
         else
             for (uint32_t x = 0; x < image->width; x++)
                 to[x] = p->stretched[from[x]];
     }
-    shot->frame = *frame;
     shot->frame.image = (pf_image){shot->pixels, image->width, image->height, image->width};
+    shot->frame.handle = NULL;
     p->daemon->camera.ops->release(p->daemon->camera.self, frame);
+}
+
+/* Takes the driver's frame over. */
+static void take_shot(pf_pipeline *p, pf_shot *shot, pf_frame *frame)
+{
+    shot->telemetry = read_telemetry(p, frame);
+    give_still(p, shot, frame);
+    if (p->index != NULL && !frame->has_sha256)
+        frame->has_sha256 = pf_sha256_image(&frame->image, frame->sha256) == PF_OK;
+    shot->frame = *frame;
+    if (shot->pixels != NULL)
+        copy_pixels(p, shot, frame);
+    if (p->index != NULL)
+        pf_index_add(p->index, shot);
 }
 
 static void count_shot(pf_pipeline *p, const pf_shot *shot, uint64_t keyframe_ns)
@@ -409,6 +440,24 @@ static void finish_shot(pf_pipeline *p, const pf_shot *shot)
 
 /* ---- the survey */
 
+/* Counts what the camera has been through, and says when it goes and comes. */
+static void watch_camera(pf_pipeline *p, pf_status status)
+{
+    pf_daemon *d = p->daemon;
+    pf_camera_stats stats;
+    if (status == PF_ERR_CLOSED && !p->is_gone)
+        pf_log(PF_LOG_WARNING, "no camera: %s", d->camera.ops->error(d->camera.self));
+    else if (status == PF_OK && p->is_gone)
+        pf_log(PF_LOG_INFO, "the camera is there");
+    if (status == PF_OK || status == PF_ERR_CLOSED)
+        p->is_gone = status == PF_ERR_CLOSED;
+    d->gpio.ops->indicate(d->gpio.self, p->is_gone ? PF_INDICATE_TROUBLE : PF_INDICATE_WORK);
+    d->camera.ops->stats(d->camera.self, &stats);
+    pthread_mutex_lock(&d->counters.mutex);
+    d->counters.camera = stats;
+    pthread_mutex_unlock(&d->counters.mutex);
+}
+
 /* Two steps overlap: while shot k is tracked, k - 1 is finished and k + 1 taken; one waits for the other before the
  * next step, so nothing queues up. Without a worker the same steps come one after the other. */
 static void capture(pf_pipeline *p, char *reason, size_t reason_n)
@@ -425,7 +474,7 @@ static void capture(pf_pipeline *p, char *reason, size_t reason_n)
     c->first_ns = c->last_ns = waited;
     pthread_mutex_unlock(&c->mutex);
     (void)snprintf(reason, reason_n, "end of recording");
-    while (status == PF_OK || status == PF_ERR_AGAIN) {
+    while (status == PF_OK || status == PF_ERR_AGAIN || status == PF_ERR_CLOSED) {
         pf_frame frame;
         pf_pulse_work(); /* next() waits for NEXT_TIMEOUT_MS at most */
         if (atomic_load(&d->stop) != PF_STOP_NO) {
@@ -433,8 +482,10 @@ static void capture(pf_pipeline *p, char *reason, size_t reason_n)
                            atomic_load(&d->stop) == PF_STOP_TERMINATED ? "terminated" : "stopped by the operator");
             break;
         }
-        status = d->camera.ops->next(d->camera.self, NEXT_TIMEOUT_MS, &frame);
         pf_shot *shot = &p->shot[next], *tracked = pending;
+        drop_shot(p, shot);
+        status = d->camera.ops->next(d->camera.self, NEXT_TIMEOUT_MS, &frame);
+        watch_camera(p, status);
         if (status == PF_OK) {
             pthread_mutex_lock(&c->mutex);
             c->frames++;
@@ -469,7 +520,9 @@ static void capture(pf_pipeline *p, char *reason, size_t reason_n)
         pf_worker_wait(p->worker);
         finish_shot(p, pending);
     }
-    if (status != PF_OK && status != PF_ERR_AGAIN && status != PF_ERR_END) {
+    for (uint32_t i = 0; i < SHOTS; i++)
+        drop_shot(p, &p->shot[i]);
+    if (status != PF_OK && status != PF_ERR_AGAIN && status != PF_ERR_CLOSED && status != PF_ERR_END) {
         p->has_failed = true;
         (void)snprintf(reason, reason_n, "camera failed: %s", d->camera.ops->error(d->camera.self));
     }
@@ -519,6 +572,7 @@ static void *run(void *argument)
     (void)d->camera.ops->stop(d->camera.self);
     pf_utf8_clean(reason);
     atomic_store(&d->state, PF_STATE_DRAINING);
+    d->gpio.ops->indicate(d->gpio.self, PF_INDICATE_SEND);
     pf_log(p->has_failed ? PF_LOG_ERROR : PF_LOG_INFO, "survey ends: %s; %u keyframes", reason, p->next_index);
     store_end(p, reason);
     pf_pulse_rest();

@@ -8,8 +8,8 @@
 
 /* A frame on its way: taken by the capture thread, tracked, then made a keyframe of by the capture thread. */
 typedef struct pf_shot {
-    pf_frame frame; /* .image is `pixels`; the driver has its buffer back */
-    uint8_t *pixels;
+    pf_frame frame;  /* the driver's until the slot is used again; without a handle its .image is `pixels` */
+    uint8_t *pixels; /* NULL: frames are used where they lie */
     pf_msg_telemetry telemetry;
     /* what tracking makes of it */
     uint64_t missing; /* frames before it */

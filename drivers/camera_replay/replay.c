@@ -12,7 +12,7 @@
 #include <sys/stat.h>
 #include <time.h>
 
-#define BUFFERS            2u
+#define BUFFERS            PF_CAMERA_HELD_MAX
 #define DEFAULT_FRAME_RATE 10.0
 #define SECOND_NS          1000000000u
 
@@ -197,6 +197,12 @@ static void replay_release(void *self, pf_frame *frame)
     frame->image.data = NULL;
 }
 
+static void replay_stats(void *self, pf_camera_stats *stats)
+{
+    (void)self;
+    *stats = (pf_camera_stats){.is_there = true};
+}
+
 static const char *replay_error(void *self)
 {
     replay *r = self;
@@ -338,6 +344,7 @@ pf_status pf_replay_open(pf_camera_source *source, const pf_replay_config *confi
         .next = replay_next,
         .release = replay_release,
         .stop = replay_stop,
+        .stats = replay_stats,
         .error = replay_error,
         .close = replay_close,
     };

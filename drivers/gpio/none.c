@@ -1,5 +1,7 @@
 #include "pipefish/drivers/gpio.h"
 
+#include <string.h>
+
 static pf_status none_set_lamp(void *self, double level)
 {
     (void)self;
@@ -14,9 +16,10 @@ static pf_status none_lamp(void *self, double *level)
     return PF_ERR_UNSUPPORTED;
 }
 
-static pf_status none_encoder(void *self, int64_t *count, uint32_t *missed)
+static pf_status none_encoder(void *self, uint64_t time_ns, int64_t *count, uint32_t *missed)
 {
     (void)self;
+    (void)time_ns;
     (void)count;
     (void)missed;
     return PF_ERR_UNSUPPORTED;
@@ -27,6 +30,18 @@ static pf_status none_stopped(void *self, bool *is_stopped)
     (void)self;
     (void)is_stopped;
     return PF_ERR_UNSUPPORTED;
+}
+
+static void none_indicate(void *self, pf_indication indication)
+{
+    (void)self;
+    (void)indication;
+}
+
+static void none_state(void *self, pf_gpio_state *state)
+{
+    (void)self;
+    memset(state, 0, sizeof *state);
 }
 
 static void none_close(void *self)
@@ -41,6 +56,8 @@ pf_status pf_gpio_none_open(pf_gpio *gpio)
         .lamp = none_lamp,
         .encoder = none_encoder,
         .stopped = none_stopped,
+        .indicate = none_indicate,
+        .state = none_state,
         .close = none_close,
     };
     gpio->self = NULL;

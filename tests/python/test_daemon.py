@@ -59,7 +59,7 @@ def test_check_config_accepts_a_good_file(crawler: Crawler):
         ("[trackers]\nlevels = 4", "unknown section [trackers]; there are: survey camera tracker"),
         ("levels = 4\nlevels = 4", "tracker.levels is set a second time; the first is in line 2"),
         ("levels", "neither [section] nor key = value"),
-        ("[camera]\ndriver = v4l3", "camera.driver = v4l3: this build has: replay"),
+        ("[camera]\ndriver = v4l3", "camera.driver = v4l3: this build has: replay|v4l2"),
         ("[link]\nrtscts = yes", "must be true or false"),
     ],
 )

@@ -35,6 +35,18 @@ typedef struct pf_camera_info {
     char source[256];  /* "replay demo.y4m" */
 } pf_camera_info;
 
+/* What went wrong so far; a recording has nothing to report. */
+typedef struct pf_camera_stats {
+    bool is_there;       /* a camera that delivers, or is expected to at any moment */
+    uint64_t damaged;    /* frames that the driver marked, that were too short, or whose JPEG was broken */
+    uint64_t restarts;   /* of a stream that had stalled */
+    uint64_t reopens;    /* of a camera that was unplugged, or that a restart did not help */
+    uint64_t bad_stamps; /* frames whose time or number was not to be believed */
+} pf_camera_stats;
+
+/* Frames of one camera that may be held at a time: the tracker's reference, the one being tracked, the one taken. */
+#define PF_CAMERA_HELD_MAX 3u
+
 typedef struct pf_camera_source {
     void *self;
     const struct pf_camera_source_ops *ops;
@@ -47,17 +59,19 @@ typedef struct pf_camera_source_ops {
     /* Starts capture; frames are due from now on. A recording goes on where it was stopped. PF_OK, PF_ERR_IO. */
     pf_status (*start)(void *self);
 
-    /* Waits up to timeout_ms for the next frame. At most two frames are held at a time (the tracker keeps the last one
-     * as its reference).
-     * PF_OK; PF_ERR_AGAIN (none yet); PF_ERR_END (a recording is over); PF_ERR_CLOSED (unplugged); PF_ERR_IO;
+    /* Waits up to timeout_ms for the next frame. At most PF_CAMERA_HELD_MAX frames are held at a time.
+     * PF_OK; PF_ERR_AGAIN (none yet); PF_ERR_END (a recording is over); PF_ERR_CLOSED (unplugged, or not plugged in
+     * yet: ask again, it goes on once the camera is back; error() says why it is not); PF_ERR_IO;
      * PF_ERR_FORMAT, PF_ERR_TRUNCATED, PF_ERR_CHECKSUM (a recording is damaged): error() says what and where, and the
-     * next call goes on with the frame after it; PF_ERR_ARGUMENT (not started, two frames are held already). */
+     * next call goes on with the frame after it; PF_ERR_ARGUMENT (not started, too many frames are held already). */
     pf_status (*next)(void *self, uint32_t timeout_ms, pf_frame *frame);
 
-    /* Gives a frame back. */
+    /* Gives a frame back; its pixels stay as they are until then, whatever becomes of the camera. */
     void (*release)(void *self, pf_frame *frame);
 
     pf_status (*stop)(void *self);
+
+    void (*stats)(void *self, pf_camera_stats *stats);
 
     /* The last failure in words, with file and position; "" if there was none. */
     const char *(*error)(void *self);
@@ -87,5 +101,33 @@ typedef struct pf_replay_config {
  * error[n] says what and where. PF_OK, PF_ERR_IO, PF_ERR_FORMAT, PF_ERR_TRUNCATED, PF_ERR_UNSUPPORTED, PF_ERR_ARGUMENT.
  */
 pf_status pf_replay_open(pf_camera_source *source, const pf_replay_config *config, char *error, size_t n);
+
+/* A camera of the kernel's V4L2, read where the kernel put the pixels wherever the format has grey bytes. It may be
+ * unplugged and come back under the same path (best one of /dev/v4l/by-path); a stream that falls silent is restarted.
+ */
+typedef enum pf_exposure_mode {
+    PF_EXPOSURE_AUTO = 0, /* ours, for a camera that carries its own lamp, where the camera can be set */
+    PF_EXPOSURE_HOLD,     /* the same until it has settled, then fixed: for calibration */
+    PF_EXPOSURE_FIXED,    /* as configured */
+    PF_EXPOSURE_DEVICE,   /* the camera's own affair */
+} pf_exposure_mode;
+
+typedef struct pf_v4l2_config {
+    const char *device;     /* /dev/video0 */
+    uint32_t width, height; /* pixels; both 0 = as the device is set now; else it may be absent at opening */
+    double frame_rate;      /* 1/s; 0 = as the device is set */
+    const char *format;     /* GREY, NV12, NM12, NV21, YU12, Y10P, Y12P, Y10, Y12, YUYV, UYVY, MJPG, JPEG; NULL or "" =
+                               the best that the camera has */
+    uint32_t buffers;       /* 4..32; 0 = 6: the held ones, and three that the camera can fill while nobody looks */
+    pf_exposure_mode mode;
+    uint32_t exposure_us;                       /* FIXED; 0 = as it is */
+    double gain;                                /* FIXED, in the camera's units; 0 = as it is */
+    uint32_t exposure_max_us;                   /* of AUTO and HOLD: motion blur; 0 = the camera's own limit */
+    uint32_t circle_u, circle_v, circle_radius; /* what AUTO and HOLD look at, pixels; radius 0 = the whole picture */
+} pf_v4l2_config;
+
+/* On failure *source is untouched and error[n] says what. PF_OK; PF_ERR_IO (absent, in use); PF_ERR_ARGUMENT;
+ * PF_ERR_UNSUPPORTED (it has no such size or format: the text lists what it has). */
+pf_status pf_v4l2_open(pf_camera_source *source, const pf_v4l2_config *config, char *error, size_t n);
 
 #endif

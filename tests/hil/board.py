@@ -1,0 +1,237 @@
+"""An emulated arm64 board with Debian's kernel: takes commands, loses power; its USB serial line can be unplugged."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import select
+import shlex
+import shutil
+import socket
+import subprocess
+import threading
+import time
+import tty
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+CACHE = ROOT / "build" / "board"
+PROGRAMS = ROOT / "build" / "arm64"
+BOOT_S, COMMAND_S = 25, 60
+DISK_BYTES = 256 << 20
+
+
+class BoardError(AssertionError):
+    """The board did not do what it was told, with what it said."""
+
+
+class UsbSerial:
+    """The host's end of the board's USB serial adapter: a pseudo-terminal that stays while the adapter is unplugged."""
+
+    def __init__(self, socket_path: Path) -> None:
+        self.socket_path = socket_path
+        self.master, slave = pty.openpty()
+        tty.setraw(self.master)
+        tty.setraw(slave)
+        self._slave = slave  # keeps the terminal alive between two receivers
+        self.device = os.ttyname(slave)
+        self._line: socket.socket | None = None
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._pump, daemon=True)
+        self._thread.start()
+
+    def plug(self) -> None:
+        """QEMU's adapter is on the board's bus while somebody is connected to its socket."""
+        line = socket.socket(socket.AF_UNIX)
+        end = time.monotonic() + 20
+        while True:
+            try:
+                line.connect(str(self.socket_path))
+                break
+            except OSError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.05)
+        with self._lock:
+            self._line = line
+
+    def unplug(self) -> None:
+        with self._lock:
+            line, self._line = self._line, None
+        if line is not None:
+            line.close()
+
+    def _pump(self) -> None:
+        while not self._over.is_set():
+            with self._lock:
+                line = self._line
+            try:
+                readable = select.select([self.master, *([line] if line else [])], [], [], 0.05)[0]
+                if self.master in readable:
+                    data = os.read(self.master, 65536)
+                    if line:
+                        line.sendall(data)
+                if line in readable:
+                    data = line.recv(65536)
+                    if not data:
+                        raise OSError
+                    while data:
+                        data = data[os.write(self.master, data) :]
+            except (OSError, ValueError):
+                if line is not None:
+                    with self._lock:
+                        self._line = None if self._line is line else self._line
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self.unplug()
+        os.close(self.master)
+        os.close(self._slave)
+
+
+class Board:
+    """One board: its disk and shared folder outlive power cuts.
+
+    folder   of this test: disk.img, share/ (the board's /mnt), console.log
+    port     of the host, that leads to the board's port 7448
+    """
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self.folder, self.port = folder, port
+        self.share = folder / "share"
+        self.share.mkdir(parents=True)
+        for program in ("firmware/pipefishd", "tests/hil/pipefish-world"):
+            shutil.copy(PROGRAMS / program, self.share)
+        self.disk = folder / "disk.img"
+        with self.disk.open("wb") as disk:
+            disk.truncate(DISK_BYTES)
+        subprocess.run(["mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1", self.disk], check=True)
+        self.initramfs = folder / "initramfs"
+        archive = ["cpio", "-o", "-H", "newc", "--quiet", "-R", "0:0"]
+        init = subprocess.run(
+            archive, cwd=ROOT / "tests" / "hil" / "guest", input=b"init\n", capture_output=True, check=True
+        )
+        packed = (CACHE / "initramfs").read_bytes()
+        self.initramfs.write_bytes(packed + bytes(-len(packed) % 4) + init.stdout)
+        self.usb = UsbSerial(folder / "usb.sock")
+        self.boot_s = 0.0
+        self._qemu: subprocess.Popen[bytes] | None = None
+        self._agent: socket.socket | None = None
+
+    def _command(self) -> list[str]:
+        return [
+            *("qemu-system-aarch64", "-M", "virt", "-cpu", "cortex-a72", "-smp", "2", "-m", "512"),
+            # The board's time runs with its instructions, 250 million a second: a busy host makes it late, never slow.
+            *("-accel", "tcg", "-icount", "shift=2"),
+            *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"),
+            *("-serial", f"file:{self.folder}/console.log"),
+            *("-kernel", str(CACHE / "vmlinuz"), "-initrd", str(self.initramfs)),
+            *("-append", "console=ttyAMA0 loglevel=4 panic=-1 rdinit=/init"),
+            *("-virtfs", f"local,path={self.share},mount_tag=host,security_model=none"),
+            *("-drive", f"file={self.disk},if=none,id=disk,format=raw,cache=writeback"),
+            *("-device", "virtio-blk-pci,drive=disk"),
+            *("-device", "virtio-serial-pci"),
+            *("-chardev", f"socket,id=agent,path={self.folder}/agent.sock,server=on,wait=off"),
+            *("-device", "virtserialport,chardev=agent,name=agent,nr=1"),
+            *(
+                "-netdev",
+                f"user,id=net,hostfwd=tcp:127.0.0.1:{self.port}-:7448",
+                "-device",
+                "virtio-net-pci,netdev=net,romfile=",
+            ),
+            *("-device", "qemu-xhci", "-chardev", f"socket,id=usb,path={self.folder}/usb.sock,server=on,wait=off"),
+            *("-device", "usb-serial,chardev=usb"),
+        ]
+
+    def power_on(self) -> float:
+        """Boots; returns the seconds until it took commands."""
+        start = time.monotonic()
+        for name in ("agent.sock", "usb.sock"):
+            (self.folder / name).unlink(missing_ok=True)
+        with (self.folder / "qemu.log").open("ab") as log:
+            self._qemu = subprocess.Popen(self._command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        self.usb.plug()
+        agent = socket.socket(socket.AF_UNIX)
+        agent.settimeout(BOOT_S)
+        agent.connect(str(self.folder / "agent.sock"))
+        self._agent = agent
+        self._input = agent.makefile("rb")
+        if not self._line().startswith("READY"):
+            raise BoardError("the board did not boot: " + self.console())
+        self.boot_s = time.monotonic() - start
+        self.run("mount /dev/vda /data")
+        return self.boot_s
+
+    def _line(self) -> str:
+        try:
+            line = self._input.readline()
+        except TimeoutError as error:
+            raise BoardError("the board does not answer: " + self.console()) from error
+        if not line:
+            raise BoardError("the board has gone: " + self.console())
+        return line.decode(errors="replace").strip()
+
+    def run(self, command: str, timeout: float = COMMAND_S, check: bool = True) -> str:
+        """Runs a shell command on the board; its output. With `check` a code other than 0 is an error."""
+        self._agent.settimeout(timeout)
+        self._agent.sendall(command.replace("\n", " ").encode() + b"\n")
+        word, code, size = self._line().split()
+        assert word == "DONE"
+        output = self._input.read(int(size)).decode(errors="replace")
+        if check and code != "0":
+            raise BoardError(f"{command}: code {code}\n{output}\n{self.console()}")
+        return output
+
+    def spawn(self, command: str, log: str) -> int:
+        """Starts a command in the background, its output in the shared folder; returns its process id."""
+        (self.share / log).touch()
+        return int(self.run(f"({command}) >/mnt/{shlex.quote(log)} 2>&1 & echo $!"))
+
+    def is_running(self, process: int) -> bool:
+        return self.run(f"kill -0 {process} 2>/dev/null && echo yes", check=False).strip() == "yes"
+
+    def wait(self, process: int, timeout: float = COMMAND_S) -> None:
+        """Until a process of spawn() has ended."""
+        end = time.monotonic() + timeout
+        while self.is_running(process):
+            if time.monotonic() > end:
+                raise BoardError(f"process {process} does not end: {self.console()}\n{self.logs()}")
+            time.sleep(0.2)
+
+    def power_cut(self) -> None:
+        """As if the plug were pulled: what the board had not written is gone."""
+        self.usb.unplug()
+        if self._agent is not None:
+            self._input.close()
+            self._agent.close()
+            self._agent = None
+        if self._qemu is not None:
+            self._qemu.kill()
+            self._qemu.wait()
+            self._qemu = None
+
+    def close(self) -> None:
+        self.power_cut()
+        self.usb.close()
+
+    def console(self) -> str:
+        """The end of what the kernel said."""
+        with contextlib.suppress(OSError):
+            return (self.folder / "console.log").read_text(errors="replace")[-3000:]
+        return ""
+
+    def logs(self) -> str:
+        return "\n".join(
+            f"--- {p.name}\n{p.read_text(errors='replace')[-3000:]}" for p in sorted(self.share.glob("*.log"))
+        )
+
+    def status(self) -> dict:
+        """The daemon's status file, {} while there is none."""
+        text = self.run("cat /run/status.json", check=False)
+        with contextlib.suppress(json.JSONDecodeError):
+            return json.loads(text)
+        return {}

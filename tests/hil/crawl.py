@@ -1,0 +1,272 @@
+"""A crawler on the emulated board: what its camera sees, its daemon, the host that receives, and the replay that must
+give the same."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from board import ROOT, Board
+
+from pipefish.survey import Survey
+
+PIPEFISH = Path(sys.executable).with_name("pipefish")
+HOST_DAEMON = ROOT / "build" / "release" / "firmware" / "pipefishd"
+FRAME = b"FRAME\n"
+SETTINGS = {
+    "camera.profile": "{folder}/crawl.profile",
+    "tracker.max_tracks": "80",
+    "keyframe.parallax_deg": "3",
+    "keyframe.min_interval": "1",
+    "survey.nominal_diameter_mm": "200",
+    "status.preview_interval_ms": "0",
+    "link.keepalive_ms": "300",
+}
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@dataclass
+class Recording:
+    """The simulated frames: `frames` bytes by SHA-256, and in order."""
+
+    path: Path
+    header: bytes
+    order: list[str]
+    frames: dict[str, bytes]
+    counts: list[int]
+
+    @staticmethod
+    def load(path: Path) -> Recording:
+        data = path.read_bytes()
+        header, _, rest = data.partition(b"\n")
+        words = dict((w[:1], w[1:]) for w in header.decode().split()[1:])
+        size = int(words["W"]) * int(words["H"])
+        order, frames = [], {}
+        for at in range(0, len(rest), size + len(FRAME)):
+            pixels = rest[at + len(FRAME) : at + len(FRAME) + size]
+            name = hashlib.sha256(pixels).hexdigest()
+            order.append(name)
+            frames[name] = pixels
+        with path.with_suffix(".csv").open() as rows:
+            counts = [int(row["encoder_count"]) for row in csv.DictReader(rows)]
+        return Recording(path, header, order, frames, counts)
+
+
+@dataclass
+class Result:
+    """One scenario's row in the table."""
+
+    name: str
+    frames_in: int = 0
+    keyframes_out: int = 0
+    lost: int = 0
+    duplicated: int = 0
+    recovery_s: float | None = None
+    boot_s: float | None = None
+    cpu: dict[str, float] = field(default_factory=dict)
+
+
+class Crawl:
+    """One survey on one board."""
+
+    def __init__(self, board: Board, recording: Recording, folder: Path, settings: dict[str, str]) -> None:
+        self.board, self.recording, self.folder = board, recording, folder
+        self.settings = {**SETTINGS, **settings}
+        self.output = folder / "survey.mcap"
+        self.daemon = 0
+        self.starts = 0
+        self._receiver: subprocess.Popen[bytes] | None = None
+        for suffix in ("y4m", "profile"):
+            target = board.share / f"crawl.{suffix}"
+            target.write_bytes(recording.path.with_suffix(f".{suffix}").read_bytes())
+        (board.share / "counts.txt").write_text("".join(f"{count}\n" for count in recording.counts))
+
+    # ---- on the board
+
+    def _arguments(self, settings: dict[str, str], folder: str) -> list[str]:
+        lines = {**self.settings, **settings}
+        return [f"{key}={value.format(folder=folder)}" for key, value in lines.items()]
+
+    def start_daemon(self) -> None:
+        """The arm64 daemon, its spool on the board's disk and its frame index in the shared folder."""
+        self.board.run("mkdir -p /mnt/index; : > /run/empty.ini")
+        settings = {
+            "camera.driver": "v4l2",
+            "camera.index": "/mnt/index",
+            "spool.path": "/data/spool.db",
+            "daemon.status_file": "/run/status.json",
+            "status.interval_ms": "200",
+        }
+        flags = " ".join(f"--set {a}" for a in self._arguments(settings, "/mnt"))
+        self.daemon = self.board.spawn(
+            f"exec /mnt/pipefishd --config /run/empty.ini {flags}", f"daemon{self.starts}.log"
+        )
+        self.starts += 1
+
+    def wait_for(self, text: str, timeout: float = 20) -> float:
+        """Until the daemon's log of this start has `text`; the seconds that took."""
+        start = time.monotonic()
+        log = self.board.share / f"daemon{self.starts - 1}.log"
+        while text not in log.read_text(errors="replace"):
+            if time.monotonic() - start > timeout:
+                raise AssertionError(f"the daemon did not say '{text}':\n{self.board.logs()}\n{self.board.console()}")
+            time.sleep(0.05)
+        return time.monotonic() - start
+
+    def wait_until(self, condition, what: str, timeout: float = 30) -> float:
+        """Until condition(status) of the daemon's status file; the seconds that took."""
+        start = time.monotonic()
+        while not condition(self.board.status()):
+            if time.monotonic() - start > timeout:
+                raise AssertionError(f"not seen: {what}: {self.board.status()}\n{self.board.logs()}")
+            time.sleep(0.1)
+        return time.monotonic() - start
+
+    def show(self, first: int, count: int, rate: float, device: str, pixels: str = "GREY", encoder: str = "") -> int:
+        """Begins to show frames to the camera; the process id of the world."""
+        command = f"exec /mnt/pipefish-world /mnt/crawl.y4m {device} {pixels} {rate} {first} {count} {encoder}"
+        return self.board.spawn(command, f"world{first}.log")
+
+    def stop_daemon(self) -> None:
+        """The survey ends; the daemon drains and exits."""
+        self.board.run(f"kill -TERM {self.daemon}")
+
+    # ---- on the host
+
+    def start_receiver(self, device: str) -> None:
+        with (self.folder / "receive.log").open("ab") as log:
+            self._receiver = subprocess.Popen(
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "60"], stdout=log, stderr=log
+            )
+
+    def kill_receiver(self) -> None:
+        self._receiver.send_signal(signal.SIGKILL)
+        self._receiver.wait()
+
+    def finish(self, timeout: float = 60) -> Survey:
+        """Waits for the receiver; the survey it got."""
+        try:
+            code = self._receiver.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise AssertionError(f"the survey does not end\n{self._texts()}") from error
+        assert code == 0, self._texts()
+        self.received = Survey.open(self.output)
+        return self.received
+
+    def _texts(self) -> str:
+        return f"{(self.folder / 'receive.log').read_text()[-2000:]}\n{self.board.logs()}\n{self.board.console()}"
+
+    def close(self) -> None:
+        if self._receiver is not None and self._receiver.poll() is None:
+            self._receiver.kill()
+            self._receiver.wait()
+
+    # ---- what must be true
+
+    def indices(self) -> list[tuple[Path, list[dict[str, str]]]]:
+        """The rows of each start's frame index; a last row that power cut short is left out."""
+        out = []
+        for path in sorted((self.board.share / "index").glob("*.csv")):
+            text = path.read_text()
+            whole = text[: text.rfind("\n") + 1]
+            out.append((path, list(csv.DictReader(whole.splitlines()))))
+        return out
+
+    def replay(self, rows: list[dict[str, str]], name: str) -> Survey:
+        """The host's own daemon on the frames of one index, in its order, with its gaps and repeats."""
+        folder = self.folder / name
+        folder.mkdir()
+        with (folder / "replay.y4m").open("wb") as out:
+            out.write(self.recording.header + b"\n")
+            for row in rows:
+                out.write(FRAME + self.recording.frames[row["sha256"]])
+        with (folder / "replay.csv").open("w", newline="") as out:
+            writer = csv.DictWriter(out, rows[0].keys())
+            writer.writeheader()
+            writer.writerows(rows)
+        port = free_port()
+        settings = {
+            "camera.driver": "replay",
+            "camera.path": f"{folder}/replay.y4m",
+            "camera.speed": "fast",
+            "spool.path": f"{folder}/spool.db",
+            "link.transport": "tcp",
+            "link.port": str(port),
+        }
+        (folder / "empty.ini").touch()
+        command = [HOST_DAEMON, "--config", folder / "empty.ini"]
+        for argument in self._arguments(settings, str(self.board.share)):
+            if not argument.startswith(
+                ("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")
+            ):
+                command += ["--set", argument]
+        with (folder / "daemon.log").open("wb") as log:
+            daemon = subprocess.Popen(command, stderr=log)
+        try:
+            receive = [PIPEFISH, "receive", f"tcp://127.0.0.1:{port}", "-o", folder / "replay.mcap"]
+            subprocess.run(receive, check=True, capture_output=True, timeout=60)
+            daemon.wait(30)
+        finally:
+            daemon.kill()
+        return Survey.open(folder / "replay.mcap")
+
+    def check(self, survey: Survey, result: Result) -> Result:
+        """Nothing lost, nothing twice, every frame whole; tracks and pictures as in the replay, bit for bit."""
+        assert survey.complete and not survey.lost, (survey.missing, survey.lost)
+        assert [k.index for k in survey.keyframes] == list(range(len(survey.keyframes)))
+        moments = Counter((k.boot, k.message.frame_sequence) for k in survey.keyframes)
+        result.duplicated = sum(n - 1 for n in moments.values())
+        result.keyframes_out = len(survey.keyframes)
+        boots = list(dict.fromkeys(s.time.boot_id for s in survey.starts))
+        compared = 0
+        for number, (path, rows) in enumerate(self.indices()):
+            strange = [row["sequence"] for row in rows if row["sha256"] not in self.recording.frames]
+            assert not strange, f"{path.name}: frames that nobody showed: {strange}"
+            result.frames_in += len(rows)
+            if not rows:
+                continue
+            boot = boots[int(path.stem.split("-")[1]) - 1]
+            got = {k.message.frame_sequence: k for k in survey.keyframes if k.boot == boot}
+            expected = {k.message.frame_sequence: k for k in self.replay(rows, f"replay{number}").keyframes}
+            # A restart without warning loses what had not reached the spool; what has must be as expected.
+            ended = boot == survey.end.time.boot_id
+            missing = set(expected) - set(got)
+            if ended:
+                result.lost += len(missing)
+            assert set(got) <= set(expected), (sorted(got), sorted(expected))
+            for sequence, keyframe in got.items():
+                compare(keyframe, expected[sequence])
+                compared += 1
+        assert compared == len(survey.keyframes)
+        assert result.duplicated == 0 and result.lost == 0, result
+        return result
+
+
+def compare(a, b) -> None:
+    """Two keyframes of one frame: tracks, picture, hash and readings must be the same bits."""
+    assert a.message.observations.SerializeToString() == b.message.observations.SerializeToString()
+    assert a.message.frame_sha256 == b.message.frame_sha256
+    assert a.message.cause == b.message.cause
+    assert a.telemetry.get("encoder_count") == b.telemetry.get("encoder_count")
+    assert a.jpeg == b.jpeg
+
+
+def is_alive(process: subprocess.Popen[bytes]) -> bool:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process.pid, 0)
+        return process.poll() is None
+    return False

@@ -1,0 +1,191 @@
+"""pipefishd as it runs on a crawler: arm64, Debian's kernel, V4L2, USB serial, network, and everything that may break.
+
+Each scenario ends with a whole survey at the host that equals, bit for bit in tracks and pictures, the host's replay of
+the frames that the daemon says it took. Not proved: anything about a real sensor's timing, or about speed."""
+
+from __future__ import annotations
+
+import time
+
+from crawl import Result
+
+LOOPBACK = "modprobe v4l2loopback devices=1 exclusive_caps=0 max_buffers=32"
+RATE = 5
+SERIAL = {"link__transport": "serial", "link__device": "/dev/ttyUSB0", "link__baud": "3000000"}
+# v4l2loopback writes into buffers that are still in use, sooner the fewer there are.
+SIZE = {"camera__device": "/dev/video0", "camera__width": "320", "camera__height": "240", "camera__buffers": "32"}
+
+
+def usb(survey) -> str:
+    return f"serial:{survey.board.usb.device}@3000000"
+
+
+def frames(n: int):
+    return lambda status: status.get("frames", 0) >= n
+
+
+def begin(crawl, **settings: str):
+    """A survey over USB serial that is waiting for its camera."""
+    survey = crawl(**{**SERIAL, **SIZE, **settings})
+    survey.board.run(LOOPBACK)
+    survey.start_receiver(usb(survey))
+    survey.start_daemon()
+    survey.wait_for("begins")
+    return survey
+
+
+def end(survey, note, name: str, recovery_s: float | None = None) -> Result:
+    survey.stop_daemon()
+    result = survey.check(survey.finish(), Result(name, recovery_s=recovery_s, boot_s=survey.board.boot_s))
+    note(result)
+    return result
+
+
+def test_a_survey_from_v4l2_over_usb_serial_equals_its_replay(crawl, note):
+    survey = begin(crawl)
+    survey.board.wait(survey.show(0, 45, RATE, "/dev/video0"))
+    result = end(survey, note, "survey over USB serial")
+    assert result.frames_in >= 30 and result.keyframes_out >= 15
+
+
+def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
+    survey = begin(crawl)
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(12), "12 frames")
+    survey.board.usb.unplug()
+    survey.wait_until(lambda s: not s["link"]["up"], "the link down")
+    survey.board.wait(world)
+    assert survey.board.status()["spool"]["objects"] > 2
+    survey.board.usb.plug()
+    recovery = survey.wait_until(lambda s: s["link"]["up"], "the link up again")
+    end(survey, note, "serial adapter unplugged", recovery)
+
+
+def test_a_killed_daemon_goes_on_with_its_survey(crawl, note):
+    survey = begin(crawl)
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(20), "20 frames")
+    survey.board.run(f"kill -9 {survey.daemon}")
+    killed = time.monotonic()
+    survey.start_daemon()
+    survey.wait_for("goes on", 30)
+    survey.wait_until(frames(3), "frames again")
+    recovery = time.monotonic() - killed
+    survey.board.wait(world)
+    end(survey, note, "daemon killed", recovery)
+    assert len(survey.indices()) == 2
+
+
+def test_a_power_cut_loses_nothing_that_was_acknowledged(crawl, note):
+    survey = begin(crawl)
+    survey.show(0, 25, RATE, "/dev/video0")
+    survey.wait_until(lambda s: s.get("spool", {}).get("acknowledged", 0) >= 4, "acknowledged keyframes")
+    survey.board.power_cut()
+    start = time.monotonic()
+    survey.board.power_on()
+    survey.board.run(LOOPBACK)
+    survey.start_daemon()
+    survey.wait_for("goes on")
+    world = survey.show(25, 20, RATE, "/dev/video0")
+    survey.wait_until(frames(1), "frames again")
+    recovery = time.monotonic() - start
+    survey.board.wait(world)
+    end(survey, note, "power cut", recovery)
+    assert len(survey.indices()) == 2
+
+
+def test_a_network_that_goes_away_and_a_host_that_is_killed_lose_nothing(crawl, note):
+    survey = crawl(**SIZE, link__transport="tcp")
+    survey.board.run(LOOPBACK)
+    survey.start_daemon()
+    survey.wait_for("begins")
+    # The daemon listens on loopback only: what an SSH tunnel is on a real crawler.
+    forward = "exec nc -ll -p 7448 -e nc 127.0.0.1 7447"
+    tunnel = survey.board.spawn(forward, "tunnel0.log")
+    survey.start_receiver(f"tcp://127.0.0.1:{survey.board.port}")
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(12), "12 frames")
+    survey.board.run(f"kill {tunnel}; killall nc", check=False)
+    survey.wait_until(lambda s: not s["link"]["up"], "the link down")
+    survey.board.spawn(forward, "tunnel1.log")
+    recovery = survey.wait_until(lambda s: s["link"]["up"], "the link up again")
+    survey.kill_receiver()
+    survey.board.wait(world)
+    survey.start_receiver(f"tcp://127.0.0.1:{survey.board.port}")
+    end(survey, note, "network lost, host killed", recovery)
+
+
+GPIO = {
+    "gpio__lamp": "LAMP",
+    "gpio__led": "LED",
+    "gpio__stop": "!ESTOP",
+    "gpio__limit_front": "FRONT",
+    "gpio__encoder": "auto",
+    "gpio__encoder_a": "ENC_A",
+    "gpio__encoder_b": "ENC_B",
+    "encoder__metres_per_count": "0.002",
+    "keyframe__step_mm": "5",
+}
+LINES = ("ENC_A", "ENC_B", "LAMP", "ESTOP", "FRONT", "LED")
+
+
+def make_lines(board) -> str:
+    """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed
+    switch to ground with the board's pull-up: open, or its wire broken, means stop."""
+    chip = "/sys/kernel/config/gpio-sim/crawler"
+    board.run("modprobe gpio-sim")
+    names = "; ".join(f"mkdir {chip}/b/line{i}; echo {name} > {chip}/b/line{i}/name" for i, name in enumerate(LINES))
+    board.run(f"mkdir {chip}; mkdir {chip}/b; echo {len(LINES)} > {chip}/b/num_lines; {names}; echo 1 > {chip}/live")
+    name = board.run(f"echo $(cat {chip}/dev_name)/$(cat {chip}/b/chip_name)").strip()
+    world = f"/sys/devices/platform/{name}"
+    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('ESTOP')}/pull")
+    return world
+
+
+def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
+    survey = crawl(**{**SERIAL, **SIZE, **GPIO})
+    board = survey.board
+    board.run(LOOPBACK)
+    world = make_lines(board)
+
+    def level(name: str) -> str:
+        return board.run(f"cat {world}/sim_gpio{LINES.index(name)}/value").strip()
+
+    def pull(name: str, way: str) -> None:
+        board.run(f"echo pull-{way} > {world}/sim_gpio{LINES.index(name)}/pull")
+
+    # A quarter of the wheel's edges: gpio-sim under emulation merges edges that are less than some milliseconds apart.
+    counts = [count // 4 for count in survey.recording.counts]
+    (board.share / "quarter.txt").write_text("".join(f"{count}\n" for count in counts))
+    survey.start_receiver(usb(survey))
+    survey.start_daemon()
+    survey.wait_for("begins")
+    assert level("LAMP") == "1"
+    encoder = f"--encoder {world}/sim_gpio0/pull {world}/sim_gpio1/pull /mnt/quarter.txt"
+    process = survey.show(0, 45, RATE, "/dev/video0", encoder=encoder)
+    survey.wait_until(frames(25), "25 frames")
+    pull("FRONT", "up")
+    survey.wait_for("front limit switch pressed")
+    pull("ESTOP", "down")
+    start = time.monotonic()
+    while level("LAMP") != "0":
+        assert time.monotonic() - start < 5
+    recovery = time.monotonic() - start
+    pull("ESTOP", "up")
+    board.wait(process)
+    status = survey.board.status()
+    assert status["gpio"]["stop"] and status["gpio"]["limit_front"], "latched, though the button is released"
+    assert level("LAMP") == "0"
+    assert status["gpio"]["encoder"] == "lines"
+    assert (status["gpio"]["missed"], status["gpio"]["illegal"]) == (0, 0)
+    # The lines are let go when the daemon has ended; its count is what the wheel was turned by.
+    result = end(survey, note, "encoder, lamp, stop by GPIO", recovery)
+    received = survey.received
+    turned = dict(zip(survey.recording.order, counts, strict=True))
+    read = [(k.encoder_count, turned[k.message.frame_sha256.hex()]) for k in received.keyframes]
+    assert all(got == made for got, made in read), read
+    assert read[-1][0] > 100
+    assert received.keyframes[-1].telemetry["emergency_stop"]
+    assert "emergency_stop" not in received.keyframes[0].telemetry
+    assert received.keyframes[0].telemetry["lamp"] == 1 and received.keyframes[-1].telemetry["lamp"] == 0
+    assert result.keyframes_out > 10

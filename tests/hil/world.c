@@ -1,0 +1,232 @@
+/* The world of the emulated board: shows recorded frames to a V4L2 camera and turns its wheel encoder with them.
+ *
+ *   pipefish-world FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT [--encoder PULL_A PULL_B COUNTS.txt]
+ *
+ * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
+ * capturing side's differ). FORMAT: GREY, YUYV, NV12 or Y10. COUNTS.txt has the encoder's count at each frame, one a
+ * line; PULL_A and PULL_B are gpio-sim's files. Frame i is shown when the encoder has reached its count.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <linux/videodev2.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/mman.h>
+#include <time.h>
+#include <unistd.h>
+
+#define BUFFERS     4u
+#define LEAST_GAP_S 0.004 /* between two edges: gpio-sim merges what comes faster than its threads */
+
+typedef struct world {
+    FILE *y4m;
+    uint32_t width, height, fourcc, stride;
+    size_t size, at; /* of a shown frame; of the first frame in the file */
+    uint8_t *grey;
+    int fd;
+    bool is_streaming, has_buffers;
+    uint8_t *buffer[BUFFERS];
+    uint32_t filled;
+    /* encoder */
+    int pull[2];
+    int64_t *counts, count;
+    uint32_t n_counts;
+} world;
+
+static _Noreturn void fail(const char *what)
+{
+    (void)fprintf(stderr, "pipefish-world: %s: %s\n", what, strerror(errno));
+    exit(1);
+}
+
+static void sleep_until(double due)
+{
+    struct timespec t = {(time_t)due, (long)((due - (double)(time_t)due) * 1e9)};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR)
+        ;
+}
+
+static double now(void)
+{
+    struct timespec t;
+    (void)clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + (double)t.tv_nsec * 1e-9;
+}
+
+static void open_y4m(world *w, const char *path)
+{
+    char line[256];
+    w->y4m = fopen(path, "rb");
+    if (w->y4m == NULL || fgets(line, sizeof line, w->y4m) == NULL ||
+        sscanf(line, "YUV4MPEG2 W%u H%u", &w->width, &w->height) != 2)
+        fail(path);
+    w->at = (size_t)ftell(w->y4m);
+    w->grey = malloc((size_t)w->width * w->height);
+}
+
+static void read_frame(world *w, uint32_t i)
+{
+    const size_t n = (size_t)w->width * w->height;
+    if (fseek(w->y4m, (long)(w->at + i * (n + 6) + 6), SEEK_SET) != 0 || fread(w->grey, 1, n, w->y4m) != n)
+        fail("the frame is not in the recording");
+}
+
+static void fill(const world *w, uint8_t *to)
+{
+    memset(to, 128, w->size);
+    for (uint32_t y = 0; y < w->height; y++) {
+        const uint8_t *from = w->grey + (size_t)y * w->width;
+        uint8_t *row = to + (size_t)y * w->stride;
+        for (uint32_t x = 0; x < w->width; x++) {
+            if (w->fourcc == V4L2_PIX_FMT_YUYV) {
+                row[2 * x] = from[x];
+            } else if (w->fourcc == V4L2_PIX_FMT_Y10) { /* the low two bits are what a tracker of bytes must not see */
+                row[2 * x] = (uint8_t)(from[x] << 2 | (x & 3));
+                row[2 * x + 1] = from[x] >> 6;
+            } else {
+                row[x] = from[x];
+            }
+        }
+    }
+}
+
+static void open_video(world *w, const char *device, const char *format)
+{
+    struct v4l2_format f = {.type = V4L2_BUF_TYPE_VIDEO_OUTPUT};
+    w->fourcc = v4l2_fourcc(format[0], format[1], format[2], format[3] ? format[3] : ' ');
+    w->fd = open(device, O_RDWR);
+    if (w->fd < 0 || ioctl(w->fd, VIDIOC_G_FMT, &f) != 0)
+        fail(device);
+    f.fmt.pix.width = w->width;
+    f.fmt.pix.height = w->height;
+    f.fmt.pix.pixelformat = w->fourcc;
+    f.fmt.pix.field = V4L2_FIELD_NONE;
+    f.fmt.pix.bytesperline = f.fmt.pix.sizeimage = 0;
+    if (ioctl(w->fd, VIDIOC_S_FMT, &f) != 0 || f.fmt.pix.width != w->width || f.fmt.pix.pixelformat != w->fourcc) {
+        errno = EINVAL;
+        fail("the format cannot be set");
+    }
+    w->stride = f.fmt.pix.bytesperline;
+    w->size = f.fmt.pix.sizeimage;
+    struct v4l2_capability cap;
+    if (ioctl(w->fd, VIDIOC_QUERYCAP, &cap) != 0)
+        fail("QUERYCAP");
+    w->has_buffers = strcmp((const char *)cap.driver, "vivid") == 0;
+    if (!w->has_buffers) {
+        w->buffer[0] = malloc(w->size);
+        return;
+    }
+    struct v4l2_requestbuffers r = {.count = BUFFERS, .type = f.type, .memory = V4L2_MEMORY_MMAP};
+    if (ioctl(w->fd, VIDIOC_REQBUFS, &r) != 0 || r.count < BUFFERS)
+        fail("REQBUFS");
+    for (uint32_t i = 0; i < BUFFERS; i++) {
+        struct v4l2_buffer b = {.index = i, .type = f.type, .memory = V4L2_MEMORY_MMAP};
+        if (ioctl(w->fd, VIDIOC_QUERYBUF, &b) != 0)
+            fail("QUERYBUF");
+        w->buffer[i] = mmap(NULL, b.length, PROT_READ | PROT_WRITE, MAP_SHARED, w->fd, b.m.offset);
+        if (w->buffer[i] == MAP_FAILED)
+            fail("mmap");
+    }
+}
+
+static void show(world *w)
+{
+    int type = V4L2_BUF_TYPE_VIDEO_OUTPUT;
+    struct v4l2_buffer b = {.index = w->filled, .type = (uint32_t)type, .memory = V4L2_MEMORY_MMAP};
+    if (!w->has_buffers) {
+        fill(w, w->buffer[0]);
+        if (write(w->fd, w->buffer[0], w->size) != (ssize_t)w->size)
+            fail("write");
+        return;
+    }
+    if (w->filled == BUFFERS && ioctl(w->fd, VIDIOC_DQBUF, &b) != 0)
+        fail("DQBUF");
+    fill(w, w->buffer[b.index]);
+    b.bytesused = (uint32_t)w->size;
+    b.field = V4L2_FIELD_NONE;
+    if (ioctl(w->fd, VIDIOC_QBUF, &b) != 0)
+        fail("QBUF");
+    w->filled += w->filled < BUFFERS;
+    if (!w->is_streaming && ioctl(w->fd, VIDIOC_STREAMON, &type) != 0)
+        fail("STREAMON");
+    w->is_streaming = true;
+}
+
+static void open_encoder(world *w, char **argument)
+{
+    FILE *in = fopen(argument[3], "r");
+    long long count;
+    for (int i = 0; i < 2; i++) {
+        w->pull[i] = open(argument[1 + i], O_WRONLY);
+        if (w->pull[i] < 0)
+            fail(argument[1 + i]);
+    }
+    if (in == NULL)
+        fail(argument[3]);
+    w->counts = calloc(100000, sizeof *w->counts);
+    while (w->n_counts < 100000 && fscanf(in, "%lld", &count) == 1)
+        w->counts[w->n_counts++] = count;
+    (void)fclose(in);
+}
+
+/* One quarter of a period: A leads B when the wheel turns forwards. */
+static void turn(world *w, int way)
+{
+    static const uint8_t phase[4] = {0, 1, 3, 2}; /* bit 0: A, bit 1: B */
+    const uint8_t before = phase[w->count & 3];
+    w->count += way;
+    const uint8_t after = phase[w->count & 3];
+    for (int i = 0; i < 2; i++) {
+        if (((before ^ after) >> i & 1) == 0)
+            continue;
+        const char *pull = after >> i & 1 ? "pull-up" : "pull-down";
+        if (pwrite(w->pull[i], pull, strlen(pull), 0) < 0)
+            fail("pull");
+    }
+}
+
+/* Turns the wheel from where it is to frame i's count, evenly over `seconds`. */
+static void drive(world *w, uint32_t i, double begin, double seconds)
+{
+    if (i >= w->n_counts)
+        return;
+    const int64_t way = w->counts[i] - w->count, steps = way < 0 ? -way : way;
+    for (int64_t k = 0; k < steps; k++) {
+        sleep_until(begin + seconds * (double)k / (double)steps);
+        turn(w, way < 0 ? -1 : 1);
+        sleep_until(now() + LEAST_GAP_S); /* also when it is late */
+    }
+}
+
+int main(int argc, char **argv)
+{
+    world w = {.fd = -1};
+    if (argc < 7) {
+        (void)fprintf(stderr, "usage: pipefish-world Y4M DEVICE FORMAT RATE FIRST COUNT [--encoder A B COUNTS]\n");
+        return 2;
+    }
+    open_y4m(&w, argv[1]);
+    open_video(&w, argv[2], argv[3]);
+    const double period = 1 / atof(argv[4]);
+    const uint32_t first = (uint32_t)atoi(argv[5]), count = (uint32_t)atoi(argv[6]);
+    if (argc == 11)
+        open_encoder(&w, argv + 7);
+    if (w.n_counts > first) /* the wheel stands where the survey begins */
+        w.count = first > 0 ? w.counts[first - 1] : w.counts[0];
+    const double begin =
+        now() + 1; /* the camera has a picture from now on; whoever waits for it gets the first frame */
+    for (uint32_t i = 0; i < count; i++) {
+        const double due = begin + i * period;
+        read_frame(&w, first + i);
+        drive(&w, first + i, due - 0.8 * period, 0.6 * period);
+        sleep_until(due);
+        show(&w);
+    }
+    sleep_until(begin + count * period + 0.2);
+    (void)printf("shown %u frames in %.2f s\n", count, now() - begin);
+    return 0;
+}

@@ -1,0 +1,534 @@
+/* The V4L2 driver against a kernel made up here, which fails on demand. Proves: frames are used where the kernel put
+ * them and stay whole while they are held; a stalled, damaged or unplugged camera comes back by itself; any single
+ * system call may fail without frames, buffers or memory getting lost. Does not prove: that a real kernel behaves so
+ * (tests/hil). */
+#include "camera_v4l2/v4l2.h"
+#include "unity.h"
+
+#include <errno.h>
+#include <string.h>
+
+#define MS UINT64_C(1000000)
+
+enum { W = 64, H = 48, STRIDE = 80, SLOTS = 8, FORMATS = 4, BYTES = 2 * STRIDE * H, MAPS = 64 };
+
+typedef struct fake_format {
+    uint32_t fourcc, rate; /* rate 0 = it does not tell */
+} fake_format;
+
+/* One camera at /dev/video0. */
+static struct {
+    uint64_t now, next_frame, period;
+    bool is_plugged, is_open, is_streaming, is_silent, restart_helps, has_error;
+    fake_format formats[FORMATS];
+    uint32_t n_formats, width, height, fourcc, sequence, n_buffers, restarts;
+    bool is_queued[SLOTS], is_done[SLOTS];
+    uint32_t done[SLOTS], n_done, flags[SLOTS], numbers[SLOTS], damaged_next;
+    uint64_t stamps[SLOTS];
+    uint8_t memory[MAPS][BYTES]; /* a fresh one for each mapping: what is unmapped is never seen again */
+    bool is_mapped[MAPS];
+    uint32_t n_maps, base;
+    int calls, fail_at, fail_with; /* the call number that fails; 0 = none */
+} k;
+
+static bool fails(void)
+{
+    if (++k.calls != k.fail_at)
+        return false;
+    errno = k.fail_with;
+    return true;
+}
+
+static int fake_open(void *self, const char *path)
+{
+    (void)self;
+    TEST_ASSERT_EQUAL_STRING("/dev/video0", path);
+    if (fails())
+        return -1;
+    errno = ENOENT;
+    if (!k.is_plugged)
+        return -1;
+    TEST_ASSERT_FALSE_MESSAGE(k.is_open, "opened twice");
+    k.is_open = true;
+    return 5;
+}
+
+static void stop(void)
+{
+    k.is_streaming = false;
+    k.n_done = 0;
+    memset(k.is_queued, 0, sizeof k.is_queued);
+}
+
+static void fake_close(void *self, int fd)
+{
+    (void)self;
+    TEST_ASSERT_EQUAL_INT(5, fd);
+    k.is_open = false;
+    stop();
+}
+
+static int set_format(struct v4l2_format *f)
+{
+    struct v4l2_pix_format *p = &f->fmt.pix;
+    bool has = false;
+    for (uint32_t i = 0; i < k.n_formats; i++)
+        has = has || k.formats[i].fourcc == p->pixelformat;
+    p->width = k.width;
+    p->height = k.height;
+    p->pixelformat = has ? p->pixelformat : k.formats[0].fourcc;
+    p->field = V4L2_FIELD_NONE;
+    p->bytesperline = STRIDE * (p->pixelformat == V4L2_PIX_FMT_YUYV ? 2 : 1);
+    p->sizeimage = BYTES;
+    return 0;
+}
+
+static int buffer_call(unsigned long request, struct v4l2_buffer *b)
+{
+    if (request == VIDIOC_QUERYBUF) {
+        b->length = BYTES;
+        b->m.offset = b->index;
+    } else if (request == VIDIOC_QBUF) {
+        TEST_ASSERT_FALSE_MESSAGE(k.is_queued[b->index], "queued twice");
+        k.is_queued[b->index] = true;
+    } else {
+        errno = k.has_error ? EIO : EAGAIN;
+        if (k.has_error || k.n_done == 0)
+            return -1;
+        b->index = k.done[0];
+        memmove(k.done, k.done + 1, --k.n_done * sizeof k.done[0]);
+        k.is_queued[b->index] = false;
+        b->bytesused = BYTES;
+        b->sequence = k.numbers[b->index];
+        b->flags = k.flags[b->index] | V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
+        b->timestamp.tv_sec = (long)(k.stamps[b->index] / 1000000000u);
+        b->timestamp.tv_usec = (long)(k.stamps[b->index] % 1000000000u / 1000);
+    }
+    return 0;
+}
+
+static int enumerate(unsigned long request, void *argument)
+{
+    errno = EINVAL;
+    if (request == VIDIOC_ENUM_FMT) {
+        struct v4l2_fmtdesc *d = argument;
+        if (d->index >= k.n_formats)
+            return -1;
+        d->pixelformat = k.formats[d->index].fourcc;
+        return 0;
+    }
+    struct v4l2_frmivalenum *e = argument;
+    for (uint32_t i = 0; i < k.n_formats; i++) {
+        if (k.formats[i].fourcc == e->pixel_format && k.formats[i].rate != 0 && e->index == 0) {
+            e->type = V4L2_FRMIVAL_TYPE_DISCRETE;
+            e->discrete = (struct v4l2_fract){1, k.formats[i].rate};
+            return 0;
+        }
+    }
+    return -1;
+}
+
+static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
+{
+    (void)self;
+    TEST_ASSERT_TRUE(k.is_open && fd == 5);
+    errno = ENODEV;
+    if (!k.is_plugged || fails())
+        return -1;
+    switch (request) {
+    case VIDIOC_QUERYCAP:
+        ((struct v4l2_capability *)argument)->capabilities = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING;
+        return 0;
+    case VIDIOC_ENUM_FMT:
+    case VIDIOC_ENUM_FRAMEINTERVALS:
+        return enumerate(request, argument);
+    case VIDIOC_S_FMT:
+        k.fourcc = ((struct v4l2_format *)argument)->fmt.pix.pixelformat;
+        return set_format(argument);
+    case VIDIOC_G_FMT:
+    case VIDIOC_TRY_FMT:
+        return set_format(argument);
+    case VIDIOC_G_PARM:
+    case VIDIOC_S_PARM:
+        ((struct v4l2_streamparm *)argument)->parm.capture.timeperframe =
+            (struct v4l2_fract){(uint32_t)(k.period / MS), 1000};
+        return 0;
+    case VIDIOC_REQBUFS:
+        k.n_buffers = 6;
+        ((struct v4l2_requestbuffers *)argument)->count = k.n_buffers;
+        k.base = k.n_maps;
+        return 0;
+    case VIDIOC_QUERYBUF:
+    case VIDIOC_QBUF:
+    case VIDIOC_DQBUF:
+        return buffer_call(request, argument);
+    case VIDIOC_STREAMON:
+        k.is_streaming = true;
+        k.has_error = false;
+        k.sequence = 0;
+        k.next_frame = k.now + k.period;
+        return 0;
+    case VIDIOC_STREAMOFF:
+        k.restarts++;
+        k.is_silent = k.is_silent && !k.restart_helps;
+        stop();
+        return 0;
+    default: /* controls: it has none */
+        errno = EINVAL;
+        return -1;
+    }
+}
+
+static void *fake_map(void *self, int fd, size_t n, int64_t offset)
+{
+    (void)self;
+    TEST_ASSERT_TRUE(k.is_open && fd == 5 && n == BYTES && k.n_maps < MAPS && offset < SLOTS);
+    if (fails())
+        return NULL;
+    k.is_mapped[k.n_maps] = true;
+    return k.memory[k.n_maps++];
+}
+
+static void fake_unmap(void *self, void *memory, size_t n)
+{
+    (void)self;
+    const size_t i = (size_t)((uint8_t *)memory - k.memory[0]) / BYTES;
+    TEST_ASSERT_TRUE(n == BYTES && i < MAPS && k.is_mapped[i]);
+    k.is_mapped[i] = false;
+    memset(memory, 0xDD, n);
+}
+
+/* Fills the queued buffers whose time has come. */
+static void run_camera(uint64_t until)
+{
+    while (k.is_streaming && k.is_plugged && !k.is_silent && k.next_frame <= until) {
+        for (uint32_t i = 0; i < k.n_buffers; i++) {
+            bool is_done = false;
+            for (uint32_t j = 0; j < k.n_done; j++)
+                is_done = is_done || k.done[j] == i;
+            if (!k.is_queued[i] || is_done)
+                continue;
+            memset(k.memory[k.base + i], (int)(k.sequence & 0xFF), BYTES);
+            k.numbers[i] = k.sequence;
+            k.stamps[i] = k.next_frame;
+            k.flags[i] = k.damaged_next > 0 ? V4L2_BUF_FLAG_ERROR : 0;
+            k.damaged_next -= k.damaged_next > 0;
+            k.done[k.n_done++] = i;
+            break;
+        }
+        k.sequence++;
+        k.next_frame += k.period;
+    }
+}
+
+static int fake_wait(void *self, int fd, uint32_t timeout_ms)
+{
+    (void)self;
+    TEST_ASSERT_TRUE(k.is_open && fd == 5);
+    if (!k.is_plugged || k.has_error) {
+        k.now += MS;
+        return -1;
+    }
+    uint64_t until = k.now + timeout_ms * MS;
+    if (k.n_done == 0)
+        k.now = k.is_streaming && !k.is_silent && k.next_frame < until && k.next_frame > k.now ? k.next_frame : until;
+    run_camera(k.now);
+    return k.n_done > 0;
+}
+
+static uint64_t fake_now(void *self)
+{
+    (void)self;
+    run_camera(k.now);
+    return k.now;
+}
+
+static void fake_sleep(void *self, uint32_t ms)
+{
+    (void)self;
+    k.now += ms * MS;
+}
+
+static const pf_v4l2_io io = {.open = fake_open,
+                              .close = fake_close,
+                              .ioctl = fake_ioctl,
+                              .map = fake_map,
+                              .unmap = fake_unmap,
+                              .wait = fake_wait,
+                              .now = fake_now,
+                              .sleep = fake_sleep};
+
+static pf_camera_source camera;
+static char error[512];
+
+void setUp(void)
+{
+    memset(&k, 0, sizeof k);
+    k.now = 1000 * MS;
+    k.period = 100 * MS;
+    k.is_plugged = true;
+    k.formats[0] = (fake_format){V4L2_PIX_FMT_YUYV, 0};
+    k.formats[1] = (fake_format){V4L2_PIX_FMT_GREY, 0};
+    k.n_formats = 2;
+    k.width = W;
+    k.height = H;
+    camera.self = NULL;
+}
+
+static void close_camera(void)
+{
+    if (camera.self == NULL)
+        return;
+    (void)camera.ops->stop(camera.self);
+    camera.ops->close(camera.self);
+    camera.self = NULL;
+    TEST_ASSERT_FALSE_MESSAGE(k.is_open, "left open");
+    for (uint32_t i = 0; i < MAPS; i++)
+        TEST_ASSERT_FALSE_MESSAGE(k.is_mapped[i], "left mapped");
+}
+
+void tearDown(void)
+{
+    close_camera();
+}
+
+static pf_status open_with(uint32_t width, uint32_t height, const char *format, double rate)
+{
+    pf_v4l2_config config = {
+        .device = "/dev/video0", .width = width, .height = height, .format = format, .frame_rate = rate};
+    return pf_v4l2_open_with(&camera, &config, &io, error, sizeof error);
+}
+
+static void start(void)
+{
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, open_with(W, H, "", 0), error);
+    TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->start(camera.self));
+}
+
+/* The next frame within `most_ms`, whatever happens on the way. */
+static pf_frame next_within(uint32_t most_ms)
+{
+    pf_frame frame;
+    const uint64_t end = k.now + most_ms * MS;
+    pf_status status;
+    do
+        status = camera.ops->next(camera.self, 100, &frame);
+    while (status != PF_OK && k.now < end && (status == PF_ERR_AGAIN || status == PF_ERR_CLOSED));
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, status, camera.ops->error(camera.self));
+    return frame;
+}
+
+static void check_whole(const pf_frame *frame, uint8_t value)
+{
+    for (uint32_t y = 0; y < H; y++)
+        for (uint32_t x = 0; x < W; x++)
+            TEST_ASSERT_EQUAL_UINT8(value, frame->image.data[y * frame->image.stride + x]);
+}
+
+static void release(pf_frame *frame)
+{
+    camera.ops->release(camera.self, frame);
+}
+
+static void test_grey_frames_are_used_where_they_lie_and_stay_whole_while_held(void)
+{
+    pf_frame held[3], another;
+    start();
+    for (int i = 0; i < 3; i++)
+        held[i] = next_within(300);
+    TEST_ASSERT_TRUE(held[0].image.data >= k.memory[0] && held[0].image.data < k.memory[MAPS - 1]);
+    TEST_ASSERT_EQUAL_UINT32(STRIDE, held[0].image.stride);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, camera.ops->next(camera.self, 100, &another));
+    k.now += 2000 * MS; /* the camera goes on into the buffers that are left */
+    for (int i = 0; i < 3; i++)
+        check_whole(&held[i], (uint8_t)i);
+    for (int i = 0; i < 3; i++)
+        release(&held[i]);
+    for (int i = 0; i < 20; i++) {
+        another = next_within(300);
+        check_whole(&another, (uint8_t)another.sequence);
+        release(&another);
+    }
+    TEST_ASSERT_TRUE(another.sequence > 20); /* what found no room is a gap */
+}
+
+static void test_the_best_format_that_is_fast_enough_is_chosen(void)
+{
+    TEST_ASSERT_EQUAL_INT(PF_OK, open_with(0, 0, "", 0));
+    TEST_ASSERT_EQUAL_UINT32(V4L2_PIX_FMT_GREY, k.fourcc);
+    TEST_ASSERT_EQUAL_UINT32(W, camera.ops->info(camera.self)->width);
+    close_camera();
+    TEST_ASSERT_EQUAL_INT(PF_OK, open_with(W, H, "YUYV", 0));
+    TEST_ASSERT_EQUAL_UINT32(V4L2_PIX_FMT_YUYV, k.fourcc);
+    close_camera();
+    k.formats[1].rate = 10;
+    k.formats[2] = (fake_format){V4L2_PIX_FMT_MJPEG, 30};
+    k.n_formats = 3;
+    k.formats[0].rate = 5;
+    TEST_ASSERT_EQUAL_INT(PF_OK, open_with(W, H, "", 30));
+    TEST_ASSERT_EQUAL_UINT32(V4L2_PIX_FMT_MJPEG, k.fourcc);
+    close_camera();
+    TEST_ASSERT_EQUAL_INT(PF_OK, open_with(W, H, "", 60)); /* none is: the best */
+    TEST_ASSERT_EQUAL_UINT32(V4L2_PIX_FMT_GREY, k.fourcc);
+}
+
+static void test_what_the_camera_cannot_do_is_said_with_what_it_can(void)
+{
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, open_with(W + 2, H, "", 0));
+    TEST_ASSERT_NOT_NULL(strstr(error, "66 x 48"));
+    TEST_ASSERT_NOT_NULL(strstr(error, "YUYV GREY"));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, open_with(W, H, "NV12", 0));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, H, "RGB3", 0));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, 0, "", 0));
+    k.is_plugged = false;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, open_with(0, 0, "", 0)); /* nobody knows what to wait for */
+}
+
+static void test_a_camera_that_is_not_there_yet_is_waited_for(void)
+{
+    pf_frame frame;
+    k.is_plugged = false;
+    start();
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 500, &frame));
+    k.is_plugged = true;
+    k.n_formats = 0; /* there, but without a picture: a receiver without a signal */
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 500, &frame));
+    k.n_formats = 2;
+    frame = next_within(1000);
+    release(&frame);
+}
+
+static void test_a_stall_is_over_within_two_seconds_by_stop_and_start(void)
+{
+    pf_camera_stats stats;
+    start();
+    pf_frame frame = next_within(300);
+    release(&frame);
+    const uint64_t last = k.now, number = frame.sequence;
+    k.is_silent = k.restart_helps = true;
+    frame = next_within(2000);
+    TEST_ASSERT_TRUE(k.now - last < 2000 * MS);
+    TEST_ASSERT_EQUAL_UINT32(1, k.restarts);
+    TEST_ASSERT_UINT64_WITHIN(1, number + (k.now - last) / k.period, frame.sequence);
+    release(&frame);
+    camera.ops->stats(camera.self, &stats);
+    TEST_ASSERT_TRUE(stats.is_there && stats.restarts == 1 && stats.reopens == 0);
+}
+
+static void test_a_failed_queue_is_restarted_at_once(void)
+{
+    start();
+    pf_frame frame = next_within(300);
+    release(&frame);
+    const uint64_t before = k.now;
+    k.has_error = true;
+    frame = next_within(500);
+    TEST_ASSERT_TRUE(k.now - before < 300 * MS);
+    release(&frame);
+}
+
+static void test_held_frames_outlive_an_unplugged_camera(void)
+{
+    pf_frame held[2], frame;
+    start();
+    held[0] = next_within(300);
+    held[1] = next_within(300);
+    for (int round = 0; round < 6; round++) {
+        k.is_plugged = false;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 600, &frame));
+        TEST_ASSERT_FALSE(k.is_open);
+        check_whole(&held[0], 0);
+        check_whole(&held[1], 1);
+        k.is_plugged = true;
+        frame = next_within(1000);
+        TEST_ASSERT_TRUE(frame.sequence > held[1].sequence + 6u * (unsigned)round);
+        TEST_ASSERT_TRUE(frame.time_ns > held[1].time_ns);
+        release(&frame);
+    }
+    release(&held[0]);
+    release(&held[1]);
+}
+
+static void test_another_camera_under_the_same_name_is_not_taken(void)
+{
+    pf_frame frame;
+    start();
+    frame = next_within(300);
+    release(&frame);
+    k.is_plugged = false;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 600, &frame));
+    k.is_plugged = true;
+    k.width = W * 2;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 2000, &frame));
+    TEST_ASSERT_NOT_NULL(strstr(camera.ops->error(camera.self), "cannot make frames of 64 x 48"));
+    k.width = W;
+    frame = next_within(1000);
+    release(&frame);
+}
+
+static void test_damaged_frames_are_left_out_with_a_gap(void)
+{
+    pf_camera_stats stats;
+    start();
+    pf_frame frame = next_within(300);
+    const uint64_t number = frame.sequence;
+    release(&frame);
+    k.damaged_next = 2;
+    frame = next_within(1000);
+    TEST_ASSERT_EQUAL_UINT64(number + 3, frame.sequence);
+    release(&frame);
+    camera.ops->stats(camera.self, &stats);
+    TEST_ASSERT_EQUAL_UINT64(2, stats.damaged);
+    TEST_ASSERT_EQUAL_UINT64(0, stats.restarts);
+}
+
+/* Every system call from the start of capture on fails once, with each of the errors that drivers give. */
+static void test_any_single_call_may_fail_and_frames_still_come(void)
+{
+    static const int errors[] = {EIO, EINVAL, EBUSY, ENOMEM, ENODEV, EPIPE};
+    for (size_t e = 0; e < sizeof errors / sizeof errors[0]; e++) {
+        for (int at = 1; at < 90; at++) {
+            pf_frame held = {0}, frame;
+            setUp();
+            start();
+            k.calls = 0;
+            k.fail_at = at;
+            k.fail_with = errors[e];
+            for (int i = 0; i < 6; i++) {
+                frame = next_within(4000);
+                check_whole(&frame, frame.image.data[0]);
+                if (held.handle != NULL)
+                    release(&held);
+                held = frame;
+            }
+            TEST_ASSERT_TRUE(k.n_maps <= 18);
+            release(&held);
+            k.fail_at = 0;
+            for (int i = 0; i < 3; i++) { /* all buffers are with the camera again */
+                frame = next_within(1000);
+                release(&frame);
+            }
+            uint32_t queued = 0;
+            for (uint32_t i = 0; i < k.n_buffers; i++)
+                queued += k.is_queued[i];
+            TEST_ASSERT_EQUAL_UINT32(6, queued);
+            close_camera();
+        }
+    }
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_grey_frames_are_used_where_they_lie_and_stay_whole_while_held);
+    RUN_TEST(test_the_best_format_that_is_fast_enough_is_chosen);
+    RUN_TEST(test_what_the_camera_cannot_do_is_said_with_what_it_can);
+    RUN_TEST(test_a_camera_that_is_not_there_yet_is_waited_for);
+    RUN_TEST(test_a_stall_is_over_within_two_seconds_by_stop_and_start);
+    RUN_TEST(test_a_failed_queue_is_restarted_at_once);
+    RUN_TEST(test_held_frames_outlive_an_unplugged_camera);
+    RUN_TEST(test_another_camera_under_the_same_name_is_not_taken);
+    RUN_TEST(test_damaged_frames_are_left_out_with_a_gap);
+    RUN_TEST(test_any_single_call_may_fail_and_frames_still_come);
+    return UNITY_END();
+}
