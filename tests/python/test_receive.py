@@ -313,8 +313,258 @@ def test_a_full_disk_names_the_file_and_keeps_what_was_acknowledged(tmp_path):
         acknowledged = set(device.acknowledged)
         assert done.returncode == 1 and done.stderr.count("\n") == 1
         assert json.loads(done.stdout)["error"]["message"] in done.stderr
-        stored = {r.sha256 for r in Survey.open(tmp_path / "a.mcap.partial").receipts}
-        keyframes = len(Survey.open(tmp_path / "a.mcap.partial").keyframes)
+        partial = Survey.open(tmp_path / "a.mcap.partial")
+        stored = {r.sha256 for r in partial.receipts}
+        said = re.search(
+            rf"{re.escape(str(path))}\.partial: File too large; (\d+) keyframes are safe in it", done.stderr
+        )
+        # What the write that failed was about may be there in whole or in part; it is not counted on.
+        assert said and 0 <= len(partial.keyframes) - int(said[1]) <= 1 and int(said[1]) > 3
+        assert acknowledged and acknowledged <= stored
+        summary = receive_from(device, path)
+        assert summary["recovered_objects"] == len(stored)
+    assert Survey.open(path).complete
+
+
+def test_what_is_stored_already_is_not_sent_again(tmp_path):
+    """The device has forgotten that everything but the end was acknowledged, as after a power cut of its own."""
+    path = tmp_path / "a.mcap"
+    objects = survey_objects(12)
+    with Device(objects[:-1], SURVEY) as device, pytest.raises(Interrupted):
+        receive_from(device, path, stop=lambda: not device.spool)
+    with Device(objects, SURVEY, nonce=8) as device:
+        summary = receive_from(device, path)
+    assert summary["link"]["objects"] == 1
+    assert len(Survey.open(path).receipts) == len(objects)
+
+
+def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path):
+    """kill -9 of the receiving process after so many acknowledgements, with more objects under way."""
+    path, partial = tmp_path / "a.mcap", tmp_path / "a.mcap.partial"
+    objects = survey_objects(60)
+    code = "import sys; from pipefish.cli import main; sys.exit(main(sys.argv[1:]))"
+    with Device(objects, SURVEY, cut_after=60_000) as device:
+        command = [sys.executable, "-c", code, "receive", device.address, "-o", str(path), "--json"]
+        for kill_at in (0, 1, 5, 13, 26, 41):
+            device.most = kill_at + 4  # no further: the kill hits a reception that is not over
+            connections = device.connections
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            deadline = time.monotonic() + 60
+            while len(device.acknowledged) < kill_at or device.connections == connections:
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.001)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            gone = set(device.acknowledged)
+            assert kill_at <= len(gone) <= kill_at + 4 and not path.exists()
+            stored = {r.sha256 for r in Survey.open(partial).receipts} if partial.exists() else set()
+            assert gone <= stored
+        device.most = len(objects)
+        receive_from(device, path)
+    names = [r.sha256 for r in Survey.open(path).receipts]
+    assert sorted(names) == sorted(n for n, _, _ in objects)
+
+
+def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):
+    path = tmp_path / "a.mcap"
+    with Device(survey_objects(5)[:-1], SURVEY) as device:  # the survey has not ended: receive would wait
+        command = [sys.executable, "-m", "pipefish", "receive", device.address, "-o", str(path)]
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # A shell's background job ignores SIGINT, and so would what it starts.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        while device.spool:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert process.returncode == 1 and out == ""
+    assert (
+        err == f"pipefish: interrupted: 5 keyframes are safe in {path}.partial; the same command goes on from there\n"
+    )
+    assert len(Survey.open(tmp_path / "a.mcap.partial").keyframes) == 5
+
+
+def test_a_restart_of_the_device_stays_in_one_survey(tmp_path):
+    second = dict(boot=BOOT + 1, first=3)
+    objects = [
+        start(),
+        *(keyframe(i) for i in range(3)),
+        start(boot=BOOT + 1),
+        *(keyframe(i, **second) for i in range(3, 6)),
+        end(6, boot=BOOT + 1),
+    ]
+    with Device(objects, SURVEY, boot=BOOT + 1) as device:
+        receive_from(device, tmp_path / "a.mcap")
+    survey = Survey.open(tmp_path / "a.mcap")
+    assert survey.complete and len(survey.starts) == 2 and len(survey.breaks) == 1
+
+
+def test_leftovers_of_an_earlier_survey_do_not_take_the_name(tmp_path):
+    old = bytes(15) + b"\x09"
+    with Device([*survey_objects(4, survey=old), *survey_objects(5)], SURVEY) as device:
+        summary = receive_from(device, tmp_path / "a.mcap")
+    assert Survey.open(tmp_path / "a.mcap").survey_id == SURVEY.hex()
+    assert Survey.open(tmp_path / "a-2.mcap").survey_id == old.hex()
+    assert summary["other_surveys"] == [{"file": str(tmp_path / "a-2.mcap"), "keyframes": 4}]
+
+
+def test_an_object_whose_bytes_do_not_match_is_asked_for_again(tmp_path, monkeypatch):
+    """The device's memory flips once; the second transfer is right."""
+    import hashlib
+
+    import pipefish.surveystore as surveystore
+
+    failed = []
+
+    class Once:
+        def __init__(self, data: bytes) -> None:
+            self._real = hashlib.sha256(data)
+
+        def digest(self) -> bytes:
+            if not failed:
+                failed.append(1)
+                return bytes(32)
+            return self._real.digest()
+
+    class Hashes:
+        sha256 = Once
+
+    monkeypatch.setattr(surveystore, "hashlib", Hashes)
+    with Device(survey_objects(3), SURVEY) as device:
+        summary = receive_from(device, tmp_path / "a.mcap")
+    assert summary["link"]["damaged_objects"] == 1
+    assert Survey.open(tmp_path / "a.mcap").complete
+
+
+def test_an_object_of_unknown_kind_stops_reception_and_stays_on_the_device(tmp_path):
+    """A refusal would make the device delete it."""
+    strange = (name_of(b"raw frame"), 5, b"raw frame")
+    with Device([*survey_objects(2), strange], SURVEY) as device:
+        with pytest.raises(PipefishError, match=r"kind 5.*stays on the device, update pipefish"):
+            receive_from(device, tmp_path / "a.mcap")
+        assert not device.refused and strange[0] in device.spool
+
+
+def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
+    for device, why in (("tcp://127.0.0.1:1", "Connection refused"), (str(tmp_path / "ttyUSB9"), "No such file")):
+        for quiet in (False, True):
+            with pytest.raises(Interrupted, match=rf"no device answers .*{why}.*nothing has arrived"):
+                receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0.3, quiet=quiet)
+            captured = capsys.readouterr()
+            assert captured.out == "" and bool(re.search(f"{why}.*waiting for it", captured.err)) != quiet
+
+
+def test_a_line_that_we_may_not_open_fails_at_once(tmp_path, monkeypatch):
+    import serial
+
+    def wait_for(device: str, why: str) -> None:
+        with pytest.raises(TransportClosed, match=why):
+            receive(open_transport(device), tmp_path / "a.mcap", timeout_s=0, quiet=True)
+
+    wait_for("/dev/null", "/dev/null: not a serial line")
+    wait_for(str(tmp_path), "Is a directory")
+
+    def denied(*_, **__):
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", denied)
+    wait_for("/dev/ttyUSB0", "ttyUSB0: Permission denied")
+
+
+def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
+    with Device(survey_objects(2), SURVEY) as device:
+        transport = open_transport(device.address)
+        real, calls = transport.open, []
+
+        def late() -> None:
+            calls.append(1)
+            if len(calls) < 3:
+                raise TransportClosed("not yet")
+            real()
+
+        transport.open = late
+        summary = receive(transport, tmp_path / "a.mcap", timeout_s=10, quiet=True)
+    assert len(calls) == 3 and summary["link"]["reconnections"] == 0
+
+
+def test_a_survey_whose_rest_is_in_another_file_ends_with_its_name(tmp_path):
+    objects = survey_objects(6)
+    with Device(objects[:4], SURVEY) as device, pytest.raises(Interrupted):
+        receive_from(device, tmp_path / "a.mcap", stop=lambda: not device.spool)
+    with Device(objects[4:], SURVEY, nonce=8) as device, pytest.raises(PipefishError) as caught:
+        receive_from(device, tmp_path / "b.mcap")
+    text = str(caught.value)
+    assert "b.mcap.partial is not complete: its start, 3 keyframes (0, 1, 2) missing" in text
+    assert f"{tmp_path / 'a.mcap.partial'} of an earlier reception" in text
+    assert len(Survey.open(tmp_path / "b.mcap.partial").keyframes) == 3
+
+
+def test_a_device_that_is_idle_and_empty_is_not_waited_for(tmp_path):
+    """The survey's end went into another file: nothing of it is here, nothing more will come."""
+    with (
+        Device(survey_objects(6)[:4], SURVEY, state="idle") as device,
+        pytest.raises(PipefishError, match=r"nothing more to send.*its end missing"),
+    ):
+        receive_from(device, tmp_path / "a.mcap")
+
+
+def test_a_survey_that_a_sibling_holds_is_not_received_twice(tmp_path):
+    """The device has forgotten all acknowledgements of a survey that went into a-2.mcap."""
+    with Device(survey_objects(4), SURVEY) as device:
+        receive_from(device, tmp_path / "a-2.mcap")
+    before = (tmp_path / "a-2.mcap").read_bytes()
+    with Device(survey_objects(4), SURVEY, nonce=8) as device:
+        summary = receive_from(device, tmp_path / "a.mcap")
+        assert not device.spool
+    assert summary["file"] == str(tmp_path / "a-2.mcap") and summary["keyframes"] == 4
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a-2.mcap": before}
+
+
+def test_a_survey_that_was_received_before_is_said(tmp_path):
+    with Device([], SURVEY, state="idle") as device, pytest.raises(PipefishError, match="has been received before"):
+        receive_from(device, tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_receptions_do_not_write_one_file(tmp_path):
+    path = tmp_path / "a.mcap"
+    objects = survey_objects(6)
+    with Device(objects, SURVEY) as device, Device(objects, SURVEY, boot=BOOT + 1) as other:
+        refused = []
+
+        def stop() -> bool:
+            if device.acknowledged and not refused:
+                with pytest.raises(PipefishError, match=r"another pipefish receive is writing .*a\.mcap\.partial"):
+                    receive_from(other, path)
+                refused.append(1)
+            return False
+
+        device.most = 3  # the reception is under way, and not over before the other one has tried
+        stopper = lambda: (stop(), setattr(device, "most", 99) if refused else None)[0]  # noqa: E731
+        receive_from(device, path, stop=stopper)
+        assert refused and not other.acknowledged
+    assert len(Survey.open(path).receipts) == len(objects)
+
+
+def test_a_full_disk_names_the_file_and_keeps_what_was_acknowledged(tmp_path):
+    path = tmp_path / "a.mcap"
+    code = (
+        "import resource, sys; from pipefish.cli import main; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, 90_000)); sys.exit(main(sys.argv[1:]))"
+    )
+    with Device(survey_objects(60), SURVEY) as device:
+        command = [sys.executable, "-c", code, "receive", device.address, "-o", str(path), "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        acknowledged = set(device.acknowledged)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1
+        assert json.loads(done.stdout)["error"]["message"] in done.stderr
+        receipts = Survey.open(tmp_path / "a.mcap.partial").receipts
+        stored = {r.sha256 for r in receipts}
+        keyframes = sum(r.kind == 2 for r in receipts)  # one more may be there whose receipt did not fit
         assert f"{path}.partial: File too large; {keyframes} keyframes are safe in it" in done.stderr
         assert acknowledged and acknowledged <= stored
         receive_from(device, path)
