@@ -92,6 +92,7 @@ nb::dict to_python(const Recognition &r)
         d["matches"] = s.matches;
         d["model_contours"] = to_python(s.model);
         d["scene_contours"] = to_python(s.scene);
+        d["extent"] = to_python(s.extent);
         segments.append(d);
     }
     nb::dict out;

@@ -65,6 +65,34 @@ double median_area_change(const std::vector<match::Match> &matches, const Groups
     return det[det.size() / 2];
 }
 
+// The affine map (of homogeneous points) that fits a group's matches best.
+Eigen::Matrix<double, 2, 3> common_map(const std::vector<match::Match> &matches, const Groups &groups, int group)
+{
+    Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
+    Eigen::Matrix<double, 2, 3> right = Eigen::Matrix<double, 2, 3>::Zero();
+    for (size_t k = 0; k < matches.size(); k++)
+        if (groups.label[k] == group) {
+            const Eigen::Vector3d one(matches[k].x, matches[k].y, 1);
+            normal += one * one.transpose();
+            right += matches[k].centre.cast<double>() * one.transpose();
+        }
+    return right * normal.inverse(); // a group has triangles: its points are not in one line
+}
+
+std::vector<std::vector<cv::Point2d>> extent(const Eigen::Matrix<double, 2, 3> &map, const Prepared &model,
+                                             const Prepared &scene)
+{
+    std::vector<std::vector<cv::Point2d>> out;
+    for (const Outline &line : outlines(model.mask())) {
+        std::vector<cv::Point2d> &moved = out.emplace_back();
+        for (const cv::Point &p : line) {
+            const Eigen::Vector2d q = map * Eigen::Vector3d(p.x, p.y, 1);
+            moved.push_back(scene.in_picture({q.x(), q.y()}));
+        }
+    }
+    return out;
+}
+
 std::vector<std::vector<cv::Point2d>> in_picture(const std::vector<Outline> &lines, const Prepared &picture)
 {
     std::vector<std::vector<cv::Point2d>> out;
@@ -100,6 +128,7 @@ Candidate measure(const std::vector<match::Match> &matches, const Groups &groups
     s.score = s.area * s.coverage * s.correlation;
     s.model = in_picture(outlines(one), model);
     s.scene = in_picture(outlines(out.scene), scene);
+    s.extent = extent(common_map(matches, groups, group), model, scene);
     return out;
 }
 

@@ -40,7 +40,9 @@ struct Segment {
     double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
     double correlation = 0; // mean of (zncc - 0.5) / 0.5
     int matches = 0;
-    std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
+    // Outlines, pixels of the pictures that were given: of the support in both, and the model's own carried into the
+    // scene by the affine map that fits the matches: where all of the object would be.
+    std::vector<std::vector<cv::Point2d>> model, scene, extent;
 };
 
 struct Recognition {
