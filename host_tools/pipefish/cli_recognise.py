@@ -9,7 +9,7 @@ from typing import Any
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import FormatError
 
-THRESHOLD, MAX_PIXELS = 0.02, 400_000  # those of pipefish.recognition, whose import costs time here
+THRESHOLD, MAX_PIXELS = 0.05, 400_000  # those of pipefish.recognition, whose import costs time here
 
 
 def run_recognise(args: argparse.Namespace) -> Result:

@@ -18,7 +18,7 @@ from .errors import ArgumentError
 from .grouping import group_options
 from .matching import grey
 
-THRESHOLD = 0.02
+THRESHOLD = 0.05
 MAX_PIXELS = 400_000
 REGIONS = 3000  # of a picture, before orientations
 LEAST = 30  # vertices of a group: 750 pixels of the model's picture
@@ -80,7 +80,6 @@ class Segment:
     matches         pixels
     view            label of the model's picture
     model_contours, scene_contours  outer boundaries, (N,2) each, in pixels of the pictures given
-    extent          the outline of the whole model, carried into the scene by the affine map that fits the matches
     """
 
     score: float
@@ -91,7 +90,6 @@ class Segment:
     view: str
     model_contours: list[Floats]
     scene_contours: list[Floats]
-    extent: list[Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +102,8 @@ class Recognition:
     present        whether score is at least the threshold
     view           label of the best view
     segments       of the best view, and of others whose score is at least the threshold; best first
+    extent         outline of the whole model, (N,2) each, carried into the scene by the affine map that fits the
+                   matches of the view that has most of them: where all of the object would be, hidden parts too
     seeds, matches of the best view by each: what a decision without growth or without groups would go by
     """
 
@@ -114,6 +114,7 @@ class Recognition:
     present: bool
     view: str
     segments: list[Segment]
+    extent: list[Floats]
     seeds: int
     matches: int
 
@@ -128,8 +129,12 @@ class Recognition:
                 draw.polygon([tuple(p) for p in line], fill=1)
         return np.asarray(picture)
 
+    def contours(self, shape: tuple[int, int]) -> list[Floats]:
+        """Outer boundaries of mask(shape), (N,2) each, largest first: what the segments' contours come to together."""
+        return _engine.mask_outlines(self.mask(shape).astype(np.uint8))
+
     def box(self) -> tuple[float, float, float, float] | None:
-        """Around the contours: least x and y, largest x and y."""
+        """Around the segments' contours: least x and y, largest x and y. None where nothing was found."""
         points = [line for segment in self.segments for line in segment.scene_contours]
         if not points:
             return None
@@ -206,6 +211,7 @@ def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], thresh
         for s in f["segments"]
     ]
     segments.sort(key=lambda s: (s.view != model.labels[best], -s.score))
+    most = max(range(len(found)), key=lambda k: sum(s["matches"] for s in found[k]["segments"]))
     return Recognition(
         object=model.name,
         scene=scene,
@@ -214,6 +220,7 @@ def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], thresh
         present=bool(scores[best] >= threshold),
         view=model.labels[best],
         segments=segments,
+        extent=found[most]["extent"],
         seeds=max(f["seeds"] for f in found),
         matches=max(f["matches"] for f in found),
     )

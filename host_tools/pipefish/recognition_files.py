@@ -92,7 +92,7 @@ def read_models(path: str | os.PathLike[str], max_pixels: int) -> list[ObjectMod
     if not sets:
         raise FormatError(top, None, "neither pictures nor folders of pictures of objects")
     out = []
-    for name, files in sets:
+    for name, files in sorted(sets):
         views = [p for p in files if not p.stem.endswith("_mask")]
         if not views:
             raise FormatError(top / name, None, "masks only, no pictures")
@@ -156,7 +156,7 @@ def as_document(found: Sequence[Recognition], scenes: Sequence[str]) -> list[dic
         row: dict[str, Any] = {
             name: getattr(r, name) for name in ("object", "score", "sum_score", "present", "view", "matches", "seeds")
         }
-        row["scene"], row["box"] = scenes[r.scene], r.box()
+        row["scene"], row["box"], row["extent"] = scenes[r.scene], r.box(), lines(r.extent)
         row["segments"] = [
             {name: getattr(s, name) for name in ("score", "area", "coverage", "correlation", "matches", "view")}
             | {"model_contours": lines(s.model_contours), "scene_contours": lines(s.scene_contours)}
@@ -167,7 +167,8 @@ def as_document(found: Sequence[Recognition], scenes: Sequence[str]) -> list[dic
 
 
 def draw_scene(image: NDArray[np.float32], found: Sequence[Recognition], objects: Sequence[str]) -> NDArray[np.uint8]:
-    """(H,W,3): the scene, darker, with the contours of the objects that are present, each in its colour and named."""
+    """(H,W,3): the scene, darker, with the contours of the objects that are present, each in its colour and named;
+    thin: where all of the object would be."""
     from PIL import Image, ImageDraw, ImageFont
 
     grey = (255 * image).astype(np.uint8)
@@ -183,10 +184,10 @@ def draw_scene(image: NDArray[np.float32], found: Sequence[Recognition], objects
     width = max(2, image.shape[1] // 300)
     for r in here:
         colour = COLOURS[objects.index(r.object) % len(COLOURS)]
-        for segment in r.segments:
-            for line in segment.scene_contours:
+        for lines, thick in ((r.extent, 1), (r.contours(image.shape), width)):
+            for line in lines:
                 points = [tuple(p) for p in line]
-                draw.line([*points, points[0]], fill=colour, width=width, joint="curve")
+                draw.line([*points, points[0]], fill=colour, width=thick, joint="curve")
     for r in here:
         colour = COLOURS[objects.index(r.object) % len(COLOURS)]
         x, y, right, _ = r.box() or (0, 0, 0, 0)

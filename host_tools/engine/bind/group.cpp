@@ -92,7 +92,6 @@ nb::dict to_python(const Recognition &r)
         d["matches"] = s.matches;
         d["model_contours"] = to_python(s.model);
         d["scene_contours"] = to_python(s.scene);
-        d["extent"] = to_python(s.extent);
         segments.append(d);
     }
     nb::dict out;
@@ -100,6 +99,7 @@ nb::dict to_python(const Recognition &r)
     out["matches"] = r.matches;
     out["score"] = r.score;
     out["segments"] = segments;
+    out["extent"] = to_python(r.extent);
     return out;
 }
 
@@ -160,6 +160,13 @@ void bind_group(nb::module_ &m)
         "Positions (K,2) in an image, triangles, their groups, which group, height, width, reach -> mask (H,W) of 0 "
         "and "
         "255, outlines.");
+    m.def(
+        "mask_outlines",
+        [](const Marked &mask) {
+            return to_python(outlines(Mask(static_cast<int>(mask.shape(0)), static_cast<int>(mask.shape(1)),
+                                           const_cast<uint8_t *>(mask.data()))));
+        },
+        "(H,W) uint8, not zero inside -> outer boundaries, (N,2) each, largest first.");
     nb::class_<RecogniseOptions>(m, "RecogniseOptions", "pipefish.recognition fills it.")
         .def(nb::init<>())
         .def_prop_rw(

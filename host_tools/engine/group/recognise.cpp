@@ -50,9 +50,30 @@ std::vector<match::Match> on_mask(std::vector<match::Match> matches, const Mask 
     return matches;
 }
 
+// Sums for the affine map, of homogeneous points, that fits matches best.
+struct Fit {
+    Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
+    Eigen::Matrix<double, 2, 3> right = Eigen::Matrix<double, 2, 3>::Zero();
+
+    void add(const match::Match &m)
+    {
+        const Eigen::Vector3d one(m.x, m.y, 1);
+        normal += one * one.transpose();
+        right += m.centre.cast<double>() * one.transpose();
+    }
+    void add(const Fit &other)
+    {
+        normal += other.normal;
+        right += other.right;
+    }
+    // A group has triangles: its points are not in one line.
+    Eigen::Matrix<double, 2, 3> map() const { return right * normal.inverse(); }
+};
+
 struct Candidate {
     Segment segment;
     Mask scene;
+    Fit fit;
 };
 
 double median_area_change(const std::vector<match::Match> &matches, const Groups &groups, int group)
@@ -63,20 +84,6 @@ double median_area_change(const std::vector<match::Match> &matches, const Groups
             det.push_back(std::abs(static_cast<double>(matches[k].a.determinant())));
     std::nth_element(det.begin(), det.begin() + static_cast<std::ptrdiff_t>(det.size() / 2), det.end());
     return det[det.size() / 2];
-}
-
-// The affine map (of homogeneous points) that fits a group's matches best.
-Eigen::Matrix<double, 2, 3> common_map(const std::vector<match::Match> &matches, const Groups &groups, int group)
-{
-    Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
-    Eigen::Matrix<double, 2, 3> right = Eigen::Matrix<double, 2, 3>::Zero();
-    for (size_t k = 0; k < matches.size(); k++)
-        if (groups.label[k] == group) {
-            const Eigen::Vector3d one(matches[k].x, matches[k].y, 1);
-            normal += one * one.transpose();
-            right += matches[k].centre.cast<double>() * one.transpose();
-        }
-    return right * normal.inverse(); // a group has triangles: its points are not in one line
 }
 
 std::vector<std::vector<cv::Point2d>> extent(const Eigen::Matrix<double, 2, 3> &map, const Prepared &model,
@@ -117,6 +124,7 @@ Candidate measure(const std::vector<match::Match> &matches, const Groups &groups
     for (size_t k = 0; k < matches.size(); k++)
         if (groups.label[k] == group) {
             matched++;
+            out.fit.add(matches[k]);
             correlation += std::max(0.0, (static_cast<double>(matches[k].zncc) - 0.5) / 0.5);
         }
     Segment &s = out.segment;
@@ -128,7 +136,6 @@ Candidate measure(const std::vector<match::Match> &matches, const Groups &groups
     s.score = s.area * s.coverage * s.correlation;
     s.model = in_picture(outlines(one), model);
     s.scene = in_picture(outlines(out.scene), scene);
-    s.extent = extent(common_map(matches, groups, group), model, scene);
     return out;
 }
 
@@ -207,14 +214,18 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
     std::stable_sort(found.begin(), found.end(),
                      [](const Candidate &a, const Candidate &b) { return a.segment.score > b.segment.score; });
     Mask taken(scene.mask().size(), 0);
+    Fit fit;
     for (Candidate &c : found) {
         const int area = cv::countNonZero(c.scene);
         if (c.segment.score < options.least || 2 * cv::countNonZero(c.scene & taken) > area)
             continue;
         taken |= c.scene;
         out.score = std::min(1.0, out.score + c.segment.score);
+        fit.add(c.fit);
         out.segments.push_back(std::move(c.segment));
     }
+    if (!out.segments.empty())
+        out.extent = extent(fit.map(), model, scene);
     return out;
 }
 

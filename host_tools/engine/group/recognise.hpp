@@ -40,15 +40,16 @@ struct Segment {
     double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
     double correlation = 0; // mean of (zncc - 0.5) / 0.5
     int matches = 0;
-    // Outlines, pixels of the pictures that were given: of the support in both, and the model's own carried into the
-    // scene by the affine map that fits the matches: where all of the object would be.
-    std::vector<std::vector<cv::Point2d>> model, scene, extent;
+    std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
 };
 
 struct Recognition {
     int seeds = 0, matches = 0;    // before grouping
     double score = 0;              // sum over `segments`, at most 1
     std::vector<Segment> segments; // best first; none overlaps a better one by half in the scene
+    // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
+    // of the object would be.
+    std::vector<std::vector<cv::Point2d>> extent;
 };
 
 struct RecogniseOptions {
