@@ -19,6 +19,7 @@ from .matching_files import png, read_grey
 from .recognition import ObjectModel, Recognition
 from .roc_curve import Roc
 
+MASKS = ("_mask", "_labels")  # what a mask's name ends with; labels are those of simulated objects
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
 COLUMNS = (
     "scene",
@@ -46,21 +47,25 @@ COLOURS = (
 )
 
 
+def _listed(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES)
+
+
 def pictures_in(path: Path) -> list[Path]:
-    """The pictures of a folder, by name, or the picture itself. Raises FormatError for none, OSError."""
+    """The pictures of a folder but for masks, by name, or the picture itself. Raises FormatError for none, OSError."""
     if path.is_file():
         return [path]
-    found = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES)
+    found = [p for p in _listed(path) if not p.stem.endswith(MASKS)]
     if not found:
         raise FormatError(path, None, "no pictures (" + ", ".join(PICTURES) + ")")
     return found
 
 
-def _mask_of(picture: Path, among: Sequence[Path]) -> Path | None:
-    """X_mask.png for X.png, X_color.png or X-color.png."""
-    stem = picture.stem
-    names = {f"{stem}_mask", f"{stem.removesuffix('_color').removesuffix('-color')}_mask"}
-    return next((p for p in among if p.stem in names), None)
+def _mask_of(picture: Path) -> Path | None:
+    """X_mask.png for X.png, X_color.png or X-color.png, beside it."""
+    stems = {picture.stem, picture.stem.removesuffix("_color").removesuffix("-color")}
+    names = {stem + ending for stem in stems for ending in MASKS}
+    return next((p for p in _listed(picture.parent) if p.stem in names), None)
 
 
 def _read_view(picture: Path, mask: Path | None) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
@@ -69,7 +74,8 @@ def _read_view(picture: Path, mask: Path | None) -> tuple[NDArray[np.float32], N
 
     image = read_grey(picture)
     if mask is not None:
-        return image, read_grey(mask) > 0.5
+        values = read_grey(mask)
+        return image, values > 0.5 * values.max()
     with Image.open(picture) as opened:
         if "A" in opened.getbands():
             return image, np.asarray(opened.getchannel("A")) > 127
@@ -80,23 +86,17 @@ def read_models(path: str | os.PathLike[str], max_pixels: int) -> list[ObjectMod
     """Objects from a folder: each folder in it is an object with a picture a view (also in its folder `models`), each
     picture in it an object of one view. Raises FormatError, OSError."""
     top = Path(path)
-    folders = sorted(p for p in top.iterdir() if p.is_dir())
     sets: list[tuple[str, list[Path]]] = []
-    for folder in folders:
-        inner = folder / "models"
-        sets.append((folder.name, pictures_in(inner if inner.is_dir() else folder)))
-    loose = sorted(p for p in top.iterdir() if p.suffix.lower() in PICTURES)
-    sets += [
-        (p.stem, [p, *(q for q in loose if q.stem.endswith("_mask"))]) for p in loose if not p.stem.endswith("_mask")
-    ]
+    for folder in top.iterdir():
+        if folder.is_dir():
+            inner = folder / "models"
+            sets.append((folder.name, pictures_in(inner if inner.is_dir() else folder)))
+    sets += [(p.stem, [p]) for p in _listed(top) if not p.stem.endswith(MASKS)]
     if not sets:
         raise FormatError(top, None, "neither pictures nor folders of pictures of objects")
     out = []
-    for name, files in sorted(sets):
-        views = [p for p in files if not p.stem.endswith("_mask")]
-        if not views:
-            raise FormatError(top / name, None, "masks only, no pictures")
-        given = [_read_view(p, _mask_of(p, files)) for p in views]
+    for name, views in sorted(sets):
+        given = [_read_view(p, _mask_of(p)) for p in views]
         for picture, (image, mask) in zip(views, given, strict=True):
             if mask is not None and mask.shape != image.shape:
                 raise FormatError(picture, None, f"is {image.shape[1]}x{image.shape[0]}, its mask is not")
