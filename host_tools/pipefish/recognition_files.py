@@ -200,34 +200,37 @@ def draw_scene(image: NDArray[np.float32], found: Sequence[Recognition], objects
 
 
 def draw_roc(curves: Mapping[str, Roc], size: int = 640) -> NDArray[np.uint8]:
-    """(H,W,3): ROC curves over a false-positive rate of 0 to 1, the names with their areas beneath."""
+    """(H,W,3): ROC curves, the names with their areas beneath. The vertical axis starts where the curves do."""
     from PIL import Image, ImageDraw, ImageFont
 
-    inset, right, legend = 60, 20, 26 * len(curves) + 16
+    inset, right, legend = 76, 20, 26 * len(curves) + 16
+    low = min(0.9, np.floor(10 * min(curve.tpr_at(0) for curve in curves.values())) / 10)
     picture = Image.new("RGB", (size + inset + right, size + inset + right + legend), "white")
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(16)
 
     def at(x: float, y: float) -> tuple[float, float]:
-        return inset + x * size, right + (1 - y) * size
+        return inset + x * size, right + (1 - y) / (1 - low) * size
 
     for k in range(11):
-        grid = (225, 225, 225) if k % 10 else (120, 120, 120)
-        draw.line([at(k / 10, 0), at(k / 10, 1)], fill=grid)
-        draw.line([at(0, k / 10), at(1, k / 10)], fill=grid)
+        grid, y = (225, 225, 225) if k % 10 else (120, 120, 120), low + (1 - low) * k / 10
+        draw.line([at(k / 10, low), at(k / 10, 1)], fill=grid)
+        draw.line([at(0, y), at(1, y)], fill=grid)
         if k % 2 == 0:
-            draw.text((at(k / 10, 0)[0], at(0, 0)[1] + 6), f"{k / 10:.1f}", fill="black", font=font, anchor="ma")
-            draw.text((inset - 8, at(0, k / 10)[1]), f"{k / 10:.1f}", fill="black", font=font, anchor="rm")
+            draw.text((at(k / 10, 0)[0], right + size + 6), f"{k / 10:.1f}", fill="black", font=font, anchor="ma")
+            draw.text((inset - 8, at(0, y)[1]), f"{y:.2f}", fill="black", font=font, anchor="rm")
     draw.text((inset + size / 2, right + size + 28), "false positive rate", fill="black", font=font, anchor="ma")
-    draw.text((inset + 8, right + 6), "true positive rate", fill="black", font=font)
+    words = Image.new("RGB", (160, 22), "white")
+    ImageDraw.Draw(words).text((80, 0), "true positive rate", fill="black", font=font, anchor="ma")
+    picture.paste(words.rotate(90, expand=True), (4, right + size // 2 - 80))
     for k, (name, curve) in reversed(list(enumerate(curves.items()))):  # the first on top
         colour = COLOURS[k % len(COLOURS)]
-        corners = [at(float(x), float(y)) for x, y in zip(curve.fpr, curve.tpr, strict=True)]
+        corners = [at(float(x), max(low, float(y))) for x, y in zip(curve.fpr, curve.tpr, strict=True)]
         draw.line(corners, fill=colour, width=4 if k == 0 else 3, joint="curve")
         y = right + size + inset + 4 + 26 * k
         draw.line([(inset, y + 9), (inset + 36, y + 9)], fill=colour, width=4)
-        low, high = curve.interval
-        draw.text((inset + 46, y), f"{name}: area {curve.auc:.4f} ({low:.3f} to {high:.3f})", fill="black", font=font)
+        least, most = curve.interval
+        draw.text((inset + 46, y), f"{name}: area {curve.auc:.4f} ({least:.3f} to {most:.3f})", fill="black", font=font)
     return np.asarray(picture)
 
 

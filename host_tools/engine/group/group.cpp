@@ -244,12 +244,14 @@ Groups group_matches(const std::vector<Match> &matches, const Options &o)
             own.insert(own.end(), t.begin(), t.end());
         std::sort(own.begin(), own.end());
         own.erase(std::unique(own.begin(), own.end()), own.end());
+        const auto label = [&](int v) -> int & {
+            return out.label[static_cast<size_t>(mesh.vertices[static_cast<size_t>(v)])];
+        };
+        std::erase_if(own, [&](int v) { return label(v) >= 0; }); // where groups touch: the larger one's
         if (static_cast<int>(own.size()) < o.least)
             continue;
-        for (const int v : own) {
-            int &label = out.label[static_cast<size_t>(mesh.vertices[static_cast<size_t>(v)])];
-            label = label < 0 ? out.count : label; // where groups touch: the larger one's
-        }
+        for (const int v : own)
+            label(v) = out.count;
         for (const Corners &t : component)
             out.triangles.push_back(
                 {{mesh.vertices[static_cast<size_t>(t[0])], mesh.vertices[static_cast<size_t>(t[1])],
