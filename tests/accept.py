@@ -76,6 +76,19 @@ def check_pipes() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_recognise() -> list[dict]:
+    """Objects in simulated and in real scenes, beside OpenCV's SIFT."""
+    peers = next((BUILD / "venv-peers/lib").glob("python3*/site-packages"), None)  # OpenCV beside this environment
+    if peers is None:
+        raise SystemExit("build/venv-peers is missing: `make accept` installs it")
+    command = (sys.executable, "tests/accept_recognise.py", "--pictures", BUILD / "accept/recognise")
+    done = run(*command, PYTHONPATH=str(peers))
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_recognise.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_calib() -> list[dict]:
     """Calibration over random set-ups, against theory, and on real data where they are; resumes by itself."""
     done = run(sys.executable, "tests/accept_calib.py")
@@ -160,6 +173,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "track": check_track,
     "pipes": check_pipes,
     "calib": check_calib,
+    "recognise": check_recognise,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,

@@ -536,10 +536,12 @@ def build_parser() -> argparse.ArgumentParser:
     add_homography(commands)
 
     from pipefish.cli_match import add_match
+    from pipefish.cli_recognise import add_recognise
     from pipefish.cli_tube import add_tube
 
     add_tube(commands)
     add_match(commands)
+    add_recognise(commands)
 
     from pipefish.cli_reconstruct import add_reconstruct
 

@@ -136,7 +136,7 @@ def statistics(m: Matches) -> dict[str, Any]:
     }
 
 
-def _png(picture: NDArray[np.uint8]) -> bytes:
+def png(picture: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()
@@ -169,8 +169,8 @@ def write_matches(
     contents = {
         "matches.npz": packed.getvalue(),
         "matches.csv": text.getvalue().encode(),
-        "matches.png": _png(draw_matches(image1, image2, m)),
-        "warped.png": _png(warp(image1, image2, m)),
+        "matches.png": png(draw_matches(image1, image2, m)),
+        "warped.png": png(warp(image1, image2, m)),
         "statistics.json": json.dumps(statistics(m), indent=1).encode(),
     }
     for name, data in contents.items():

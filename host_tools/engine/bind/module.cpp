@@ -7,6 +7,7 @@ void bind_calib(nb::module_ &m);
 void bind_camera(nb::module_ &m);
 void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
+void bind_group(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_match(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
@@ -21,6 +22,7 @@ NB_MODULE(_engine, m)
     bind_camera(m);
     bind_conics(m);
     bind_detect(m);
+    bind_group(m);
     bind_link(m);
     bind_match(m);
     bind_sfm(m);

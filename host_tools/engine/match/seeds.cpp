@@ -62,9 +62,8 @@ Choices choose(const Described &one, const Described &two, int threads)
 
 } // namespace
 
-std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, const SeedOptions &options)
+std::vector<Seed> match_regions(const Described &one, const Described &two, const SeedOptions &options)
 {
-    const Described one = describe_regions(first, options.regions), two = describe_regions(second, options.regions);
     if (one.regions.empty() || two.regions.empty())
         return {};
     const auto [there, back] = choose(one, two, options.regions.threads);
@@ -83,6 +82,11 @@ std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, 
     for (size_t k = 0; k < std::min(found.size(), static_cast<size_t>(options.most)); k++)
         out.push_back(found[k].second);
     return out;
+}
+
+std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, const SeedOptions &options)
+{
+    return match_regions(describe_regions(first, options.regions), describe_regions(second, options.regions), options);
 }
 
 } // namespace pipefish::match

@@ -13,7 +13,10 @@ struct SeedOptions {
     int most = 2000;     // best first
 };
 
-// Regions that choose each other, with the map between them. Many are wrong: growth sorts that out.
+// Regions that choose each other, with the map between them, best first. Many are wrong: growth sorts that out.
+std::vector<Seed> match_regions(const Described &one, const Described &two, const SeedOptions &options);
+
+// The same from the images.
 std::vector<Seed> find_seeds(const ScaleStack &first, const ScaleStack &second, const SeedOptions &options);
 
 } // namespace pipefish::match

@@ -1,0 +1,65 @@
+// Recognition of specific objects: a model's picture against a scene, by how much of the model is matched by groups.
+#pragma once
+
+#include "group/support.hpp"
+#include "match/region.hpp"
+
+namespace pipefish::group
+{
+
+// A picture made ready once, for many pairs: cropped to its mask, made smaller where it is large, regions described.
+class Prepared
+{
+public:
+    // mask: empty for the whole picture, else of its size, where the object is. Throws std::invalid_argument for a mask
+    // that covers less than 100 pixels of what remains. Pictures of more than max_pixels are made smaller.
+    Prepared(const match::Image &image, const Mask &mask, int max_pixels, int regions);
+
+    const match::ScaleStack &stack() const { return stack_; }
+    const match::Described &regions() const { return regions_; }
+    const Mask &mask() const { return mask_; }         // 255 everywhere without a mask
+    const Mask &textured() const { return textured_; } // of the mask
+    double area() const { return area_; }              // pixels of the mask
+    cv::Point2d in_picture(cv::Point2d p) const;       // from here to the picture that was given
+
+private:
+    struct Cut;
+    explicit Prepared(const Cut &cut, int regions);
+
+    cv::Point2d offset_;
+    double scale_;
+    Mask mask_, textured_;
+    double area_;
+    match::ScaleStack stack_;
+    match::Described regions_;
+};
+
+struct Segment {
+    double score = 0;       // area * coverage * correlation
+    double area = 0;        // of the support, as a share of the model
+    double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
+    double correlation = 0; // mean of (zncc - 0.5) / 0.5
+    int matches = 0;
+    std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
+};
+
+struct Recognition {
+    int seeds = 0, matches = 0;    // before grouping
+    double score = 0;              // sum over `segments`, at most 1
+    std::vector<Segment> segments; // best first; none overlaps a better one by half in the scene
+    // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
+    // of the object would be.
+    std::vector<std::vector<cv::Point2d>> extent;
+};
+
+struct RecogniseOptions {
+    match::Options growth;
+    Options grouping;
+    int seeds = 300;
+    double least = 0.002; // score of a segment
+    double reach = 3;     // pixels of the coarser image by which supports go beyond their triangles
+};
+
+Recognition recognise(const Prepared &model, const Prepared &scene, const RecogniseOptions &options);
+
+} // namespace pipefish::group
