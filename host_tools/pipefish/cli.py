@@ -531,11 +531,13 @@ def build_parser() -> argparse.ArgumentParser:
     add_calibrate(commands)
     add_homography(commands)
 
+    from pipefish.cli_dense import add_dense
     from pipefish.cli_match import add_match
     from pipefish.cli_tube import add_tube
 
     add_tube(commands)
     add_match(commands)
+    add_dense(commands)
 
     from pipefish.cli_reconstruct import add_reconstruct
 
