@@ -31,12 +31,11 @@ SEARCH_S, SEARCH_CLOCK = 10, 3  # cells of the unrolled picture around the model
 SEED_STEP, SEED_RADIUS = 36, 7
 ANGLE_LEAST = math.radians(1.5)  # between two rays
 MATCH_PX = 0.25  # sigma of a match as growth leaves it, before the map's own scatter corrects it
-# What all pairs share and no scatter tells: what a calibration leaves (zonal errors of 0.1 px are ordinary) and shading
-# that moves with the lamp. In a simulated concrete pipe errors stay as they are from 2 pairs to 7.
-COMMON_PX = 0.1
+CALIBRATION_PX = 0.1
 ACROSS = 3  # matches in a map's cell, along and around, where the pictures have more: near ones share their error
 SKEW_PX = 1.5  # two rays may miss each other by so much
 WINDOW = 7  # side of the correlation window: matches nearer to each other than that share their error
+BATCH = 8  # pairs at a time, whatever the number of threads: sums have one order
 SPREAD_LEAST = 3  # pairs, for a cell to say something about the scatter
 REGION_SIGMA, REGION_CELLS = 3.0, 12
 
@@ -278,9 +277,11 @@ def _per_cell(
     return key[start][keep], middle[keep], (mean_sigma / np.sqrt(effective))[keep]
 
 
-def _fused(key: NDArray[np.int64], value: Floats, sigma: Floats, cells: int) -> tuple[Floats, Floats, Any, float]:
+def _fused(
+    key: NDArray[np.int64], value: Floats, sigma: Floats, cells: int, shared: float
+) -> tuple[Floats, Floats, Any, float]:
     """Of each cell: the mean of the pairs that agree with their median within 3 sigma, its sigma, how many pairs; and
-    the scatter, by which sigmas are multiplied."""
+    the scatter, by which sigmas are multiplied. shared: part of sigma that all pairs share."""
     order = np.lexsort((value, key))
     key, value, sigma = key[order], value[order], sigma[order]
     if not len(key):
@@ -292,8 +293,8 @@ def _fused(key: NDArray[np.int64], value: Floats, sigma: Floats, cells: int) -> 
     telling = count >= SPREAD_LEAST
     normal = np.abs(value - median[group]) / (sigma * np.sqrt(1 - 1 / count[group]).clip(0.5))
     scatter = float(np.median(normal[telling[group]]) / 0.6745) if telling.any() else 1.0
-    scatter = max(scatter, 0.3)
-    keep = np.abs(value - median[group]) <= 3 * math.hypot(scatter, COMMON_PX / MATCH_PX) * sigma
+    scatter = max(scatter, 0.1)
+    keep = np.abs(value - median[group]) <= 3 * math.hypot(scatter, shared) * sigma
     weight = np.where(keep, sigma**-2.0, 0)
     total = np.add.reduceat(weight, start)
     agree = np.add.reduceat(keep.astype(int), start)
@@ -301,7 +302,7 @@ def _fused(key: NDArray[np.int64], value: Floats, sigma: Floats, cells: int) -> 
     square = np.add.reduceat(weight * (value - mean[group]) ** 2, start) / np.maximum(agree - 1, 1)
     # Pairs share keyframes, so n of them tell half as much as n would; and a cell whose pairs scatter more than most is
     # believed.
-    variance = 2 * np.maximum(square, scatter**2) + (COMMON_PX / MATCH_PX) ** 2 * agree
+    variance = 2 * np.maximum(square, scatter**2) + shared**2 * agree
     good = (agree >= 2) & (2 * agree > count)
     out, error, pairs = np.full(cells, np.nan), np.full(cells, np.nan), np.zeros(cells, int)
     out[key[start][good]] = mean[good]
@@ -336,6 +337,7 @@ def dense_wall(
     *,
     cell: float | None = None,
     scale: float = 1.0,
+    calibration_px: float = CALIBRATION_PX,
     threads: int = 1,
     tell: Callable[[float], None] | None = None,
 ) -> DenseWall:
@@ -347,6 +349,9 @@ def dense_wall(
     wall     the fitted tube, or a piece of it between joints
     cell     side of the map's cells [a hundredth of the diameter, or three pixels]
     scale    pixels of the pictures to a cell of the unrolled ones: 2 takes a quarter of the time
+    calibration_px   what all pairs share and no scatter tells: errors that the calibration leaves (zones of 0.1 px are
+             ordinary) and shading that moves with the lamp. In a simulated concrete pipe errors stay as they are from 2
+             pairs to 7, and 0.1 px makes sigmas true
     threads  pairs at a time: do not change the result
     tell     is called with a fraction done
 
@@ -358,6 +363,8 @@ def dense_wall(
         raise ArgumentError(f"scale: {scale} is not within 0.5 to 8")
     diameter = 2 * wall.mean_radius
     unroller = _Unroller(camera, wall, scale)
+    if not 0 <= calibration_px <= 10:
+        raise ArgumentError(f"calibration_px: {calibration_px} is not within 0 to 10")
     size = max(diameter / CELLS, ACROSS * unroller.cell) if cell is None else cell
     if not (math.isfinite(size) and diameter / 1000 <= size <= diameter / 10):
         raise ArgumentError(f"cell: {size} is not within a thousandth to a tenth of the diameter")
@@ -390,10 +397,10 @@ def dense_wall(
         return _per_cell((row * columns + column % columns)[keep], deviation[keep], sigma[keep], every)
 
     with ThreadPoolExecutor(threads) as pool:
-        for n in range(0, len(pairs), threads):
+        for n in range(0, len(pairs), BATCH):
             if tell:
                 tell(n / len(pairs))
-            batch, rest = pairs[n : n + threads], {k for pair in pairs[n:] for k in pair}
+            batch, rest = pairs[n : n + BATCH], {k for pair in pairs[n:] for k in pair}
             views = {k: v for k, v in views.items() if k in rest}
             wanted = sorted({k for pair in batch for k in pair} - set(views))
             for k, view in zip(wanted, pool.map(seen, wanted), strict=True):
@@ -403,7 +410,7 @@ def dense_wall(
                 looks += _in_view(unroller, views[i], views[j], rows, columns)
             parts += [part for part in pool.map(measured, batch) if part is not None]
     joined = [np.concatenate(p) for p in zip(*parts, strict=True)] if parts else [np.empty(0, int), *[np.empty(0)] * 2]
-    value, error, agree, scatter = _fused(joined[0], joined[1], joined[2], rows * columns)
+    value, error, agree, scatter = _fused(*joined, rows * columns, calibration_px / MATCH_PX)
     shape = (rows, columns)
     found = DenseWall(
         wall=wall,
@@ -450,10 +457,10 @@ def _in_view(unroller: _Unroller, one: _View, two: _View, rows: int, columns: in
 
 
 def find_regions(found: DenseWall) -> list[dict[str, float]]:
-    """Connected cells (12 or more) whose 3 x 3 neighbourhood stands over 3 sigma and a 500th of the diameter in or out of
-    the ellipse through the wall half a diameter around, which leaves out what a tube's smoothness makes of ovality and
-    bends. Largest volume first: s, clock (radians) of the middle; length (along), extent (around, radians); height (the
-    90th percentile, negative: it stands into the pipe); sigma of it; area; volume."""
+    """Connected cells (12 or more) whose 3 x 3 neighbourhood stands over 3 sigma and a 500th of the diameter in or out
+    of the ellipse through the wall half a diameter around, which leaves out what a tube's smoothness makes of ovality
+    and bends. Largest volume first: s, clock (radians) of the middle; length (along), extent (around, radians); height
+    (the 90th percentile, negative: it stands into the pipe); sigma of it; area; volume."""
     measured = np.isfinite(found.deviation)
     weight = np.where(measured, np.nan_to_num(found.sigma, nan=1.0) ** -2.0, 0)
     total = _wrapped_box(weight)

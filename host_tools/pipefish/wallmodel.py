@@ -107,10 +107,13 @@ class WallModel:
                 far = np.linalg.norm(points[k : k + 4096, None] - self._centre[None], axis=2)
                 start[k : k + 4096] = self._s[far.argmin(axis=1)]
         s = np.asarray(start, float).copy()
-        for _ in range(3):  # a step leaves what the axis bends over it
+        for _ in range(20):  # each step leaves what the axis bends over it
             centre, tangent, up, right = self.frames(s)
             off = points - centre
-            s += np.einsum("ni,ni->n", off, tangent)
+            step = np.einsum("ni,ni->n", off, tangent)
+            s += step
+            if not np.abs(step).max(initial=0) > 1e-6 * self.mean_radius:
+                break
         a, b = np.einsum("ni,ni->n", off, up), np.einsum("ni,ni->n", off, right)
         clock = np.arctan2(b, a) % (2 * np.pi)
         return s, clock, np.hypot(a, b) - self.radius(s, clock)
