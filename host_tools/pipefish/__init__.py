@@ -37,6 +37,8 @@ _LAZY = {
     "Seeds": "pipefish.matching",
     "find_seeds": "pipefish.matching",
     "match_quasi_dense": "pipefish.matching",
+    "filter_matches": "pipefish.matching_filters",
+    "match_back": "pipefish.matching_filters",
     "DenseWall": "pipefish.dense",
     "WallModel": "pipefish.wallmodel",
     "dense_wall": "pipefish.dense",
