@@ -535,6 +535,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_record(commands)
     add_homography(commands)
 
+    from pipefish.cli_dense import add_dense
     from pipefish.cli_match import add_match
     from pipefish.cli_recognise import add_recognise
     from pipefish.cli_tube import add_tube
@@ -542,6 +543,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_tube(commands)
     add_match(commands)
     add_recognise(commands)
+    add_dense(commands)
 
     from pipefish.cli_reconstruct import add_reconstruct
 

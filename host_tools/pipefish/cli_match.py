@@ -8,6 +8,7 @@ from typing import Any
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError
 
+FILTERS = ("consistent", "both-ways", "plane", "motion")
 MODES = ("adaptive", "constant", "translation")  # matching.MODES, whose import costs time here
 
 
@@ -16,6 +17,7 @@ def run_match(args: argparse.Namespace) -> Result:
     from pipefish.camera import Camera
     from pipefish.matching import match_quasi_dense
     from pipefish.matching_files import read_grey, read_pose, read_seeds, statistics, write_matches
+    from pipefish.matching_filters import filter_matches, match_back
 
     if bool(args.profile) != bool(args.pose):
         raise ArgumentError("--profile and --pose: the epipolar geometry needs both")
@@ -23,20 +25,30 @@ def run_match(args: argparse.Namespace) -> Result:
     cameras = tuple(Camera.load(path) for path in args.profile) if args.profile else None
     if cameras and len(cameras) > 2:
         raise ArgumentError(f"--profile: {len(cameras)} profiles for two pictures")
+    if {"plane", "motion"} <= set(args.filter):
+        raise ArgumentError("--filter: plane or motion, not both")
+    options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}
     m = match_quasi_dense(
         one,
         two,
         read_seeds(args.seeds) if args.seeds else None,
         cameras[0] if cameras and len(cameras) == 1 else cameras,
         read_pose(args.pose) if args.pose else None,
-        mode=args.mode,
-        zncc_min=args.zncc,
-        threads=args.threads,
+        **options,
     )
+    grown = len(m)
+    if args.filter:
+        m = filter_matches(
+            m,
+            least=30 if "consistent" in args.filter else 0,
+            back=match_back(one, two, m, **options) if "both-ways" in args.filter else None,
+            geometry=next((name for name in args.filter if name in ("plane", "motion")), None),
+        )
     files = write_matches(args.output, one, two, m)
     document = statistics(m) | {"files": files}
     rows: list[tuple[str, object]] = [
         ("matches", f"{len(m)}, {100 * document['share_of_image1']:.1f} % of {args.first}"),
+        *([("filtered", f"{grown - len(m)} of {grown} taken away")] if args.filter else []),
         ("status", m.status),
         ("seeds", f"{len(m.seeds)}, {document['seeds_that_grew']} of them grew"),
     ]
@@ -79,4 +91,13 @@ def add_match(commands: Any) -> None:
         "--profile", action="append", metavar="PROFILE", help="of the camera; twice for two cameras. Needs --pose"
     )
     p.add_argument("--pose", metavar="FILE", help="cam2_from_cam1: the 12 numbers of [R | t], row by row")
+    p.add_argument(
+        "--filter",
+        action="append",
+        choices=FILTERS,
+        default=[],
+        help="keep only matches that fit their neighbours (consistent), that the reverse direction confirms "
+        "(both-ways), or that fit the one plane or rigid motion that most agree with (pinhole pictures); may be "
+        "repeated",
+    )
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

@@ -276,6 +276,120 @@ def test_turns_by_epipolar_lines() -> None:
     assert len(m) > 8000 and np.mean(errors(m, fisheye_truth) < 1) >= 0.98
 
 
+# ---- invariants, and what filters take away
+
+
+def test_swapped_images_give_the_inverse_map() -> None:
+    a = np.array([[0.9, -0.2], [0.25, 1.0]])
+    there, back = affine(a)
+    one, two = pair(back)
+    m = pf.match_quasi_dense(one, two, one_seed(there, a))
+    reverse = pf.match_back(one, two, m)
+    check_invariants(reverse)
+    index = reverse.map1()
+    x, y = np.rint(m.xy2).astype(int).T
+    k = np.flatnonzero(index[y, x] >= 0)
+    j = index[y, x][k]
+    home = reverse.xy2[j] + np.einsum("kij,kj->ki", reverse.affine[j], m.xy2[k] - reverse.xy1[j])
+    assert len(k) >= 0.9 * len(m)
+    assert np.mean(np.linalg.norm(home - m.xy1[k], axis=1) < 1) >= 0.95
+
+
+def test_children_are_where_their_parents_map_has_them() -> None:
+    """To the search's one pixel, half of one for the fraction and one for the fit, in units of the map."""
+    for m in (
+        pf.match_quasi_dense(*pair(unbend), one_seed(bend, bend_slope()), mode=k) for k in ("constant", "adaptive")
+    ):
+        check_invariants(m)
+        child = np.flatnonzero(m.parent >= 0)
+        up = m.parent[child]
+        off = m.xy2[child] - m.xy2[up] - np.einsum("kij,kj->ki", m.affine[up], m.xy1[child] - m.xy1[up])
+        bound = 1.5 * np.maximum(1, np.linalg.norm(m.affine[up], 2, axis=(1, 2))) + 1
+        assert (np.abs(off).max(axis=1) <= bound).all()
+
+
+def spoiled(m: pf.Matches, share: float) -> tuple[pf.Matches, NDArray[np.bool_]]:
+    """Some matches moved by 5 to 30 pixels, islands of 4 x 4 among them; and which."""
+    rng = np.random.default_rng(8)
+    corner = (m.xy1 // 4).astype(int)
+    wrong = rng.random((H // 4 + 1, W // 4 + 1))[corner[:, 1], corner[:, 0]] < share
+    shift = rng.uniform(5, 30, (H // 4 + 1, W // 4 + 1, 2))[corner[:, 1], corner[:, 0]]
+    from dataclasses import replace
+
+    to = np.clip(m.xy2 + wrong[:, None] * shift, 0, [W - 1, H - 1])
+    _, first = np.unique(np.rint(to), axis=0, return_index=True)
+    keep = np.zeros(len(m), bool)
+    keep[first] = True
+    from pipefish.matching_filters import select
+
+    return select(replace(m, xy2=to), keep), wrong[keep]
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_what_contradicts_its_neighbours_goes(scale: float) -> None:
+    a = scale * np.array([[0.95, -0.2], [0.25, 1.0]])
+    there, back = affine(a)
+    m, wrong = spoiled(pf.match_quasi_dense(*pair(back), one_seed(there, a)), 0.1)
+    kept = pf.filter_matches(m)
+    off = errors(kept, there) > 3
+    assert wrong.sum() > 200 and off.sum() <= 0.02 * wrong.sum()
+    assert len(kept) >= 0.9 * (~wrong).sum()
+    grown = kept.parent >= 0  # whose parents went have grandparents now
+    assert (kept.parent < np.arange(len(kept))).all()
+    assert np.array_equal(kept.seed[grown], kept.seed[kept.parent[grown]])
+
+
+@pytest.mark.parametrize("geometry", ["plane", "motion"])
+def test_what_is_off_the_plane_or_the_motion_goes(geometry: str) -> None:
+    """Of two planes 6 pixels apart under one motion along x, `plane` keeps the larger one, `motion` both; neither keeps
+    what is wrong."""
+
+    def there(x: Floats) -> Floats:
+        step = 8 + 0.02 * x[..., :1] + np.where(x[..., 1:] > 0.7 * H, 6.0, 0.0)
+        return x + np.concatenate([step, 0 * step], axis=-1)
+
+    one = waves(grid())
+    x2 = grid()
+    source = x2[..., 0] - 8 - np.where(x2[..., 1] > 0.7 * H, 6.0, 0.0)
+    two = waves(np.stack([source / 1.02, x2[..., 1]], axis=-1))
+    at = np.array([[60.0, 40.0], [60.0, 140.0]])
+    m = pf.match_quasi_dense(noisy(one, 1), noisy(two, 2), pf.Seeds(at, there(at)))
+    m, wrong = spoiled(m, 0.15)
+    kept = pf.filter_matches(m, least=0, geometry=geometry)
+    lower = kept.xy1[:, 1] > 0.7 * H + 6
+    right = ~wrong & (m.xy1[:, 1] < 0.7 * H - 6)
+    if geometry == "plane":
+        assert np.mean(errors(kept, there) > 3) <= 0.01
+        assert lower.sum() <= 0.02 * len(kept)
+    else:
+        assert np.abs(kept.xy2[:, 1] - kept.xy1[:, 1]).max() <= 2.5  # lines of this motion are rows
+        assert lower.sum() >= 0.8 * (~wrong & (m.xy1[:, 1] > 0.7 * H + 6)).sum()
+    assert (~lower).sum() >= 0.9 * right.sum()
+
+
+def test_matches_that_nothing_holds_together_come_to_nothing() -> None:
+    rng = np.random.default_rng(2)
+    one, two = pair(affine(np.eye(2))[1])
+    m = pf.match_quasi_dense(one, two, one_seed(affine(np.eye(2))[0], np.eye(2)))
+    from dataclasses import replace
+
+    mixed = replace(m, xy2=m.xy2[rng.permutation(len(m))])
+    for geometry in ("plane", "motion"):
+        left = pf.filter_matches(mixed, least=0, geometry=geometry)
+        assert len(left) == 0 and left.status == "nothing left"
+
+
+def test_filters_refuse_what_cannot_be() -> None:
+    m = pf.match_quasi_dense(PLAIN, PLAIN)
+    with pytest.raises(pf.ArgumentError, match="least: -1"):
+        pf.filter_matches(m, least=-1)
+    with pytest.raises(pf.ArgumentError, match="kind: 'sphere'"):
+        pf.filter_matches(m, geometry="sphere")
+    with pytest.raises(pf.ArgumentError, match="back: not of the same"):
+        pf.filter_matches(m, back=pf.match_quasi_dense(np.zeros((64, 80), np.uint8), PLAIN))
+    assert len(pf.filter_matches(m)) == 0
+
+
 # ---- what is wrong is refused
 
 PLAIN = np.zeros((64, 64), np.uint8)
@@ -369,3 +483,60 @@ def test_a_wall_seen_from_40_degrees_aside(real_data: Callable[[str], Path]) -> 
     e = np.linalg.norm(p[:, :2] / p[:, 2:] - m.xy2, axis=1)
     assert wall.sum() >= 150_000
     assert np.mean(e[wall] < 3) >= 0.93
+    motion = pf.filter_matches(m, least=0, geometry="motion")
+    p = np.c_[motion.xy1, np.ones(len(motion))] @ h.T
+    assert len(motion) >= 150_000
+    assert np.mean(np.linalg.norm(p[:, :2] / p[:, 2:] - motion.xy2, axis=1) < 3) >= 0.9  # of all of them
+
+
+def fountain(folder: Path, number: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], Floats, Floats]:
+    """A picture in that size, K and cam_from_world."""
+    rows = [r.split() for r in (folder / "gt_dense_cameras" / f"{number:04d}.jpg.camera").read_text().splitlines()]
+    k, r = np.array(rows[:3], float), np.array(rows[4:7], float)
+    name = next((folder / "images").glob(f"{number:04d}*"))
+    with Image.open(name) as opened:
+        shrink = size[0] / opened.size[0]
+        grey = np.asarray(opened.convert("L").resize(size, Image.Resampling.BOX))
+    k = np.diag([shrink, shrink, 1]) @ k
+    k[:2, 2] += (shrink - 1) / 2  # pixel centres are whole numbers
+    return grey, k, np.column_stack([r.T, -r.T @ np.array(rows[7], float)])
+
+
+@pytest.mark.parametrize("first", [4, 5])
+def test_photographs_with_known_motion_match_on_their_epipolar_lines(
+    first: int, real_data: Callable[[str], Path]
+) -> None:
+    """fountain-P11: 95 % within 2 pixels of the true line, and 70 % of the textured pixels that both photographs show:
+    those that the nearest matches' maps take into the other photograph."""
+    folder = real_data("multiview/fountain-P11")
+    (one, k1, p1), (two, k2, p2) = (fountain(folder, n, (768, 512)) for n in (first, first + 1))
+    m = pf.match_quasi_dense(one, two)
+    r = p2[:, :3] @ p1[:, :3].T
+    t = p2[:, 3] - r @ p1[:, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    f = np.linalg.inv(k2).T @ cross @ r @ np.linalg.inv(k1)
+    a, b = np.c_[m.xy1, np.ones(len(m))], np.c_[m.xy2, np.ones(len(m))]
+    line = a @ f.T
+    distance = np.abs((line * b).sum(axis=1)) / np.linalg.norm(line[:, :2], axis=1)
+    assert np.mean(distance < 2) >= 0.95
+    value = one / 255
+    steps = [np.abs(np.diff(value, axis=0, prepend=0)), np.abs(np.diff(value, axis=0, append=0))]
+    steps += [np.abs(np.diff(value, axis=1, prepend=0)), np.abs(np.diff(value, axis=1, append=0))]
+    textured = (np.max(steps, axis=0) > 0.01)[8:-8, 8:-8]
+    good = m.map1()
+    tile = 16  # pixels: the median shift of a tile's matches stands for its other pixels
+    shared = covered = 0
+    for y in range(8, good.shape[0] - tile - 8, tile):
+        for x in range(8, good.shape[1] - tile - 8, tile):
+            here = good[y : y + tile, x : x + tile]
+            rough = textured[y - 8 : y - 8 + tile, x - 8 : x - 8 + tile]
+            inside = here[here >= 0]
+            near = inside if len(inside) else good[max(0, y - 48) : y + 64, max(0, x - 48) : x + 64]
+            near = near[near >= 0]
+            if not len(near):
+                continue
+            to = np.array([x, y]) + np.median(m.xy2[near] - m.xy1[near], axis=0)
+            if (to >= 8).all() and (to + tile < np.array(two.shape[::-1]) - 8).all():
+                shared += rough.sum()
+                covered += (rough & (here >= 0)).sum()
+    assert shared > 100_000 and covered >= 0.7 * shared

@@ -7,6 +7,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
+#include <limits>
 #include <memory>
 
 namespace nb = nanobind;
@@ -101,6 +102,26 @@ Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at
     return grow(one, two, seeds, options, epipolar ? &*epipolar : nullptr);
 }
 
+// Values between pixels, by the cubic spline through them; places within two pixels of the rim are NaN.
+nb::ndarray<nb::numpy, float> sample_image(const Picture &image, const Rows2 &places)
+{
+    const size_t n = places.shape(0);
+    auto values = std::make_unique<float[]>(std::max<size_t>(1, n));
+    {
+        const nb::gil_scoped_release release;
+        const ScaleStack stack(view(image));
+        const Image &coefficients = stack.spline_for_step(1);
+        const auto right = static_cast<double>(stack.width() - 3), bottom = static_cast<double>(stack.height() - 3);
+        for (size_t k = 0; k < n; k++) {
+            const double x = places(k, 0), y = places(k, 1);
+            values[k] = x >= 2 && y >= 2 && x <= right && y <= bottom
+                            ? spline(coefficients, static_cast<float>(x), static_cast<float>(y))
+                            : std::numeric_limits<float>::quiet_NaN();
+        }
+    }
+    return array<float>({n}, std::move(values));
+}
+
 } // namespace
 
 void bind_match(nb::module_ &m)
@@ -143,6 +164,8 @@ void bind_match(nb::module_ &m)
         },
         nb::arg("image1"), nb::arg("image2"), nb::arg("most"), nb::arg("adapt"), nb::arg("extremal"),
         nb::arg("threads"), "Two (H,W) float32 of 0..1 -> (S,8): x1, y1, x2, y2, the map row by row.");
+    m.def("sample_image", &sample_image, nb::arg("image"), nb::arg("xy"),
+          "(H,W) float32, (N,2) pixels -> (N,) float32 by cubic splines, NaN within two pixels of the rim.");
     m.def(
         "grow_matches",
         [](const Picture &first, const Picture &second, const Rows2 &at, const Rows2 &centre, const Maps &maps,

@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
 namespace pipefish::match
 {
@@ -115,10 +116,31 @@ struct Window {
     // Sum of products with the window at `from` (values next to each other).
     float dot(const float *from, size_t stride) const
     {
+        switch (side) {
+        case 5:
+            return dot_of<5>(from, stride);
+        case 7:
+            return dot_of<7>(from, stride);
+        case 9:
+            return dot_of<9>(from, stride);
+        case 11:
+            return dot_of<11>(from, stride);
+        case 13:
+            return dot_of<13>(from, stride);
+        default:
+            return dot_of<15>(from, stride);
+        }
+    }
+
+    // The same for a side known beforehand: no loops left, and the window stays in registers from one place to the
+    // next.
+    template <int kSide> float dot_of(const float *from, size_t stride) const
+    {
+        constexpr int kVectors = (kSide + 3) / 4;
         Float4 sum = {};
-        for (int j = 0; j < side; j++)
-            for (int k = 0; k < vectors; k++)
-                sum += load(v + 4 * (j * vectors + k)) * load(from + static_cast<size_t>(j) * stride + 4 * k);
+        for (int j = 0; j < kSide; j++)
+            for (int k = 0; k < kVectors; k++)
+                sum += load(v + 4 * (j * kVectors + k)) * load(from + static_cast<size_t>(j) * stride + 4 * k);
         return total(sum);
     }
 };
@@ -164,11 +186,14 @@ public:
         if (options.mode == Mode::kTranslation) {
             whole_1_ = statistics_of(first.image());
             whole_2_ = statistics_of(second.image());
+            last_shift_ = cv::Mat1i(first.image().size(), INT32_MIN);
         }
     }
 
     Growth run(const std::vector<Seed> &seeds)
     {
+        // Once for all: growing it would copy, and touch new pages of memory, twice over.
+        out_.matches.reserve(std::min(free_1_.total(), free_2_.total()));
         plant(seeds);
         std::vector<Candidate> found;
         for (int id = queue_.pop(); id >= 0; id = queue_.pop()) {
@@ -212,6 +237,15 @@ private:
     bool is_free(int x, int y) const
     {
         return x >= 0 && y >= 0 && x < free_1_.cols && y < free_1_.rows && free_1_(y, x) != 0;
+    }
+
+    // Which of the 5 pixels from x - 2 on are free, a byte each: most rows around a match are not, at one look. Matches
+    // are never nearer to the rim than that.
+    uint64_t free_row(int x, int y) const
+    {
+        uint64_t bytes = 0;
+        std::memcpy(&bytes, free_1_[y] + x - kReach, 2 * kReach + 1);
+        return bytes;
     }
 
     void commit(const Match &m)
@@ -277,10 +311,9 @@ private:
     // all neighbours are then windows of two small pictures. Where image 1 is the finer one, samples are `step` apart.
     void look_around(const Match &m, std::vector<Candidate> &found)
     {
-        int free = 0;
+        uint64_t free = 0;
         for (int dy = -kReach; dy <= kReach; dy++)
-            for (int dx = -kReach; dx <= kReach; dx++)
-                free += is_free(m.x + dx, m.y + dy);
+            free |= free_row(m.x, m.y + dy);
         if (!free)
             return;
         const Sampling s = sampling_for(first_, second_, m.a);
@@ -455,41 +488,52 @@ private:
 
     void look_around_whole(const Match &m, std::vector<Candidate> &found)
     {
-        const int r = options_.radius, margin = r + 4;
         const int tx = static_cast<int>(std::lround(m.centre.x())) - m.x,
                   ty = static_cast<int>(std::lround(m.centre.y())) - m.y;
-        int order = 0;
-        for (int y = m.y - kReach; y <= m.y + kReach; y++)
-            for (int x = m.x - kReach; x <= m.x + kReach; x++, order++) {
-                const int x_2 = x + tx, y_2 = y + ty;
-                if (!is_free(x, y) || x < margin || y < margin || x + margin >= free_1_.cols ||
-                    y + margin >= free_1_.rows || x_2 < margin || y_2 < margin || x_2 + margin >= free_2_.cols ||
-                    y_2 + margin >= free_2_.rows)
-                    continue;
-                if (!any_free_2({static_cast<float>(x_2), static_cast<float>(y_2)}, Eigen::Matrix2f::Identity())) {
-                    out_.taken++;
-                    continue;
-                }
-                out_.tried++;
-                Window window;
-                const Image &one = first_.image(), &two = second_.image();
-                if (whole_1_.inverse(y, x) == 0)
-                    continue;
-                window.take_known(one[y - r] + x - r, one.step1(), r, whole_1_.mean(y, x), whole_1_.inverse(y, x));
-                float z[3][3];
-                for (int ej = -1; ej <= 1; ej++)
-                    for (int ei = -1; ei <= 1; ei++)
-                        z[ej + 1][ei + 1] = whole_2_.inverse(y_2 + ej, x_2 + ei) * window.inverse_sigma *
-                                            window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
-                const Peak peak(z);
-                if (static_cast<double>(peak.zncc) < options_.zncc_min) {
-                    out_.low_zncc++;
-                    continue;
-                }
-                found.push_back({order, x, y,
-                                 Eigen::Vector2f(static_cast<float>(x_2), static_cast<float>(y_2)) + peak.at, peak.zncc,
-                                 peak.at_border});
-            }
+        for (int dy = -kReach; dy <= kReach; dy++) {
+            if (!free_row(m.x, m.y + dy))
+                continue;
+            for (int dx = -kReach; dx <= kReach; dx++)
+                if (free_1_(m.y + dy, m.x + dx))
+                    try_whole(m.x + dx, m.y + dy, tx, ty, (dy + kReach) * (2 * kReach + 1) + dx + kReach, found);
+        }
+    }
+
+    void try_whole(int x, int y, int tx, int ty, int order, std::vector<Candidate> &found)
+    {
+        const int r = options_.radius, margin = r + 4, x_2 = x + tx, y_2 = y + ty;
+        const int shift = ty * 65536 + tx; // images have at most 16384 pixels a side
+        if (last_shift_(y, x) == shift)
+            return;
+        last_shift_(y, x) = shift;
+        if (x < margin || y < margin || x + margin >= free_1_.cols || y + margin >= free_1_.rows || x_2 < margin ||
+            y_2 < margin || x_2 + margin >= free_2_.cols || y_2 + margin >= free_2_.rows)
+            return;
+        const uint8_t *cell = free_2_[y_2] + x_2;
+        const ptrdiff_t row = free_2_.cols;
+        if (!(cell[-row - 1] | cell[-row] | cell[-row + 1] | cell[-1] | cell[0] | cell[1] | cell[row - 1] | cell[row] |
+              cell[row + 1])) {
+            out_.taken++;
+            return;
+        }
+        out_.tried++;
+        const Image &one = first_.image(), &two = second_.image();
+        if (whole_1_.inverse(y, x) == 0)
+            return;
+        Window window;
+        window.take_known(one[y - r] + x - r, one.step1(), r, whole_1_.mean(y, x), whole_1_.inverse(y, x));
+        float z[3][3];
+        for (int ej = -1; ej <= 1; ej++)
+            for (int ei = -1; ei <= 1; ei++)
+                z[ej + 1][ei + 1] = whole_2_.inverse(y_2 + ej, x_2 + ei) * window.inverse_sigma *
+                                    window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
+        const Peak peak(z);
+        if (static_cast<double>(peak.zncc) < options_.zncc_min) {
+            out_.low_zncc++;
+            return;
+        }
+        found.push_back({order, x, y, Eigen::Vector2f(static_cast<float>(x_2), static_cast<float>(y_2)) + peak.at,
+                         peak.zncc, peak.at_border});
     }
 
     // ---- taking a candidate
@@ -531,22 +575,30 @@ private:
         const Image &one = first_.image(), &two = second_.image();
         const float mean[2] = {whole_1_.mean(c.y, c.x), whole_2_.mean(y_2, x_2)};
         const float inverse[2] = {whole_1_.inverse(c.y, c.x), whole_2_.inverse(y_2, x_2)};
-        float xx = 0, xy = 0, yy = 0, xe = 0, ye = 0;
+        Float4 sums[5] = {}; // xx, xy, yy, xe, ye
+        const int n = 2 * r + 1, full = n / 4 * 4;
+        Float4 last = {};
+        for (int k = 0; k < n - full; k++)
+            last[k] = 1;
         for (int j = -r; j <= r; j++) {
-            const float *p = one[c.y + j] + c.x, *q = two[y_2 + j] + x_2;
-            const float *p0 = one[c.y + j - 1] + c.x, *p1 = one[c.y + j + 1] + c.x;
-            const float *q0 = two[y_2 + j - 1] + x_2, *q1 = two[y_2 + j + 1] + x_2;
-            for (int i = -r; i <= r; i++) {
-                const float gx = 0.25F * ((p[i + 1] - p[i - 1]) * inverse[0] + (q[i + 1] - q[i - 1]) * inverse[1]);
-                const float gy = 0.25F * ((p1[i] - p0[i]) * inverse[0] + (q1[i] - q0[i]) * inverse[1]);
-                const float e = (p[i] - mean[0]) * inverse[0] - (q[i] - mean[1]) * inverse[1];
-                xx += gx * gx;
-                xy += gx * gy;
-                yy += gy * gy;
-                xe += gx * e;
-                ye += gy * e;
+            const float *p = one[c.y + j] + c.x - r, *q = two[y_2 + j] + x_2 - r;
+            const size_t step = one.step1(), step_2 = two.step1();
+            for (int i = 0; i < n; i += 4) {
+                const Float4 gx = 0.25F * ((load(p + i + 1) - load(p + i - 1)) * inverse[0] +
+                                           (load(q + i + 1) - load(q + i - 1)) * inverse[1]);
+                const Float4 gy = 0.25F * ((load(p + i + step) - load(p + i - step)) * inverse[0] +
+                                           (load(q + i + step_2) - load(q + i - step_2)) * inverse[1]);
+                const Float4 e = (load(p + i) - mean[0]) * inverse[0] - (load(q + i) - mean[1]) * inverse[1];
+                const Float4 x = i < full ? gx : gx * last, y = i < full ? gy : gy * last;
+                sums[0] += x * gx;
+                sums[1] += x * gy;
+                sums[2] += y * gy;
+                sums[3] += x * e;
+                sums[4] += y * e;
             }
         }
+        const float xx = total(sums[0]), xy = total(sums[1]), yy = total(sums[2]), xe = total(sums[3]),
+                    ye = total(sums[4]);
         const float ridge = 1e-3F * (xx + yy), det = (xx + ridge) * (yy + ridge) - xy * xy;
         const Eigen::Vector2f t = Eigen::Vector2f((yy + ridge) * xe - xy * ye, (xx + ridge) * ye - xy * xe) / det;
         const Eigen::Vector2f whole(static_cast<float>(x_2), static_cast<float>(y_2));
@@ -581,6 +633,9 @@ private:
     cv::Mat1b free_1_,
         free_2_; // where a match may be: textured, and without one yet. Bytes: they are all over the cache
     Statistics whole_1_, whole_2_;
+    // Of each pixel of image 1, the shift it was last tried with and failed: it would fail again, as windows stay the
+    // same and what is taken stays taken. Saves a third of the work.
+    cv::Mat1i last_shift_;
     Queue queue_;
     Growth out_;
     std::vector<float> block_;

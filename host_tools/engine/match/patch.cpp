@@ -81,19 +81,26 @@ bool sane(const Eigen::Matrix2f &a)
     return det > 1.0F / 36 && det < 36 && most <= 36 * least;
 }
 
+bool compare(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local,
+             Pair &out)
+{
+    out.s = sampling_for(first, second, local.a);
+    if (!fits(out.s, x, y, r, local))
+        return false;
+    sample_first(out.s, x, y, r, out.p);
+    sample_second(out.s, local, r, out.q);
+    out.lp = level_of(out.p, r);
+    out.lq = level_of(out.q, r);
+    if (static_cast<double>(std::min(out.lp.sigma, out.lq.sigma)) < sigma_min)
+        return false;
+    local.zncc = correlate(out.p, out.lp, out.q, out.lq, r);
+    return true;
+}
+
 bool measure(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local)
 {
-    const Sampling s = sampling_for(first, second, local.a);
-    if (!fits(s, x, y, r, local))
-        return false;
-    Patch p, q;
-    sample_first(s, x, y, r, p);
-    sample_second(s, local, r, q);
-    const Level lp = level_of(p, r), lq = level_of(q, r);
-    if (static_cast<double>(std::min(lp.sigma, lq.sigma)) < sigma_min)
-        return false;
-    local.zncc = correlate(p, lp, q, lq, r);
-    return true;
+    Pair pair;
+    return compare(first, second, x, y, r, sigma_min, local, pair);
 }
 
 } // namespace pipefish::match

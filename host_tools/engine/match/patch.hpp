@@ -24,9 +24,6 @@ Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const E
 
 constexpr int kPatchMost = 10; // largest radius of a patch, in samples
 
-// Sets local.zncc over (2 r + 1)^2 samples; false where the patch leaves an image or is flatter than sigma_min.
-bool measure(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local);
-
 constexpr int kPatchWide = 2 * kPatchMost + 4; // a row of a patch with its rim, in whole Float4s from index 0
 
 // (2 r + 3)^2 samples: row and column 0 are the rim at -(r + 1). Four zeros end each row.
@@ -44,6 +41,19 @@ struct Level {
 };
 Level level_of(const Patch &p, int r);
 float correlate(const Patch &p, Level lp, const Patch &q, Level lq, int r);
+
+// Both patches of a match in one frame.
+struct Pair {
+    Sampling s;
+    Patch p, q;
+    Level lp, lq;
+};
+// Samples both and sets local.zncc over (2 r + 1)^2 of them; false where a patch leaves its image or is flatter than
+// sigma_min.
+bool compare(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local,
+             Pair &out);
+// The same where only the correlation matters.
+bool measure(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local);
 
 // Bounds on what a map may be: shape (ratio of singular values) at most 6, scale 1/6 to 6.
 bool sane(const Eigen::Matrix2f &a);

@@ -114,17 +114,11 @@ Normal normal_of(const Patch &p, Level lp, const Patch &q, Level lq, int r)
 bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, float max_shift,
             float max_change, Local &local, float *shift)
 {
-    const Sampling s = sampling_for(first, second, local.a);
-    if (!fits(s, x, y, r, local))
+    Pair pair;
+    if (!compare(first, second, x, y, r, sigma_min, local, pair))
         return false;
-    Patch p, q;
-    sample_first(s, x, y, r, p);
-    sample_second(s, local, r, q);
-    const Level lp = level_of(p, r), lq = level_of(q, r);
-    if (static_cast<double>(std::min(lp.sigma, lq.sigma)) < sigma_min)
-        return false;
-    local.zncc = correlate(p, lp, q, lq, r);
-    Normal n = normal_of(p, lp, q, lq, r);
+    const Sampling &s = pair.s;
+    Normal n = normal_of(pair.p, pair.lp, pair.q, pair.lq, r);
     // A thousandth of the typical strength: what the patch does not tell (along an edge) stays as it is.
     const double shift_ridge = 1e-3 * (n.h(0, 0) + n.h(1, 1)), map_ridge = 1e-3 * n.h.diagonal().segment<4>(2).sum();
     n.h.diagonal().head<2>().array() += shift_ridge;
@@ -148,9 +142,9 @@ bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int
         if (!measure(first, second, x, y, r, sigma_min, moved))
             return false;
     } else {
-        sample_second(s_2, moved, r, q, 0);
-        const Level moved_lq = level_of(q, r);
-        moved.zncc = correlate(p, lp, q, moved_lq, r);
+        sample_second(s_2, moved, r, pair.q, 0);
+        const Level moved_lq = level_of(pair.q, r);
+        moved.zncc = correlate(pair.p, pair.lp, pair.q, moved_lq, r);
         if (static_cast<double>(moved_lq.sigma) < sigma_min)
             return false;
     }

@@ -1,0 +1,93 @@
+"""The command `pipefish dense`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from pipefish.cli import Result, add_command, positive, table
+from pipefish.errors import ArgumentError, PipefishError
+
+
+def run_dense(args: argparse.Namespace) -> Result:
+    """Measures the wall of a reconstructed survey densely."""
+    from pipefish.dense import dense_wall
+    from pipefish.dense_files import read_survey_of, write_dense
+    from pipefish.measured_texts import length_text
+    from pipefish.progress import Progress
+
+    measured = read_survey_of(Path(args.measured), Path(args.survey) if args.survey else None)
+    maps = []
+    problem: ArgumentError | None = None
+    with Progress("dense", 100 * len(measured.walls), args.json) as bar:
+        for n, wall in enumerate(list(measured.walls)):
+            try:
+                found = dense_wall(
+                    measured.picture,
+                    measured.camera,
+                    measured.poses,
+                    wall,
+                    cell=args.cell / 1000 if args.cell else None,
+                    scale=args.scale,
+                    threads=args.threads,
+                    tell=lambda done, n=n: bar.update(round(100 * (n + done))),
+                )
+            except ArgumentError as error:
+                problem = error
+                continue
+            maps.append((n, found))
+        if not maps:
+            raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
+        for values in (measured.walls, measured.origins, measured.signs):
+            values[:] = [values[n] for n, _ in maps]
+        document, files = write_dense(Path(args.output), [found for _, found in maps], measured)
+    unit = document["unit"]
+    low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
+    rows: list[tuple[str, object]] = [
+        ("pairs", f"{document['pairs']} of keyframes"),
+        (
+            "cells",
+            f"{document['measured']} of {length_text(document['cell'], unit)}, {100 * document['coverage']:.0f} % of "
+            "those in view of two pairs",
+        ),
+        ("sigma of a cell", f"median {length_text(document['sigma_median'], unit)}"),
+        (
+            "off the tube",
+            f"median {length_text(middle, unit)}, 90 % within {length_text(low, unit)} to {length_text(high, unit)}",
+        ),
+    ]
+    for r in document["regions"][:20]:
+        rows.append(
+            (
+                r["kind"],
+                f"{length_text(abs(r['height']), unit)} +- {length_text(1.96 * r['sigma'], unit)} (95 %) at "
+                f"{r['chainage']:.3f}, {r['clock_text']}, {length_text(r['length'], unit)} long",
+            )
+        )
+    return document, table([*rows, *(("written", f) for f in files)])
+
+
+def add_dense(commands: Any) -> None:
+    """Adds `dense` to the command line."""
+    p = add_command(
+        commands,
+        "dense",
+        run_dense,
+        "Measure the wall of a reconstructed survey densely: keyframes are unrolled onto the fitted tube and matched; "
+        "writes a map of how far the wall is from the tube with a sigma for each cell, as tables, arrays, a picture "
+        "and a point cloud, and what stands in or out of it.",
+        "pipefish reconstruct survey.mcap -o out/ && pipefish dense out/ -o out/dense/",
+    )
+    p.add_argument("measured", metavar="DIR", help="of pipefish reconstruct")
+    p.add_argument("-o", "--output", required=True, metavar="FOLDER", help="for what is written")
+    p.add_argument("--survey", metavar="SURVEY", help="the survey file [where it was when DIR was made]")
+    p.add_argument("--cell", type=float, metavar="MM", help="side of the map's cells [a hundredth of the diameter]")
+    p.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        metavar="N",
+        help="pixels of the pictures to a cell of the unrolled ones; 2 takes a quarter of the time [1]",
+    )
+    p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

@@ -1,0 +1,247 @@
+"""What `pipefish dense` reads, a folder of `pipefish reconstruct` with its survey, and what it writes: the map of the
+wall as tables, arrays, a picture and a point cloud."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipefish.camera import Camera
+from pipefish.cloudfile import ply_bytes
+from pipefish.colours import diverging
+from pipefish.dense import DenseWall
+from pipefish.errors import FormatError
+from pipefish.files import write_atomically
+from pipefish.measured_files import plain
+from pipefish.measured_texts import clock_text, column, read_measured
+from pipefish.survey import Survey
+from pipefish.wallmodel import Floats, WallModel, read_walls
+
+FORMAT, VERSION = "pipefish-dense", 1
+MAP_WIDTH = 3000  # pixels at most; cells are drawn up to 3 x 3
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A measured survey: its camera, keyframes with poses (n,3,4) and pictures, the pieces of its tube, each with the
+    chainage at its start and the way it grows along s."""
+
+    document: dict[str, Any]
+    survey: Survey
+    camera: Camera
+    keyframes: list[int]
+    poses: Floats
+    walls: list[WallModel]
+    origins: list[float]
+    signs: list[int]
+
+    def picture(self, k: int) -> NDArray[np.uint8]:
+        """Of the k-th pose."""
+        return np.asarray(self.survey.keyframes[self._places[self.keyframes[k]]].image)
+
+    @property
+    def _places(self) -> dict[int, int]:
+        return {frame.index: place for place, frame in enumerate(self.survey.keyframes)}
+
+
+def read_survey_of(folder: Path, survey: Path | None) -> Measured:
+    """The folder's tables and the survey it was made of, at `survey` or where it was. Raises FormatError, OSError."""
+    document = read_measured(folder)
+    path = folder / "reconstruction.json"
+    try:
+        poses, camera = document["poses"], Camera.from_document(document["camera"]["profile"], path)
+        rotations = _rotations(np.array(poses["quaternion"], float).reshape(-1, 4))
+        matrices = np.concatenate([rotations, np.array(poses["translation"], float).reshape(-1, 3, 1)], axis=2)
+        index = [int(k) for k in poses["keyframe"]]
+        place = np.column_stack([column(document, name) for name in ("x", "y", "z")])
+        tangent = np.column_stack([column(document, name) for name in ("tx", "ty", "tz")])
+        chainage, stretch = column(document, "chainage"), np.array(document["stations"]["stretch"])
+        signs = {t["stretch"]: int(t["chainage_sign"]) for t in document["tubes"]}
+        source = document["survey"]["file"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(path, None, f"not whole: {error!r:.80}") from None
+    opened = Survey.open(survey or source)
+    lacking = sorted(set(index) - {k.index for k in opened.keyframes})
+    if opened.survey_id != document["survey"]["survey_id"] or lacking:
+        raise FormatError(opened.path, None, f"is not the survey that {folder} was made of")
+    walls = read_walls(folder)
+    origins, ways = [], []
+    for wall in walls:
+        start = wall.frames([0.0])[0][0]
+        k = int(np.linalg.norm(place - start, axis=1).argmin())
+        ways.append(signs[int(stretch[k])])
+        origins.append(float(chainage[k] + ways[-1] * ((start - place[k]) @ tangent[k])))
+    return Measured(document, opened, camera, index, matrices, walls, origins, ways)
+
+
+def _rotations(q: Floats) -> Floats:
+    """(n,4) unit quaternions (w, x, y, z) -> (n,3,3)."""
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def _table(first: str, along: Floats, clock: Floats, values: Floats) -> bytes:
+    """A grid as CSV: chainage in the first column, clock hours in the first row."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([first, *(f"{c * 6 / math.pi:.3f}" for c in clock)])
+    for s, row in zip(along, values, strict=True):
+        writer.writerow([f"{s:.4f}", *("" if math.isnan(v) else f"{v:.3f}" for v in row)])
+    return stream.getvalue().encode()
+
+
+def map_picture(found: DenseWall, chainage: Floats, unit: str) -> NDArray[np.uint8]:
+    """(H,W,3): the deviation in colours above, the unrolled pipe below, chainage to the right, clock downwards from
+    twelve o'clock; regions framed."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    rows, columns = found.deviation.shape
+    zoom = max(1, min(3, MAP_WIDTH // rows))
+    factor, name = (1000.0, "mm") if unit == "metre" else (100.0, "% of the diameter")
+    known = np.abs(found.deviation[np.isfinite(found.deviation)])
+    span = max(float(np.percentile(known, 99.5)) if len(known) else 0.0, found.wall.mean_radius / 100)
+    value = found.deviation / span
+    colour = diverging(np.nan_to_num(value).ravel()).reshape(rows, columns, 3)
+    colour[np.isnan(found.deviation)] = (40, 40, 44)
+    most = np.nanpercentile(found.brightness, 99.5) if np.isfinite(found.brightness).any() else 1.0
+    level = (255 * np.clip(np.nan_to_num(found.brightness) / max(most, 1e-6), 0, 1)).astype(np.uint8)
+    maps = [colour.transpose(1, 0, 2), np.repeat(level.T[..., None], 3, axis=2)]
+    left, top, gap = 48, 40, 34
+    height = zoom * columns
+    sheet = Image.new("RGB", (left + max(zoom * rows, 420) + 20, top + 2 * height + 2 * gap), "white")
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(13)
+    for n, picture in enumerate(maps):
+        y0 = top + n * (height + gap)
+        sheet.paste(Image.fromarray(picture).resize((zoom * rows, height), Image.Resampling.NEAREST), (left, y0))
+        for hour in (12, 3, 6, 9, 12):
+            y = y0 + height * (0 if hour == 12 else hour / 12)
+            draw.text((left - 8, y), str(hour), "black", font, anchor="rm")
+        draw.text((left - 8, y0 + height), "12", "black", font, anchor="rm")
+        for s in _ticks(chainage):
+            x = left + zoom * float(np.interp(s, *_ascending(chainage, np.arange(rows))))
+            draw.line([(x, y0 + height), (x, y0 + height + 4)], "black")
+            draw.text((x, y0 + height + 6), f"{s:g}", "black", font, anchor="ma")
+        for r in found.regions:
+            _frame(draw, found, r, zoom, left, y0)
+    draw.text((left, 8), "off the fitted tube (blue: inside)", "black", font)
+    for k in range(160):
+        value = np.array([2 * k / 159 - 1])
+        draw.line([(left + 290 + k, 8), (left + 290 + k, 22)], tuple(int(v) for v in diverging(value)[0]))
+    draw.text((left + 284, 8), f"-{factor * span:.1f}", "black", font, anchor="ra")
+    draw.text((left + 456, 8), f"+{factor * span:.1f} {name}", "black", font)
+    return np.asarray(sheet)
+
+
+def _ascending(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    return (x, y) if x[-1] >= x[0] else (x[::-1], y[::-1])
+
+
+def _ticks(chainage: Floats) -> Floats:
+    """Round chainages, four to ten of them."""
+    low, high = min(chainage), max(chainage)
+    step = 10 ** math.floor(math.log10(max(high - low, 1e-3)))
+    step = next(step * f for f in (0.1, 0.2, 0.5, 1, 2) if (high - low) / (step * f) <= 10)
+    return np.round(np.arange(math.ceil(low / step), math.floor(high / step) + 1) * step, 6)
+
+
+def _frame(draw: Any, found: DenseWall, region: dict[str, float], zoom: int, left: int, top: int) -> None:
+    rows, columns = found.deviation.shape
+    x = [left + zoom * rows * (region["s"] + k * region["length"] / 2) / found.wall.length for k in (-1, 1)]
+    height = zoom * columns
+    y = [top + height * (region["clock"] + k * region["extent"] / 2) / (2 * math.pi) for k in (-1, 1)]
+    draw.rectangle([(x[0] - 3, max(y[0], top) - 3), (x[1] + 3, min(y[1], top + height) + 3)], outline=(220, 30, 140))
+
+
+def cloud(found: DenseWall, unit: str) -> bytes:
+    """The measured cells as a PLY file: place, deviation and sigma, grey level, colour by deviation."""
+    good = np.isfinite(found.deviation)
+    span = found.wall.mean_radius / 50
+    columns = dict(zip("xyz", found.points[good].T, strict=True))
+    columns |= {"deviation": found.deviation[good], "sigma": found.sigma[good]}
+    columns = {name: v.astype(np.float32) for name, v in columns.items()}
+    columns["pairs"] = found.pairs[good].astype(np.uint8)
+    columns["brightness"] = (255 * np.nan_to_num(found.brightness[good])).astype(np.uint8)
+    columns |= dict(zip(("red", "green", "blue"), diverging(found.deviation[good] / span).T, strict=True))
+    return ply_bytes(columns, None, (f"unit: {unit}", f"full colour at {span:.6g} off the fitted tube"))
+
+
+def document_of(maps: list[DenseWall], measured: Measured) -> dict[str, Any]:
+    """The document of dense.json."""
+    regions = []
+    for n, (found, origin, sign) in enumerate(zip(maps, measured.origins, measured.signs, strict=True)):
+        for r in found.regions:
+            place = {
+                "piece": n,
+                "chainage": origin + sign * r["s"],
+                "kind": "inwards" if r["height"] < 0 else "outwards",
+            }
+            regions.append(place | r | {"clock_text": clock_text(r["clock"])})
+    values = np.concatenate([f.deviation[np.isfinite(f.deviation)] for f in maps])
+    sigmas = np.concatenate([f.sigma[np.isfinite(f.deviation)] for f in maps])
+    return plain(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "unit": measured.document["summary"]["unit"],
+            "cells": sum(f.deviation.size for f in maps),
+            "measured": len(values),
+            "coverage": float(np.mean([f.coverage for f in maps])) if maps else 0.0,
+            "cell": maps[0].s[1] - maps[0].s[0] if maps and len(maps[0].s) > 1 else None,
+            "pairs": sum(f.pairs_used for f in maps),
+            "deviation_p05_p50_p95": np.percentile(values, [5, 50, 95]) if len(values) else None,
+            "sigma_median": float(np.median(sigmas)) if len(sigmas) else None,
+            "regions": regions,
+        }
+    )
+
+
+def write_dense(folder: Path, maps: list[DenseWall], measured: Measured) -> tuple[dict[str, Any], list[str]]:
+    """Writes dense.json, and of each piece dense.npz, deviation.csv, sigma.csv, dense.png, dense.ply (from the second
+    piece on with its number). Returns the document and the paths. Raises OSError."""
+    from PIL import Image
+
+    unit = measured.document["summary"]["unit"]
+    factor, length = (1000.0, "mm") if unit == "metre" else (1.0, "diameters")
+    contents: dict[str, bytes] = {}
+    for n, (found, origin, sign) in enumerate(zip(maps, measured.origins, measured.signs, strict=True)):
+        end = "" if n == 0 else f"-{n + 1}"
+        chainage = origin + sign * found.s
+        packed, picture = io.BytesIO(), io.BytesIO()
+        arrays = {"deviation": found.deviation, "sigma": found.sigma, "pairs": found.pairs}
+        np.savez_compressed(
+            packed,
+            chainage=chainage,
+            s=found.s,
+            clock=found.clock,
+            brightness=found.brightness,
+            points=found.points,
+            **arrays,
+        )
+        Image.fromarray(map_picture(found, chainage, unit)).save(picture, "PNG")
+        contents[f"dense{end}.npz"] = packed.getvalue()
+        corner = f"chainage / clock ({length})"
+        contents[f"deviation{end}.csv"] = _table(corner, chainage, found.clock, factor * found.deviation)
+        contents[f"sigma{end}.csv"] = _table(corner, chainage, found.clock, factor * found.sigma)
+        contents[f"dense{end}.png"] = picture.getvalue()
+        contents[f"dense{end}.ply"] = cloud(found, unit)
+    document = document_of(maps, measured)
+    document["files"] = [*contents, "dense.json"]
+    contents["dense.json"] = json.dumps(document).encode()  # last: what is there is whole
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, data in contents.items():
+        write_atomically(folder / file, data)
+    return document, [str(folder / file) for file in contents]

@@ -1,0 +1,131 @@
+"""A fitted tube as rings of wall points: fast both ways between places (s, clock) and points. Lengths as given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipefish.cloudfile import read_columns
+from pipefish.errors import ArgumentError, FormatError
+from pipefish.measured_files import RING
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class WallModel:
+    """One piece of a tube between two joints, or a tube without joints.
+
+    rings   (n,m,3): ring by ring, wall points at m equal steps of the clock from twelve o'clock on, clockwise looking
+            along increasing s, as Tube.mesh() gives them
+
+    The axis is the line through the rings' means. Places between rings: cubic along the axis, linear in the radius."""
+
+    rings: Floats
+
+    def __post_init__(self) -> None:
+        rings = np.asarray(self.rings, float)
+        if rings.ndim != 3 or rings.shape[0] < 2 or rings.shape[1] < 8 or rings.shape[2] != 3:
+            raise ArgumentError(f"rings: shape {rings.shape} is not (2 or more, 8 or more, 3)")
+        if not np.isfinite(rings).all():
+            raise ArgumentError("rings: not finite")
+        centre = rings.mean(axis=1)
+        s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+        if not (np.diff(s) > 0).all():
+            raise ArgumentError("rings: two at one place")
+        slope = np.gradient(centre, s, axis=0)
+        tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+        up = rings[:, 0] - centre
+        up -= np.einsum("ni,ni->n", up, tangent)[:, None] * tangent
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        right = np.cross(tangent, up)
+        off = rings - centre[:, None]
+        a, b = np.einsum("nmi,ni->nm", off, up), np.einsum("nmi,ni->nm", off, right)
+        angles = np.arange(rings.shape[1] + 1) * 2 * np.pi / rings.shape[1]
+        radius = np.empty((len(rings), len(angles)))
+        for k, (angle, r) in enumerate(zip(np.arctan2(b, a), np.hypot(a, b), strict=True)):
+            radius[k] = np.interp(angles, angle, r, period=2 * np.pi)
+        for name, value in {"s": s, "centre": centre, "slope": slope, "up": up, "radii": radius}.items():
+            object.__setattr__(self, "_" + name, value)
+
+    @property
+    def length(self) -> float:
+        """Along the axis."""
+        return float(self._s[-1])
+
+    @property
+    def mean_radius(self) -> float:
+        """Of all the wall."""
+        return float(self._radii[:, :-1].mean())
+
+    def frames(self, s: Any) -> tuple[Floats, Floats, Floats, Floats]:
+        """Of each s (n,): the axis's point, its tangent, twelve and three o'clock, all (n,3). Straight on beyond the
+        ends."""
+        s = np.asarray(s, float)
+        k = np.clip(np.searchsorted(self._s, s, side="right") - 1, 0, len(self._s) - 2)
+        h = (self._s[k + 1] - self._s[k])[:, None]
+        t = (np.clip(s, 0, self.length) - self._s[k])[:, None] / h
+        c0, c1, d0, d1 = self._centre[k], self._centre[k + 1], h * self._slope[k], h * self._slope[k + 1]
+        centre = c0 + t * (d0 + t * (3 * (c1 - c0) - 2 * d0 - d1 + t * (2 * (c0 - c1) + d0 + d1)))
+        tangent = d0 + t * (6 * (c1 - c0) - 4 * d0 - 2 * d1 + t * 3 * (2 * (c0 - c1) + d0 + d1))
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        centre += (s - np.clip(s, 0, self.length))[:, None] * tangent
+        up = (1 - t) * self._up[k] + t * self._up[k + 1]
+        up -= np.einsum("ni,ni->n", up, tangent)[:, None] * tangent
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        return centre, tangent, up, np.cross(tangent, up)
+
+    def radius(self, s: Any, clock: Any) -> Floats:
+        """Of the wall at places s (n,), clock (n,)."""
+        s, columns = np.clip(np.asarray(s, float), 0, self.length), self._radii.shape[1] - 1
+        k = np.clip(np.searchsorted(self._s, s, side="right") - 1, 0, len(self._s) - 2)
+        t = (s - self._s[k]) / (self._s[k + 1] - self._s[k])
+        angle = np.asarray(clock, float) / (2 * np.pi) % 1 * columns
+        j = np.minimum(angle.astype(int), columns - 1)
+        u = angle - j
+        near = (1 - u) * self._radii[k, j] + u * self._radii[k, j + 1]
+        return (1 - t) * near + t * ((1 - u) * self._radii[k + 1, j] + u * self._radii[k + 1, j + 1])
+
+    def points(self, s: Any, clock: Any, deviation: Any = 0.0) -> Floats:
+        """Wall points (n,3) at places s (n,), clock (n,), so much outside the wall."""
+        centre, _, up, right = self.frames(s)
+        clock = np.asarray(clock, float)
+        out = np.cos(clock)[:, None] * up + np.sin(clock)[:, None] * right
+        return centre + (self.radius(s, clock) + deviation)[:, None] * out
+
+    def locate(self, points: Any, start: Any = None) -> tuple[Floats, Floats, Floats]:
+        """s, clock and distance outside the wall (radially), each (n,), of points (n,3) near it. start (n,): s to
+        begin with [the nearest ring's]."""
+        points = np.asarray(points, float)
+        if start is None:
+            start = np.empty(len(points))
+            for k in range(0, len(points), 4096):
+                far = np.linalg.norm(points[k : k + 4096, None] - self._centre[None], axis=2)
+                start[k : k + 4096] = self._s[far.argmin(axis=1)]
+        s = np.asarray(start, float).copy()
+        for _ in range(20):  # each step leaves what the axis bends over it
+            centre, tangent, up, right = self.frames(s)
+            off = points - centre
+            step = np.einsum("ni,ni->n", off, tangent)
+            s += step
+            if not np.abs(step).max(initial=0) > 1e-6 * self.mean_radius:
+                break
+        a, b = np.einsum("ni,ni->n", off, up), np.einsum("ni,ni->n", off, right)
+        clock = np.arctan2(b, a) % (2 * np.pi)
+        return s, clock, np.hypot(a, b) - self.radius(s, clock)
+
+
+def read_walls(folder: Path) -> list[WallModel]:
+    """The pieces of tube.ply of a measured folder, in order. Raises FormatError, OSError."""
+    path = folder / "tube.ply"
+    columns = read_columns(path)
+    count = len(columns["x"])
+    if "piece" not in columns or count == 0 or count % RING:
+        raise FormatError(path, "vertex", f"not rings of {RING} with their piece")
+    rings = np.column_stack([columns[k] for k in "xyz"]).astype(float).reshape(-1, RING, 3)
+    piece = columns["piece"].reshape(-1, RING)[:, 0]
+    return [WallModel(rings[piece == k]) for k in np.unique(piece) if (piece == k).sum() >= 2]
