@@ -9,6 +9,7 @@ void bind_conics(nb::module_ &m);
 void bind_detect(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_match(nb::module_ &m);
+void bind_selfcal(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
@@ -23,6 +24,7 @@ NB_MODULE(_engine, m)
     bind_detect(m);
     bind_link(m);
     bind_match(m);
+    bind_selfcal(m);
     bind_sfm(m);
     bind_sim(m);
     bind_sim_studio(m);
