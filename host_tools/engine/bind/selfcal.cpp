@@ -129,10 +129,10 @@ nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixe
     out["covariance"] = matrix_to_numpy(profile_covariance(found));
     out["sigma_px"] = found.sigma;
     const selfcal::Observability &o = found.observed;
-    for (const auto &[name, value] :
-         {std::pair("alpha_sigma", o.alpha_sigma), std::pair("bearing_sigma", o.bearing_sigma),
-          std::pair("radius_px", o.radius), std::pair("theta", o.theta), std::pair("area", o.area),
-          std::pair("tilt", o.tilt), std::pair("axial", o.axial), std::pair("needed", o.needed)}) {
+    for (const auto &[name, value] : {std::pair("alpha_sigma", o.alpha_sigma), std::pair("alpha_alone", o.alpha_alone),
+                                      std::pair("bearing_sigma", o.bearing_sigma), std::pair("radius_px", o.radius),
+                                      std::pair("theta", o.theta), std::pair("area", o.area), std::pair("tilt", o.tilt),
+                                      std::pair("axial", o.axial), std::pair("needed", o.needed)}) {
         out[name] = value;
     }
     return out;

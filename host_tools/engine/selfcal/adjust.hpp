@@ -56,6 +56,8 @@ public:
     // Covariance of the lens, with the information at matches that are moved onto their epipolar planes: the noise's
     // own products in J^T J would feign knowledge of directions that nothing tells.
     LensMatrix covariance() const;
+    LensVector prior_mean() const;
+    LensVector prior_sigma() const;
 
     // ---- the problem as the optimiser sees it
     int eliminated() const { return static_cast<int>(used.size()); }
@@ -75,8 +77,6 @@ public:
 private:
     pf_camera camera_at(const LensVector &at) const;
     void set_stage(Stage stage);
-    LensVector prior_mean() const;
-    LensVector prior_sigma() const;
 
     std::vector<int> free_;
     LensVector saved_lens_ = LensVector::Zero();

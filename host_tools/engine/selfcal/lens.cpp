@@ -203,6 +203,7 @@ bool make_beam(const pf_camera &camera, const Eigen::Vector2d &uv, Beam<double> 
 }
 
 template class Slopes<kLens>;
-template class Slopes<kLens + 5>;
+template class Slopes<kLens + 5>; // and a pose
+template class Slopes<kLens + 9>; // and a homography
 
 } // namespace pipefish::selfcal

@@ -5,6 +5,7 @@
 
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
+#include <Eigen/LU>
 
 #include <algorithm>
 #include <array>
@@ -159,6 +160,26 @@ Eigen::Matrix<double, 1, kLens> alpha_row(const Adjustment &at)
     return weight > 0.0 ? Eigen::Matrix<double, 1, kLens>(sum / weight) : sum;
 }
 
+LensVector alpha_direction(const Adjustment &at)
+{
+    const pf_camera model = at.camera();
+    const Slopes<kLens> slopes(model, at.family, at.lens);
+    LensMatrix normal = LensMatrix::Zero();
+    LensVector right = LensVector::Zero();
+    for (const Eigen::Vector2d &uv : inlier_pixels(at)) {
+        Dual<kLens> theta;
+        if (slopes.theta(uv, theta)) {
+            theta.d.tail<2>().setZero();
+            normal += theta.d * theta.d.transpose();
+            right -= std::sin(theta.v) * std::cos(theta.v) * theta.d;
+        }
+    }
+    // Of the many ways to write it the one that priors like best.
+    const LensVector spread = at.prior_sigma();
+    normal.diagonal() += 1e-9 * normal.trace() * spread.cwiseProduct(spread).cwiseInverse();
+    return normal.ldlt().solve(right);
+}
+
 double bearing_sigma(const Adjustment &at, const LensMatrix &covariance, double radius)
 {
     using Rows = Eigen::Matrix<double, 3, kLens>;
@@ -242,6 +263,10 @@ Observability observe(const Adjustment &at, const LensMatrix &covariance, double
     out.area = hull_area(pixels) / (static_cast<double>(model.width) * model.height);
     const Eigen::Matrix<double, 1, kLens> row = alpha_row(at);
     out.alpha_sigma = std::sqrt((row * covariance * row.transpose()).value());
+    const LensVector along = alpha_direction(at);
+    const LensVector priors = at.prior_sigma().cwiseProduct(at.prior_sigma()).cwiseInverse();
+    const LensMatrix known = covariance.inverse() - LensMatrix(priors.asDiagonal());
+    out.alpha_alone = 1.0 / std::sqrt(std::max((along.transpose() * known * along).value(), 1e-6));
     out.bearing_sigma = bearing_sigma(at, covariance, out.radius);
     out.axial = std::numbers::pi;
     for (const int used : at.used) {

@@ -10,6 +10,7 @@ struct Observability {
     // Of the map diag(1, 1, alpha) on rays, cot theta -> alpha cot theta, which no motion without rotation across the
     // axis and no plane in two views shows: sigma of ln alpha.
     double alpha_sigma = 1e3;
+    double alpha_alone = 1e3;   // the same by the matches alone, without priors, were all else of the lens known
     double bearing_sigma = 1e3; // radians, largest over the covered field, after the best common rotation
     double radius = 0.0;        // of the covered field, pixels from the principal point: 95 % of the inliers' pixels
     double theta = 0.0;         // its angle
@@ -21,6 +22,9 @@ struct Observability {
 
 // The covered field and all that follows from the covariance. `limit`: what alpha_sigma may be.
 Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit);
+
+// The change of the unknowns that is one of ln alpha, as nearly as the family has it.
+LensVector alpha_direction(const Adjustment &at);
 
 // Derivative of ln alpha by the lens's unknowns.
 Eigen::Matrix<double, 1, kLens> alpha_row(const Adjustment &at);
