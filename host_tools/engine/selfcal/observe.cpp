@@ -99,9 +99,17 @@ std::vector<Eigen::Vector2d> disc(const Eigen::Vector2d &centre, double radius)
     return out;
 }
 
+double alone(const Adjustment &at, const LensMatrix &covariance)
+{
+    const LensVector along = alpha_direction(at);
+    const LensVector priors = at.prior_sigma().cwiseProduct(at.prior_sigma()).cwiseInverse();
+    const LensMatrix known = covariance.inverse() - LensMatrix(priors.asDiagonal());
+    return 1.0 / std::sqrt(std::max((along.transpose() * known * along).value(), 1e-6));
+}
+
 // The pairs as they would be seen if the second camera were turned by `angle` about an axis across its optical axis:
-// sigma of ln alpha then.
-double sigma_if_turned(const Adjustment &at, double angle, const Eigen::Vector3d &axis)
+// whether that would do.
+bool enough_if_turned(const Adjustment &at, double angle, const Eigen::Vector3d &axis, double limit, double alone_limit)
 {
     const pf_camera model = at.camera();
     const Eigen::Matrix3d turn = geometry::rotation_exp(angle * axis);
@@ -134,9 +142,10 @@ double sigma_if_turned(const Adjustment &at, double angle, const Eigen::Vector3d
     next.pairs = &seen;
     try {
         const Eigen::Matrix<double, 1, kLens> row = alpha_row(next);
-        return std::sqrt((row * next.covariance() * row.transpose()).value());
+        const LensMatrix covariance = next.covariance();
+        return (row * covariance * row.transpose()).value() < limit * limit && alone(next, covariance) < alone_limit;
     } catch (const std::domain_error &) {
-        return 1e3;
+        return false;
     }
 }
 
@@ -242,7 +251,7 @@ double bearing_difference(const pf_camera &a, const pf_camera &b, const Eigen::V
     return std::asin(std::min(worst, 1.0));
 }
 
-Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit)
+Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit, double alone_limit)
 {
     Observability out;
     const std::vector<Eigen::Vector2d> pixels = inlier_pixels(at);
@@ -263,10 +272,7 @@ Observability observe(const Adjustment &at, const LensMatrix &covariance, double
     out.area = hull_area(pixels) / (static_cast<double>(model.width) * model.height);
     const Eigen::Matrix<double, 1, kLens> row = alpha_row(at);
     out.alpha_sigma = std::sqrt((row * covariance * row.transpose()).value());
-    const LensVector along = alpha_direction(at);
-    const LensVector priors = at.prior_sigma().cwiseProduct(at.prior_sigma()).cwiseInverse();
-    const LensMatrix known = covariance.inverse() - LensMatrix(priors.asDiagonal());
-    out.alpha_alone = 1.0 / std::sqrt(std::max((along.transpose() * known * along).value(), 1e-6));
+    out.alpha_alone = alone(at, covariance);
     out.bearing_sigma = bearing_sigma(at, covariance, out.radius);
     out.axial = std::numbers::pi;
     for (const int used : at.used) {
@@ -275,11 +281,10 @@ Observability observe(const Adjustment &at, const LensMatrix &covariance, double
         const double first = std::abs((pose.r.transpose() * pose.t)[2]), second = std::abs(pose.t[2]);
         out.axial = std::min(out.axial, std::acos(std::clamp(std::max(first, second), 0.0, 1.0)));
     }
-    if (out.alpha_sigma > limit) {
-        for (const double angle : {2.5, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0}) {
-            const double best = std::min(sigma_if_turned(at, angle * DEGREE, Eigen::Vector3d::UnitX()),
-                                         sigma_if_turned(at, angle * DEGREE, Eigen::Vector3d::UnitY()));
-            if (best <= limit) {
+    if (out.alpha_sigma > limit || out.alpha_alone > alone_limit) {
+        for (const double angle : {5.0, 10.0, 15.0, 20.0, 30.0, 45.0}) {
+            if (enough_if_turned(at, angle * DEGREE, Eigen::Vector3d::UnitX(), limit, alone_limit) ||
+                enough_if_turned(at, angle * DEGREE, Eigen::Vector3d::UnitY(), limit, alone_limit)) {
                 out.needed = angle * DEGREE;
                 break;
             }

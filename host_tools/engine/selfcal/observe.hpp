@@ -17,11 +17,12 @@ struct Observability {
     double area = 0.0;          // share of the picture inside the inliers' convex hull, the farthest twentieth left out
     double tilt = 0.0;          // largest angle between the optical axes of a pair, radians
     double axial = 0.0;         // smallest angle between a pair's translation and either optical axis, radians
-    double needed = 0.0;        // radians: the least tilt among 2.5, 5, 10, .. 45 degrees that would do; 0: none would
+    double needed = 0.0;        // radians: the least tilt among 5, 10, .. 45 degrees that would do; 0: none would
 };
 
 // The covered field and all that follows from the covariance. `limit`: what alpha_sigma may be.
-Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit);
+// `alone_limit`: what alpha_alone may be. `needed` is looked for where one of them is beyond.
+Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit, double alone_limit);
 
 // The change of the unknowns that is one of ln alpha, as nearly as the family has it.
 LensVector alpha_direction(const Adjustment &at);

@@ -489,7 +489,7 @@ private:
         } catch (const std::domain_error &) {
             result_.covariance = 1e6 * LensMatrix::Identity();
         }
-        result_.observed = observe(at, result_.covariance, options_.alpha_limit);
+        result_.observed = observe(at, result_.covariance, options_.alpha_limit, options_.alone_limit);
     }
 
     const std::vector<Pair> &pairs_;

@@ -11,7 +11,7 @@ namespace pipefish::selfcal
 
 struct Options {
     Prior prior;
-    double alpha_limit = 0.05; // sigma of ln alpha from which on a motion is missing
+    double alpha_limit = 0.08, alone_limit = 0.02; // sigmas of ln alpha from which on a motion is missing
     uint64_t seed = 0;
     int threads = 1;
 };
