@@ -532,10 +532,12 @@ def build_parser() -> argparse.ArgumentParser:
     add_homography(commands)
 
     from pipefish.cli_match import add_match
+    from pipefish.cli_selfcal import add_selfcal
     from pipefish.cli_tube import add_tube
 
     add_tube(commands)
     add_match(commands)
+    add_selfcal(commands)
 
     from pipefish.cli_reconstruct import add_reconstruct
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .camera import PARAMETERS, Camera
+from .camera import Camera
 from .errors import ArgumentError
 from .structure import Encoder, reconstruct
 from .survey import Tracks
@@ -67,9 +67,7 @@ class ProfileCheck:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         out = dataclasses.asdict(self)
-        out["changes"] = {
-            name: {"value": v, "sigma": s, "unit": UNITS[name]} for name, (v, s) in self.changes.items()
-        }
+        out["changes"] = {name: {"value": v, "sigma": s, "unit": UNITS[name]} for name, (v, s) in self.changes.items()}
         return out
 
 
@@ -164,8 +162,8 @@ def check_profile(
     """Tests a survey against its profile.
 
     tracks .. sigma  as of reconstruct()
-    diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what a
-                     straight drive cannot
+    diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
+                     a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
 
     Raises ArgumentError.

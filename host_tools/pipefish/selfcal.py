@@ -142,8 +142,8 @@ def self_calibrate(
     centre        where the principal point is likely to be, pixels, and its sigma [the picture's, 1 % of the width]
     threads       do not change the result [all cores]
 
-    The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central mirror,
-    fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status. Raises ArgumentError.
+    The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central
+    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status. Raises ArgumentError.
     """
     width, height = (int(n) for n in image_size)
     if not (16 <= width <= 16384 and 16 <= height <= 16384):
@@ -206,7 +206,9 @@ def _reason(status: str, found: dict[str, Any]) -> str:
         sigma = max(found["alpha_sigma"], found["alpha_alone"])
         known = f"{100 * sigma:.0f} %" if sigma < 1 else "100 % and more"
         degrees = round(math.degrees(found["needed"])) or 45
-        text += f"; along alpha it is open by {known} (1 sigma). Pan or tilt by at least {degrees} degrees between views"
+        text += (
+            f"; along alpha it is open by {known} (1 sigma). Pan or tilt by at least {degrees} degrees between views"
+        )
         text += " of a scene in depth" if found["needed"] else ", with more or better matches"
     if status == "low_coverage":
         text += f" ({100 * found['area']:.0f} %; {100 * AREA_LEAST:.0f} % are needed)"

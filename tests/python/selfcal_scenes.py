@@ -1,4 +1,4 @@
-"""Random two-view set-ups for self-calibration, general and degenerate. The lenses are formulas of their own, not lib/camera's."""
+"""Random set-ups for self-calibration, general and degenerate. The lenses are formulas of their own."""
 
 from __future__ import annotations
 
@@ -101,7 +101,9 @@ def _motion(case: str, lens: Lens, random: np.random.Generator) -> tuple[np.ndar
     where *= random.uniform(0.6, 1.4) / np.linalg.norm(where)
     if case == "no_rotation":
         sideways = random.uniform(0, 2 * np.pi)
-        return _turn(roll * random.integers(0, 2)), np.array([np.cos(sideways), np.sin(sideways), random.uniform(-1, 1)])
+        return _turn(roll * random.integers(0, 2)), np.array(
+            [np.cos(sideways), np.sin(sideways), random.uniform(-1, 1)]
+        )
     if case == "axial":
         return _turn(roll * random.integers(0, 2)), np.array([0, 0, -random.uniform(0.8, 1.5)])
     if lens.theta_max < 1:  # look at the same scene from elsewhere
