@@ -98,6 +98,15 @@ def check_calib() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_selfcal() -> list[dict]:
+    """Self-calibration and the profile's health check over random set-ups and on real data; resumes by itself."""
+    done = run(sys.executable, "tests/accept_selfcal.py")
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_selfcal.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -174,6 +183,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "pipes": check_pipes,
     "calib": check_calib,
     "recognise": check_recognise,
+    "selfcal": check_selfcal,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
+from pipefish.health import VERDICTS, ProfileCheck, check_profile
 from pipefish.structure import REASONS, Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.tube import Tube, fit_tube
@@ -100,6 +101,7 @@ class Measurement:
     encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
     structure   in the unit of `scale`
     camera_sigma   relative systematic sigma of the diameter by the camera's covariance; None: not known
+    health      what the survey says of its profile
     remarks     what one should know, in words, most serious first
     """
 
@@ -115,6 +117,7 @@ class Measurement:
     camera_sigma: float | None
     residuals: Residuals
     backwards: bool
+    health: ProfileCheck | None = None
     remarks: list[str] = field(default_factory=list)
 
     @property
@@ -288,6 +291,19 @@ def measure(
     m.camera_sigma = _camera_sigma(m)
     _widen(m)
     _check_diameter(m, diameter)
+    m.health = _while_telling(
+        lambda: check_profile(
+            weighed,
+            camera,
+            chainage,
+            encoder=quality,
+            attitude=attitude,
+            attitude_sigma=attitude_sigma,
+            diameter=diameter if m.scale.source == "encoder" else None,
+            threads=threads,
+        ),
+        lambda: tell(0.9, "profile"),
+    )
     _remark(m, diameter)
     return m
 
@@ -520,6 +536,8 @@ def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str
 def _remark(m: Measurement, diameter: float | None) -> None:
     """What one should know, most serious first."""
     remarks: list[str] = []
+    if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
+        remarks.append(m.health.text)
     if m.scale.source == "none":
         remarks.append(
             "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "

@@ -230,6 +230,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "observations": len(residuals.item),
                 "outliers": int((~residuals.inlier).sum()),
                 "encoder": encoder_against_vision(m),
+                "profile": m.health.as_dict() if m.health else None,
             },
         }
     )

@@ -604,6 +604,7 @@ class Report:
             ("model", camera["model"]),
             ("picture", f"{camera['width']} x {camera['height']}"),
             ("field", f"to {camera['theta_max_deg']:.1f}° from the axis"),
+            *([("in this survey", profile["text"])] if (profile := d["quality"].get("profile")) else []),
             (
                 "residual of the calibration",
                 f"{camera['rms_px']:.3f} px" if camera["rms_px"] is not None else "unknown",

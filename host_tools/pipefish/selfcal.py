@@ -1,0 +1,244 @@
+"""Self-calibration: a camera from matches of one or many pairs of views of an unknown scene. docs/selfcal.md.
+
+The search and the adjustment are C++ (engine/selfcal); here arguments are checked and the result is judged.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _engine
+from .camera import Camera, Provenance
+from .errors import ArgumentError
+
+Floats = npt.NDArray[np.float64]
+
+#: Sigma of ln alpha that is still a calibration: 8 % are 2.3 degrees at 45 degrees off the axis.
+ALPHA_LIMIT = 0.08
+#: The same by the matches alone. 500 set-ups of general motion: at most 0.008; 100 without rotation or along the axis:
+#: at least 0.1.
+ALONE_LIMIT = 0.02
+AREA_LEAST = 0.10  # of the picture, that the matches must span
+AXIAL = math.radians(12.0)
+TILT_LITTLE = math.radians(4.0)
+CENTRE_SIGMA = 0.01  # of the picture's width
+BEND = 0.01  # of the radius at the rim: how far a lens differs from its nearest nominal projection
+ASPECT_SIGMA = 1e-3  # pixels are taken to be square; the covariance says how sure that is
+PARAMETERS = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
+
+#: Why there is no camera.
+REASONS = {
+    "no_matches": "too few matches agree with one motion of a camera",
+    "standing": "hardly anything moved between the views: a camera that stands",
+    "turning": "the camera only turned: without a change of place nothing is seen in depth",
+    "low_coverage": "the matches span too little of the picture",
+    "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
+    "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",
+    "axial": "the camera moved along its optical axis without panning or tilting: any lens explains that",
+    "weak": "the matches leave the lens too uncertain",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PairReport:
+    """One pair of views.
+
+    status   "ok"; or "few", "standing", "turning", "plane": then it says nothing of the lens
+    pose     (3,4) cam2_from_cam1, translation of length 1
+    inlier   (n,) bool
+    shift    median displacement, pixels; rms: of the inliers' errors, pixels
+    """
+
+    status: str
+    pose: Floats
+    inlier: npt.NDArray[np.bool_]
+    shift: float
+    rms: float
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """What self_calibrate returns.
+
+    status         "ok", or a key of REASONS: then camera is None and `reason` says why and what is missing
+    camera         source "selfcal", with covariance; None where refused
+    pairs          list of PairReport
+    sigma          of a match's error, pixels
+    alpha_sigma    sigma along the direction that matches show least, cot theta -> alpha cot theta, relative
+    bearing_sigma  largest sigma of a ray inside the covered field, radians, after the best common rotation
+    radius, theta  of the covered field: pixels from the principal point, and radians
+    area           share of the picture that the matches span
+    tilt           largest angle between optical axes of a pair, radians
+    needed         radians by which the camera should have been panned or tilted; 0: no such angle would do, or needed
+    starts, refined, agreeing   how many starts were tried, refined, and end at this camera
+    runner_up      cost of the next best minimum, of this one's; 0: none was found
+    """
+
+    status: str
+    reason: str
+    camera: Camera | None
+    pairs: list[PairReport]
+    sigma: float = math.nan
+    alpha_sigma: float = math.nan
+    bearing_sigma: float = math.nan
+    radius: float = math.nan
+    theta: float = math.nan
+    area: float = math.nan
+    tilt: float = math.nan
+    needed: float = 0.0
+    starts: int = 0
+    refined: int = 0
+    agreeing: int = 0
+    runner_up: float = 0.0
+
+
+def _pixels(name: str, value: Any, size: tuple[int, int]) -> Floats:
+    try:
+        out = np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name}: not numbers") from None
+    if out.ndim != 2 or out.shape[1] != 2:
+        raise ArgumentError(f"{name}: shape {out.shape} is not (n,2)")
+    if not np.isfinite(out).all():
+        raise ArgumentError(f"{name}: not finite")
+    # Half a feature's size beyond the rim is a measurement; more is another picture's pixel.
+    if len(out) and ((out < -10.0).any() or (out > np.array(size) + 10.0).any()):
+        raise ArgumentError(f"{name}: a pixel outside the picture of {size[0]}x{size[1]}")
+    return out
+
+
+def _pair(number: int, pair: Any, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    given = (pair.xy1, pair.xy2) if hasattr(pair, "xy1") else tuple(pair)
+    if len(given) != 2:
+        raise ArgumentError(f"pairs[{number}]: not two arrays of pixels")
+    one, two = (_pixels(f"pairs[{number}]: view {k + 1}", xy, size) for k, xy in enumerate(given))
+    if len(one) != len(two):
+        raise ArgumentError(f"pairs[{number}]: {len(one)} pixels in one view, {len(two)} in the other")
+    return one, two
+
+
+def self_calibrate(
+    pairs: Sequence[Any],
+    image_size: tuple[int, int],
+    *,
+    centre: tuple[float, float] | None = None,
+    centre_sigma: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+) -> SelfCalibration:
+    """The camera that matches of pairs of views were taken with; nothing else need be known of it.
+
+    pairs         of one camera: each two arrays (n,2) of pixels, row by row of one scene point, or Matches. Up to 40 %
+                  may be wrong
+    image_size    (width, height), pixels
+    centre        where the principal point is likely to be, pixels, and its sigma [the picture's, 1 % of the width]
+    threads       do not change the result [all cores]
+
+    The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central
+    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status. Raises ArgumentError.
+    """
+    width, height = (int(n) for n in image_size)
+    if not (16 <= width <= 16384 and 16 <= height <= 16384):
+        raise ArgumentError(f"image_size: {width}x{height} is not within 16 to 16384 pixels")
+    taken = [_pair(k, pair, (width, height)) for k, pair in enumerate(pairs)]
+    if not taken:
+        raise ArgumentError("pairs: none")
+    middle = ((width - 1) / 2, (height - 1) / 2) if centre is None else centre
+    spread = CENTRE_SIGMA * width if centre_sigma is None else centre_sigma
+    if not (np.isfinite(middle).all() and math.isfinite(spread) and spread > 0):
+        raise ArgumentError("centre, centre_sigma: not finite and above 0")
+    found = _engine.self_calibrate(
+        [one for one, _ in taken],
+        [two for _, two in taken],
+        width,
+        height,
+        float(middle[0]),
+        float(middle[1]),
+        float(spread),
+        BEND,
+        ALPHA_LIMIT,
+        ALONE_LIMIT,
+        seed,
+        threads or len(os.sched_getaffinity(0)),
+    )
+    reports = [
+        PairReport(p["status"], p["pose"], p["inlier"], p["median_shift_px"], p["rms_px"]) for p in found["pairs"]
+    ]
+    values: dict[str, Any] = {key: found[key] for key in ("starts", "refined", "agreeing", "runner_up")}
+    if found["found"]:
+        values |= {key: found[key] for key in ("alpha_sigma", "bearing_sigma", "theta", "area", "tilt", "needed")}
+        values |= {"sigma": found["sigma_px"], "radius": found["radius_px"]}
+    status = _status(found)
+    if status != "ok":
+        return SelfCalibration(status, _reason(status, found), None, reports, **values)
+    camera = _camera(found, width, height, sum(p["status"] == "ok" for p in found["pairs"]))
+    return SelfCalibration("ok", "", camera, reports, **values)
+
+
+def _status(found: dict[str, Any]) -> str:
+    states = [p["status"] for p in found["pairs"]]
+    if not found["found"]:
+        return "standing" if "standing" in states else "no_matches"
+    if found["area"] < AREA_LEAST:
+        return "low_coverage"
+    if "ok" not in states:
+        return {"plane": "planar", "turning": "turning", "standing": "standing"}.get(
+            max(set(states), key=states.count), "no_matches"
+        )
+    if found["alpha_alone"] > ALONE_LIMIT or found["alpha_sigma"] > ALPHA_LIMIT:
+        if found["tilt"] < TILT_LITTLE or found["alpha_alone"] > 5 * ALONE_LIMIT:
+            return "axial" if found["axial"] < AXIAL else "no_rotation"
+        return "weak"
+    return "ok"
+
+
+def _reason(status: str, found: dict[str, Any]) -> str:
+    text = REASONS[status]
+    if status in ("no_rotation", "axial", "weak"):
+        sigma = max(found["alpha_sigma"], found["alpha_alone"])
+        known = f"{100 * sigma:.0f} %" if sigma < 1 else "100 % and more"
+        degrees = round(math.degrees(found["needed"])) or 45
+        text += (
+            f"; along alpha it is open by {known} (1 sigma). Pan or tilt by at least {degrees} degrees between views"
+        )
+        text += " of a scene in depth" if found["needed"] else ", with more or better matches"
+    if status == "low_coverage":
+        text += f" ({100 * found['area']:.0f} %; {100 * AREA_LEAST:.0f} % are needed)"
+    if status == "planar":
+        text += ": take a scene in depth"
+    return text
+
+
+def _camera(found: dict[str, Any], width: int, height: int, good: int) -> Camera:
+    small = found["covariance"]
+    spread = np.zeros((8, 7))
+    spread[0, 0] = spread[1, 0] = 1.0
+    spread[2:, 1:] = np.eye(6)
+    covariance = spread @ small @ spread.T
+    covariance[1, 1] += (ASPECT_SIGMA * found["camera"]["f_u"]) ** 2
+    covariance = (covariance + covariance.T) / 2
+    return Camera(
+        width=width,
+        height=height,
+        **found["camera"],
+        source="selfcal",
+        created=datetime.datetime.now(datetime.UTC),
+        rms_px=found["sigma_px"],
+        theta_covered=min(found["theta"], found["camera"]["theta_max"]),
+        provenance=Provenance(
+            tool="pipefish selfcal",
+            model_choice=f"{good} pairs, sigma(alpha) {100 * found['alpha_sigma']:.2g} %",
+            views=2 * good,
+            points=sum(p["inliers"] for p in found["pairs"] if p["status"] == "ok"),
+        ),
+        covariance_parameters=PARAMETERS,
+        covariance=covariance,
+    )

@@ -1,0 +1,261 @@
+"""Self-calibration and the profile's health check over random set-ups, and on real data where they are; resumable.
+
+    python tests/accept_selfcal.py [--only general,half,degenerate,real,health] [--setups 500]
+
+prints a table, then one JSON list of {name, value, bound, holds}. Results of set-ups are kept in build/accept_selfcal/,
+one line each, and are not measured again: delete the folder to start anew. Real data: in PIPEFISH_DATA or
+../shared/data.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "python"))
+
+from pipefish.camera import Camera  # noqa: E402
+from pipefish.matching import find_seeds  # noqa: E402
+from pipefish.matching_files import read_grey  # noqa: E402
+from pipefish.selfcal import self_calibrate  # noqa: E402
+from selfcal_drives import health_of  # noqa: E402
+from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup  # noqa: E402
+
+KEEP = ROOT / "build" / "accept_selfcal"
+DATA = Path(os.environ.get("PIPEFISH_DATA", ROOT.parent / "shared" / "data"))
+Row = dict
+
+
+def figure(name: str, value: float, bound: str, holds: bool) -> Row:
+    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
+
+
+def at_least(name: str, value: float, bound: float) -> Row:
+    return figure(name, value, f">= {bound}", value >= bound)
+
+
+def at_most(name: str, value: float, bound: float) -> Row:
+    return figure(name, value, f"<= {bound}", value <= bound)
+
+
+def kept(name: str, count: int, measure: Callable[[int], Row]) -> list[Row]:
+    """measure(0..count-1), each from the file where an earlier run left it."""
+    KEEP.mkdir(parents=True, exist_ok=True)
+    path = KEEP / f"{name}.jsonl"
+    rows = {r["seed"]: r for r in map(json.loads, path.read_text().splitlines())} if path.exists() else {}
+    with path.open("a") as out:
+        for seed in range(count):
+            if seed not in rows:
+                rows[seed] = {"seed": seed, **measure(seed)}
+                out.write(json.dumps(rows[seed]) + "\n")
+                out.flush()
+    return [rows[s] for s in range(count)]
+
+
+def general(seed: int, noise: float | None = None) -> Row:
+    """One set-up of general motion: half of them one pair, the others two or three."""
+    pairs = (1, 2, 1, 3)[seed // 4 % 4]
+    setup = make_setup(seed, KINDS[seed % 4], pairs=pairs, noise=noise)
+    start = time.process_time()
+    found = self_calibrate(setup.pairs, (setup.lens.width, setup.lens.height), threads=1)
+    seconds = time.process_time() - start
+    row: Row = {"kind": setup.kind, "pairs": pairs, "seconds": seconds, "status": found.status}
+    if found.camera is not None:
+        error = bearing_error(found.camera, setup.lens, found.radius)
+        row |= {
+            "error_deg": math.degrees(error) if math.isfinite(error) else 180.0,
+            "sigmas": error / found.bearing_sigma if math.isfinite(error) else 1e3,
+            "alpha_sigma": found.alpha_sigma,
+            "agreeing": found.agreeing / found.refined,
+        }
+    return row
+
+
+def degenerate(seed: int) -> Row:
+    """One set-up that must be refused."""
+    case = DEGENERATE[seed // 4 % 4]
+    setup = make_setup(10_000 + seed, KINDS[seed % 4], case)
+    found = self_calibrate(setup.pairs, (setup.lens.width, setup.lens.height), threads=1)
+    return {"case": case, "kind": setup.kind, "status": found.status}
+
+
+def check_general(count: int) -> Iterator[Row]:
+    rows = kept("general", count, general)
+    good = [r for r in rows if r["status"] == "ok"]
+    yield at_least("selfcal.within_3_sigma", sum(r["sigmas"] < 3 for r in good) / len(rows), 0.95)
+    yield at_most("selfcal.one_pair_seconds", max(r["seconds"] for r in rows if r["pairs"] == 1), 3.0)
+
+
+def check_half(count: int) -> Iterator[Row]:
+    rows = kept("half", count, lambda seed: general(seed, noise=0.5))
+    for kind in KINDS:
+        of = [r for r in rows if r["kind"] == kind]
+        share = sum(r.get("error_deg", 180.0) < 0.5 for r in of) / len(of)
+        print(f"  at 0.5 px, {kind}: {100 * share:.1f} % below 0.5 degrees", file=sys.stderr)
+    for number in (1, 2, 3):
+        of = [r for r in rows if r["pairs"] == number]
+        share = sum(r.get("error_deg", 180.0) < 0.5 for r in of) / max(len(of), 1)
+        print(f"  at 0.5 px, {number} pairs: {100 * share:.1f} % below 0.5 degrees", file=sys.stderr)
+    yield at_least("selfcal.below_half_degree", sum(r.get("error_deg", 180.0) < 0.5 for r in rows) / len(rows), 0.9)
+
+
+def check_degenerate(count: int) -> Iterator[Row]:
+    rows = kept("degenerate", count, degenerate)
+    yield figure(
+        "selfcal.degenerate_misjudged",
+        sum(r["status"] != r["case"] for r in rows),
+        "= 0",
+        all(r["status"] == r["case"] for r in rows),
+    )
+
+
+# ---------------------------------------------------------------------- real
+
+
+def fountain() -> list[Row]:
+    """All pairs and triples of the six pictures, by their own seeds."""
+    folder = DATA / "multiview" / "fountain-P11" / "images"
+    names = sorted(folder.glob("*.jpg"))
+    k = np.loadtxt(folder / "K.txt", usecols=range(3))[:3]
+    true = Camera(
+        width=3072, height=2048, f_u=k[0, 0], f_v=k[1, 1], c_u=k[0, 2], c_v=k[1, 2], radial="perspective", theta_max=0.9
+    )
+    file = KEEP / "fountain_matches.npz"
+    KEEP.mkdir(parents=True, exist_ok=True)
+    pairs = list(itertools.combinations(range(len(names)), 2))
+    if not file.exists():
+        pictures = [read_grey(name) for name in names]
+        seeds = [find_seeds(pictures[a], pictures[b], threads=2) for a, b in pairs]
+        np.savez(file, **{f"{a}{b}": np.hstack([s.xy1, s.xy2]) for (a, b), s in zip(pairs, seeds, strict=True)})
+    with np.load(file) as data:
+        matches = {(a, b): data[f"{a}{b}"] for a, b in pairs}
+    groups = [[p] for p in pairs] + [
+        [(a, b), (a, c), (b, c)] for a, b, c in itertools.combinations(range(len(names)), 3)
+    ]
+
+    class Truth:
+        width, height = 3072, 2048
+
+        @staticmethod
+        def rays(uv: np.ndarray) -> np.ndarray:
+            return true.unproject(uv)[0]
+
+    def one(number: int) -> Row:
+        group = groups[number]
+        found = self_calibrate([(matches[p][:, :2], matches[p][:, 2:]) for p in group], (3072, 2048), threads=1)
+        row: Row = {"views": len(group), "status": found.status, "matches": sum(len(matches[p]) for p in group)}
+        if found.camera is not None:
+            row |= {
+                "focal": found.camera.f_u / true.f_u - 1,
+                "error_deg": math.degrees(bearing_error(found.camera, Truth, found.radius)),
+                "bearing_sigma_deg": math.degrees(found.bearing_sigma),
+            }
+        return row
+
+    return kept("fountain", len(groups), one)
+
+
+def boards() -> list[Row]:
+    """Corners of one plane board in two of its views; and the pictures' own matches, with the room behind the board by
+    a camera that stands."""
+    from calib_data_sets import jy_stereo, ov_plane
+
+    board, size = ov_plane(DATA / "calibration", "train")
+    stereo, stereo_size = jy_stereo(DATA / "calibration", 1)
+    cases = []
+    for name, views, of in (("ov_plane", board, size), ("jy_stereo", stereo, stereo_size)):
+        for a, b in zip(views, views[1:], strict=False):
+            first = {tuple(np.round(p, 6)): k for k, p in enumerate(a.board_xyz)}
+            common = [(first[key], k) for k, p in enumerate(b.board_xyz) if (key := tuple(np.round(p, 6))) in first]
+            one, two = np.array(common, int).reshape(-1, 2).T
+            cases.append((name, (a.pixels[one], b.pixels[two]), of))
+
+    def one_case(number: int) -> Row:
+        name, pair, of = cases[number]
+        found = self_calibrate([pair], of, threads=1)
+        return {"name": name, "status": found.status, "matches": len(pair[0])}
+
+    rows = kept("boards", len(cases), one_case)
+    files = sorted((DATA / "calibration/jy_stereo/left").glob("*.jpg"))[:5]
+    if len(files) == 5:
+
+        def standing(number: int) -> Row:
+            one, two = (read_grey(files[number + k]) for k in (0, 1))
+            seeds = find_seeds(one, two, threads=1)
+            found = self_calibrate([(seeds.xy1, seeds.xy2)], one.shape[::-1], threads=1)
+            return {"name": "static", "status": found.status, "matches": len(seeds)}
+
+        rows += kept("static", 4, standing)
+    return rows
+
+
+def check_real() -> Iterator[Row]:
+    if not (DATA / "multiview" / "fountain-P11").is_dir():
+        print(f"skipped: {DATA} has no multiview/fountain-P11", file=sys.stderr)
+        return
+    rows = [r for r in fountain() if r["status"] == "ok"]
+    good = [r for r in rows if abs(r["focal"]) < 0.03 and r["error_deg"] < 0.5]
+    print(f"  fountain-P11: {len(rows)} usable pairs and triples, {len(good)} of them good", file=sys.stderr)
+    yield at_least("selfcal.fountain_good", len(good) / max(len(rows), 1), 0.8)
+    rest = [r for r in rows if r not in good]
+    honest = sum(r["error_deg"] < 3 * r["bearing_sigma_deg"] for r in rest)
+    refused = boards()
+    for row in refused:
+        print(f"  {row['name']}: {row['matches']} matches, {row['status']}", file=sys.stderr)
+    accepted = sum(r["status"] == "ok" for r in refused)
+    yield figure("selfcal.boards_accepted", accepted, "= 0", accepted == 0)
+    yield figure("selfcal.fountain_rest_dishonest", len(rest) - honest, "= 0", honest == len(rest))
+
+
+# ---------------------------------------------------------------------- health
+
+
+def check_health(count: int) -> Iterator[Row]:
+    for case in ("bend", "radius"):
+        for change in ("scale", "centre"):
+            rows = kept(f"health_{case}_{change}", count, lambda s, c=case, x=change: health_of(s, c, x))
+            share = sum(r["verdict"].startswith("drifted") for r in rows) / len(rows)
+            yield at_least(f"health.{case}_{change}_detected", share, 0.95)
+        rows = kept(f"health_{case}_none", count, lambda s, c=case: health_of(s, c, ""))
+        yield at_most(
+            f"health.{case}_false_alarms", sum(r["verdict"].startswith("drifted") for r in rows) / len(rows), 0.02
+        )
+        valid = sum(r["verdict"].endswith("valid") for r in rows) / len(rows)
+        print(f"  health, {case}: {100 * valid:.0f} % of the intact called valid", file=sys.stderr)
+    rows = kept("health_straight", count, lambda s: health_of(s, "straight", ("", "scale", "alpha")[s % 3]))
+    certain = sum(r["verdict"] != "cannot tell" for r in rows)
+    yield figure("health.straight_not_cannot_tell", certain, "= 0", certain == 0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--setups", type=int, default=500)
+    parser.add_argument("--half", type=int, default=200)
+    parser.add_argument("--degenerate", type=int, default=200)
+    parser.add_argument("--health", type=int, default=100)
+    parser.add_argument("--only", default="general,half,degenerate,real,health")
+    args = parser.parse_args()
+    checks: dict[str, Callable[[], Iterator[Row]]] = {
+        "general": lambda: check_general(args.setups),
+        "half": lambda: check_half(args.half),
+        "degenerate": lambda: check_degenerate(args.degenerate),
+        "real": check_real,
+        "health": lambda: check_health(args.health),
+    }
+    rows = [row for name in args.only.split(",") for row in checks[name]()]
+    for row in rows:
+        print(f"  {'holds' if row['holds'] else 'FAILS'}  {row['name']:36} {row['value']:10.4g}  {row['bound']}")
+    print(json.dumps(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
