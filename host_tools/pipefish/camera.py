@@ -9,7 +9,7 @@ import dataclasses
 import datetime
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -325,12 +325,21 @@ class Camera(Sources):
     @classmethod
     def load_json(cls, path: str | os.PathLike[str]) -> Camera:
         """Reads a profile in JSON. Raises ProfileError with the file, the key and the reason."""
+        return cls._made(path, lambda: profile_json.read(path))
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], source: str | os.PathLike[str]) -> Camera:
+        """From what `to_json` writes, parsed; source: the file that it is a part of, for errors. Raises ProfileError."""
+        return cls._made(source, lambda: profile_json.values_of(document))
+
+    @classmethod
+    def _made(cls, source: str | os.PathLike[str], values_of: Callable[[], dict[str, Any]]) -> Camera:
         try:
-            values = profile_json.read(path)
+            values = values_of()
             return cls(**values | {"provenance": Provenance(**values.get("provenance", {}))})
         except ProfileError as error:
             key = "covariance.parameters" if error.key == "covariance_parameters" else error.key
-            raise ProfileError(path, key, error.reason) from None
+            raise ProfileError(source, key, error.reason) from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the profile as JSON; the file appears whole or not at all. Raises OSError where it cannot."""

@@ -262,6 +262,7 @@ def points_ply(m: Measurement) -> bytes:
 def tube_ply(m: Measurement) -> bytes:
     """The wall: rings of RING vertices; deviation: radius less half of the nominal (or mean) diameter."""
     vertices, faces, pieces, rows = [], [], [], 0
+    along, stretches = [], []
     size = m.nominal if m.nominal and m.scale.unit == "metre" else mean_diameter(m)[0]
     for stretch in m.measured:
         points, triangles = stretch.tube.mesh(around=RING)
@@ -269,11 +270,15 @@ def tube_ply(m: Measurement) -> bytes:
         deviation = np.linalg.norm(rings - rings.mean(axis=1, keepdims=True), axis=2) - size / 2
         vertices.append(np.column_stack([points, deviation.ravel()]))
         faces.append(triangles + rows)
+        along.append(np.repeat(stretch.chainage(np.concatenate(stretch.tube.ring_places())), RING))
+        stretches.append(np.full(len(points), stretch.segment))
         pieces.append(_piece_of(len(points), triangles) + sum(p.max() + 1 for p in pieces))
         rows += len(points)
     table = np.vstack(vertices)
     columns = dict(zip(("x", "y", "z", "deviation"), table.T.astype(np.float32), strict=True))
     columns |= _colours(table[:, 3], size)
+    columns["chainage"] = np.concatenate(along).astype(np.float32)
+    columns["stretch"] = np.concatenate(stretches).astype(np.int32)
     columns["piece"] = np.concatenate(pieces).astype(np.int32)
     comments = (f"unit: {m.scale.unit}", f"rings of {RING} vertices", f"deviation from a radius of {size / 2:.6g}")
     return ply_bytes(columns, np.vstack(faces), comments)

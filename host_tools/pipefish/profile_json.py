@@ -103,7 +103,11 @@ def text(key: str, value: object) -> str:
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The arguments of Camera out of a file. What they are worth is for Camera to check."""
-    document = _parse(path)
+    return values_of(_parse(path))
+
+
+def values_of(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of Camera out of a document."""
     if document.get("format") != _FORMAT:
         raise ProfileError(None, "format", f"not {_FORMAT!r}: this is not a profile")
     version = document.get("version")

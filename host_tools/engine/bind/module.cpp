@@ -13,6 +13,7 @@ void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 void bind_tube(nb::module_ &m);
+void bind_unroll(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
@@ -27,4 +28,5 @@ NB_MODULE(_engine, m)
     bind_sim(m);
     bind_sim_studio(m);
     bind_tube(m);
+    bind_unroll(m);
 }
