@@ -329,7 +329,7 @@ class Camera(Sources):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], source: str | os.PathLike[str]) -> Camera:
-        """From what `to_json` writes, parsed; source: the file that it is a part of, for errors. Raises ProfileError."""
+        """From what `to_json` writes, parsed; source: the file, for errors. Raises ProfileError."""
         return cls._made(source, lambda: profile_json.values_of(document))
 
     @classmethod

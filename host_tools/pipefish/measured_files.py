@@ -261,9 +261,22 @@ def points_ply(m: Measurement) -> bytes:
 
 def tube_ply(m: Measurement) -> bytes:
     """The wall: rings of RING vertices; deviation: radius less half of the nominal (or mean) diameter."""
+    columns, faces = wall_columns(m)
+    size = reference_diameter(m)
+    comments = (f"unit: {m.scale.unit}", f"rings of {RING} vertices", f"deviation from a radius of {size / 2:.6g}")
+    return ply_bytes(columns, faces, comments)
+
+
+def reference_diameter(m: Measurement) -> float:
+    """What deviations are against: the nominal diameter, or the mean where there is none or no scale."""
+    return m.nominal if m.nominal and m.scale.unit == "metre" else mean_diameter(m)[0]
+
+
+def wall_columns(m: Measurement) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Vertices of the wall by column, and triangles (M,3)."""
     vertices, faces, pieces, rows = [], [], [], 0
     along, stretches = [], []
-    size = m.nominal if m.nominal and m.scale.unit == "metre" else mean_diameter(m)[0]
+    size = reference_diameter(m)
     for stretch in m.measured:
         points, triangles = stretch.tube.mesh(around=RING)
         rings = points.reshape(-1, RING, 3)
@@ -280,8 +293,7 @@ def tube_ply(m: Measurement) -> bytes:
     columns["chainage"] = np.concatenate(along).astype(np.float32)
     columns["stretch"] = np.concatenate(stretches).astype(np.int32)
     columns["piece"] = np.concatenate(pieces).astype(np.int32)
-    comments = (f"unit: {m.scale.unit}", f"rings of {RING} vertices", f"deviation from a radius of {size / 2:.6g}")
-    return ply_bytes(columns, np.vstack(faces), comments)
+    return columns, np.vstack(faces)
 
 
 def _piece_of(count: int, triangles: np.ndarray) -> np.ndarray:

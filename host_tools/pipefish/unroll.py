@@ -15,7 +15,7 @@ from pipefish import _engine
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.wall import Piece, Wall
 
-REACH = 1.0  # diameters along the pipe over which a keyframe may show the wall
+REACH = 1.1  # diameters from the eye up to which a keyframe shows the wall: one along the pipe
 NODE = 1 / 80  # diameters from node to node: between them pixels are interpolated, to 0.05 px
 MOST_STEP = 16  # cells from node to node
 STRIP = 512  # cells of the pipe's length that are drawn at a time
@@ -84,12 +84,12 @@ class Unroller:
         self.light = balance.solve(wall.camera._profile, np.nan_to_num(wall.chainage))
         self._finest = float(np.percentile(found[found > 0], 95))
         self.resolution = 1 / float(np.median(found[found > 0]))
-        self.cell = cell or _nice(self.resolution)
+        self.cell = cell or nice_length(self.resolution)
         self.rows = max(8, round(math.pi * wall.diameter / self.cell))
         self.step = min(MOST_STEP, max(1, round(NODE * wall.diameter / self.cell)))
-        first = math.floor(low / self.cell + 1e-9)
+        first = math.ceil(low / self.cell - 0.5 - 1e-9)  # columns whose middle is on the wall
         self.start = first * self.cell
-        self.columns = max(1, math.ceil(high / self.cell - 1e-9) - first)
+        self.columns = max(1, math.floor(high / self.cell + 0.5 - 1e-9) - first)
 
     def clock(self, row: Any, sign: int = 1) -> Any:
         """Clock angle of the middle of a row, radians, 0 to 2 pi; sign: of the stretch's chainage along its s."""
@@ -127,7 +127,9 @@ class Unroller:
             clock = (np.arange(SAMPLES_AROUND) + 0.618 * k) * 2 * np.pi / SAMPLES_AROUND
             spots.append(_spots(piece, np.array([s]), clock, 0.01 * self.wall.diameter, 0.01)[0])
         self._forget(low)
-        return balance.add(*self._sources(views), np.concatenate(spots), SAMPLE_SIDE * self.wall.diameter)
+        return balance.add(
+            *self._sources(views), np.concatenate(spots), SAMPLE_SIDE * self.wall.diameter, REACH * self.wall.diameter
+        )
 
     def _sources(self, views: np.ndarray) -> tuple[Any, list[np.ndarray], np.ndarray, list[int]]:
         poses = np.ascontiguousarray(self.wall.poses[views])
@@ -171,6 +173,7 @@ class Unroller:
             self.light,
             self._finest,
             wall.diameter / 2,
+            REACH * wall.diameter,
             SEAM * wall.diameter,
             self._threads,
         )
@@ -202,9 +205,11 @@ def _most(values: np.ndarray) -> int:
     return int(np.bincount(values).argmax()) if len(values) else -1
 
 
-def _nice(length: float) -> float:
-    """1, 2 or 5 times a power of ten, the nearest in proportion."""
+def nice_length(length: float, up: bool = False) -> float:
+    """1, 2 or 5 times a power of ten: the nearest in proportion, or the next above."""
     power = 10.0 ** math.floor(math.log10(length))
+    if up:
+        return power * next(n for n in (*NICE, 20.0) if n * power >= length * (1 - 1e-9))
     return power * min(NICE, key=lambda n: abs(math.log(n * power / length)))
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from pipefish.camera import Camera
 from pipefish.cloudfile import read_columns
 from pipefish.errors import FormatError, PipefishError
-from pipefish.measured_files import RING
+from pipefish.measure import Measurement
+from pipefish.measured_files import RING, wall_columns
 from pipefish.measured_texts import read_measured
 from pipefish.survey import Survey
 
@@ -119,10 +120,8 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def read_pieces(folder: Path, document: dict[str, Any]) -> list[Piece]:
-    """The wall of a folder of `pipefish reconstruct`, by chainage. Raises FormatError, OSError."""
-    path = folder / "tube.ply"
-    wall = read_columns(path)
+def pieces_of(wall: dict[str, np.ndarray], document: dict[str, Any], path: Path) -> list[Piece]:
+    """The pieces of a wall, by chainage, from the columns of tube.ply (path: for errors). Raises FormatError."""
     if {"deviation", "piece", "chainage", "stretch"} - set(wall) or len(wall["x"]) % RING or not len(wall["x"]):
         raise FormatError(path, "vertex", "not a wall that this version of `pipefish reconstruct` wrote")
     signs = {t["stretch"]: t["chainage_sign"] for t in document["tubes"]}
@@ -142,9 +141,11 @@ def read_pieces(folder: Path, document: dict[str, Any]) -> list[Piece]:
 
 
 def read_wall(folder: Path, survey: Path | None = None) -> Wall:
-    """The wall of a folder of `pipefish reconstruct`; survey: its file [where it was]. Raises PipefishError, OSError."""
+    """The wall of a folder of `pipefish reconstruct`; survey: its file [where it was].
+
+    Raises PipefishError, OSError."""
     document = read_measured(folder)
-    pieces = read_pieces(folder, document)
+    pieces = pieces_of(read_columns(folder / "tube.ply"), document, folder / "tube.ply")
     path = survey or Path(document["survey"]["file"])
     if not path.exists() and survey is None and (folder.parent / path.name).exists():
         path = folder.parent / path.name  # the two were moved together
@@ -154,6 +155,11 @@ def read_wall(folder: Path, survey: Path | None = None) -> Wall:
     if opened.survey_id != document["survey"]["survey_id"]:
         raise PipefishError(f"{path}: is not the survey that was measured ({document['survey']['survey_id']})")
     return wall_of(document, pieces, opened)
+
+
+def measured_wall(m: Measurement, document: dict[str, Any]) -> Wall:
+    """The wall of a measurement and its document (measured_files.document_of)."""
+    return wall_of(document, pieces_of(wall_columns(m)[0], document, m.survey.path), m.survey)
 
 
 def wall_of(document: dict[str, Any], pieces: list[Piece], survey: Survey) -> Wall:

@@ -14,9 +14,13 @@ class TrueWall(Wall):
     """A Wall whose pictures are rendered when they are asked for."""
 
     scene: Scene
+    rendered: dict[int, np.ndarray]
 
     def picture(self, view: int) -> np.ndarray:
-        return np.ascontiguousarray(self.scene.render(int(self.keyframe[view])))
+        frame = int(self.keyframe[view])
+        if frame not in self.rendered:
+            self.rendered[frame] = np.ascontiguousarray(self.scene.render(frame))
+        return self.rendered[frame]
 
 
 class NoSurvey:
@@ -41,5 +45,5 @@ def true_wall(scene: Scene, frames: np.ndarray, start: float, end: float, ring: 
         chainage=np.array([scene.arc_length(int(f)) for f in frames]),
         diameter=scene.spec["diameter"],
     )
-    wall.scene = scene
+    wall.scene, wall.rendered = scene, {}
     return wall

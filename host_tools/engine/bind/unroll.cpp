@@ -67,14 +67,14 @@ struct Balance {
 
     // Best resolution at each spot, pixels per metre; 0 where nothing sees it.
     Eigen::VectorXd add(const pf_profile &profile, const std::vector<Grey> &images, const Poses &poses,
-                        const std::vector<int> &views, const Spots &rows, double side)
+                        const std::vector<int> &views, const Spots &rows, double side, double reach)
     {
         const std::vector<Picture> pictures = pictures_of(profile.camera, images, poses, views);
         const std::vector<Spot> spots = spots_of(rows);
         std::vector<double> fine;
         {
             const nb::gil_scoped_release release;
-            const std::vector<Glance> more = glances(profile.camera, pictures, spots, side, patches, fine);
+            const std::vector<Glance> more = glances(profile.camera, pictures, spots, side, reach, patches, fine);
             seen.insert(seen.end(), more.begin(), more.end());
         }
         patches += static_cast<int>(spots.size());
@@ -97,7 +97,8 @@ struct Balance {
 // columns).
 nb::tuple draw_sheet(const pf_profile &profile, const std::vector<Grey> &images, const Poses &poses,
                      const std::vector<int> &views, const Spots &rows, int columns, int row_count, int step,
-                     double cell, const Light &light, double finest, double radius, double seam, int threads)
+                     double cell, const Light &light, double finest, double radius, double reach, double seam,
+                     int threads)
 {
     Sheet sheet{columns, row_count, step, cell, spots_of(rows)};
     if (step < 1 || columns % step || row_count % step ||
@@ -114,7 +115,7 @@ nb::tuple draw_sheet(const pf_profile &profile, const std::vector<Grey> &images,
     {
         const nb::gil_scoped_release release;
         out = draw(profile.camera, pictures, sheet, light,
-                   {.finest = finest, .radius = radius, .seam = seam, .level = light.level}, threads);
+                   {.finest = finest, .radius = radius, .reach = reach, .seam = seam, .level = light.level}, threads);
     }
     const size_t nr = static_cast<size_t>(sheet.node_rows()), nc = static_cast<size_t>(sheet.node_columns());
     const size_t r = static_cast<size_t>(row_count), c = static_cast<size_t>(columns);
@@ -134,9 +135,9 @@ void bind_unroll(nb::module_ &m)
     nb::class_<Balance>(m, "UnrollBalance")
         .def(nb::init<>())
         .def("add", &Balance::add, nb::arg("camera"), nb::arg("images"), nb::arg("poses"), nb::arg("views"),
-             nb::arg("spots"), nb::arg("side"))
+             nb::arg("spots"), nb::arg("side"), nb::arg("reach"))
         .def("solve", &Balance::solve, nb::arg("camera"), nb::arg("along"));
     m.def("unroll_draw", &draw_sheet, nb::arg("camera"), nb::arg("images"), nb::arg("poses"), nb::arg("views"),
           nb::arg("spots"), nb::arg("columns"), nb::arg("rows"), nb::arg("step"), nb::arg("cell"), nb::arg("light"),
-          nb::arg("finest"), nb::arg("radius"), nb::arg("seam"), nb::arg("threads"));
+          nb::arg("finest"), nb::arg("radius"), nb::arg("reach"), nb::arg("seam"), nb::arg("threads"));
 }

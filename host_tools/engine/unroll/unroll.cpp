@@ -13,9 +13,10 @@ namespace pipefish::unroll
 namespace
 {
 
-constexpr double RIM = 24.0;           // pixels over which a picture fades out towards its rim
-constexpr double LEAST_COS = 0.1;      // of incidence: flatter looks show nothing
-constexpr double FADE_COS = 0.15;      // and fade out over this
+constexpr double RIM = 24.0;      // pixels over which a picture fades out towards its rim
+constexpr double LEAST_COS = 0.1; // of incidence: flatter looks show nothing
+constexpr double FADE_COS = 0.15; // and fade out over this
+constexpr double FADE_REACH = 0.1;
 constexpr int CLIPPED = 250, DARK = 3; // greys beyond which nothing is known of the wall
 constexpr int SAMPLES = 4;             // most, a cell and direction
 constexpr double CLIPPED_WEIGHT = 0.003;
@@ -95,7 +96,7 @@ struct Artist {
     {
         const Picture &p = pictures[static_cast<size_t>(picture)];
         for (size_t n = 0; n < nodes(); n++) {
-            looks[static_cast<size_t>(picture) * nodes() + n] = look(camera, p.pose, sheet.nodes[n]);
+            looks[static_cast<size_t>(picture) * nodes() + n] = look(camera, p.pose, sheet.nodes[n], tone.reach);
         }
     }
 
@@ -203,12 +204,12 @@ struct Artist {
 
 } // namespace
 
-Look look(const pf_camera &camera, const Pose &pose, const Spot &spot)
+Look look(const pf_camera &camera, const Pose &pose, const Spot &spot, double reach)
 {
     Look out;
     const Vector3d x = pose * spot.at;
     const double distance = x.norm(), facing = spot.along.cross(spot.down).dot(pose.r.transpose() * x) / distance;
-    if (facing < LEAST_COS) {
+    if (facing < LEAST_COS || distance > reach) {
         return out;
     }
     Eigen::Matrix<double, 2, 3, Eigen::RowMajor> d;
@@ -235,14 +236,14 @@ Look look(const pf_camera &camera, const Pose &pose, const Spot &spot)
 }
 
 std::vector<Glance> glances(const pf_camera &camera, std::span<const Picture> pictures, std::span<const Spot> spots,
-                            double side, int first, std::vector<double> &fine)
+                            double side, double reach, int first, std::vector<double> &fine)
 {
     constexpr int SIDE = 5;
     std::vector<Glance> out;
     fine.assign(spots.size(), 0.0);
     for (size_t i = 0; i < spots.size(); i++) {
         for (const Picture &p : pictures) {
-            const Look l = look(camera, p.pose, spots[i]);
+            const Look l = look(camera, p.pose, spots[i], reach);
             if (!l.seen) {
                 continue;
             }

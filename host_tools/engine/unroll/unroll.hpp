@@ -37,12 +37,13 @@ struct Look {
     double theta = 0.0, phi = 0.0;
     double fall_off = 0.0; // logarithm of cos(incidence) / distance^2
 };
-Look look(const pf_camera &camera, const Pose &pose, const Spot &spot);
+// Nothing is seen further from the eye than `reach`.
+Look look(const pf_camera &camera, const Pose &pose, const Spot &spot, double reach);
 
 // What each picture shows of each spot's surroundings, `side` metres wide: for balancing. Patches that are clipped or
 // dark are left out. patch = first + place in `spots`. fine[i]: the best at spot i.
 std::vector<Glance> glances(const pf_camera &camera, std::span<const Picture> pictures, std::span<const Spot> spots,
-                            double side, int first, std::vector<double> &fine);
+                            double side, double reach, int first, std::vector<double> &fine);
 
 // A rectangle of cells. Nodes lie at every `step`-th corner of cells: (columns / step + 1) x (rows / step + 1) spots,
 // column by column; columns and rows are multiples of step.
@@ -58,6 +59,7 @@ struct Sheet {
 struct Tone {
     double finest = 0.0; // pixels per metre: of a place that is seen as well as can be
     double radius = 0.0; // of the pipe, metres
+    double reach = 0.0;  // metres
     double seam = 0.0;   // metres over which one keyframe goes over into the next
     double level = 0.0;  // logarithm of reflectance that becomes `grey`
     double grey = 118.0;
