@@ -98,6 +98,7 @@ def add_reconstruct(commands: Any) -> None:
         help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
         "reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm)",
     )
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
     p.add_argument("--title", help="of the page [the survey's name]")
 
 
@@ -123,7 +124,9 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
             tell=lambda done, word: bar.update(round(100 * done), word),
         )
         bar.update(97, "writing files")
-        document, files = write_measurement(measured, Path(args.output))
+        document, files = write_measurement(
+            measured, Path(args.output), lambda done, word: bar.update(round(97 + 3 * done), "writing files")
+        )
     return document, reconstruct_text(document, files)
 
 
@@ -216,13 +219,22 @@ def run_unroll(args: argparse.Namespace) -> Result:
 def run_report(args: argparse.Namespace) -> Result:
     """Runs the command."""
     from pipefish.measured_texts import LIMITS
+    from pipefish.progress import Progress
     from pipefish.report import write_report
 
     unknown = [name for name, _ in args.limit if name not in LIMITS]
     if unknown:
         raise UsageError(f"--limit {unknown[0]}: not one of {', '.join(LIMITS)}")
     out = Path(args.output)
-    verdicts = write_report(Path(args.folder), out, limits=args.limit, title=args.title)
+    with Progress("report", 100, args.json) as bar:
+        verdicts = write_report(
+            Path(args.folder),
+            out,
+            limits=args.limit,
+            title=args.title,
+            survey=Path(args.survey) if args.survey else None,
+            tell=lambda done, word: bar.update(round(100 * done), word),
+        )
     document = {"file": str(out), "bytes": out.stat().st_size, "limits": verdicts}
     rows = [(f"limit {v['name']}", v["text"]) for v in verdicts]
     return document, table([*rows, ("written", str(out))])

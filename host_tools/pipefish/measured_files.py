@@ -17,7 +17,7 @@ from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
-from pipefish.measure import Measurement, mean_diameter, not_measured, trend
+from pipefish.measure import Measurement, Tell, mean_diameter, not_measured, trend
 from pipefish.simulate import quaternion
 
 FORMAT, VERSION = "pipefish-reconstruction", 1
@@ -371,10 +371,14 @@ def _only(line: str, held: set[int]) -> str:
     return " ".join(words)
 
 
-def write_measurement(m: Measurement, folder: Path) -> tuple[dict[str, Any], list[str]]:
+def write_measurement(m: Measurement, folder: Path, tell: Tell | None = None) -> tuple[dict[str, Any], list[str]]:
     """Writes all files; returns the document of reconstruction.json and the files' paths. Raises OSError."""
+    from pipefish.gltf import gltf_files
+
     model, note = colmap_model(m)
     document = document_of(m, [note] if note else [])
+    scenes, note = gltf_files(m, document, tell)
+    document["remarks"] += [note] if note else []
     table = stations(m)
     contents = {
         "profile.csv": csv_bytes(table),
@@ -382,6 +386,7 @@ def write_measurement(m: Measurement, folder: Path) -> tuple[dict[str, Any], lis
         "events.csv": _events_csv(document["events"]),
         "points.ply": points_ply(m),
         "tube.ply": tube_ply(m),
+        **scenes,
         **{f"colmap/{name}": data for name, data in model.items()},
     }
     files = [str(folder / name) for name in (*contents, "reconstruction.json")]

@@ -3,39 +3,24 @@
 from __future__ import annotations
 
 import html
-import itertools
-import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pipefish.cloudfile import read_columns
-from pipefish.colours import DIVERGING
-from pipefish.errors import FormatError, PipefishError
+from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_files import COLOUR_SPAN, RING
-from pipefish.measured_texts import (
-    LIMITS,
-    Z95,
-    clock_text,
-    column,
-    events_text,
-    length_text,
-    read_measured,
-    size_parts,
-    verdict,
-)
-from pipefish.page import Chart, chart_html, fill, table_html, whole_page
-
+from pipefish.measured_texts import LIMITS, Z95, clock_text, length_text, size_parts, verdict
+from pipefish.page import chart_html, fill, table_html, whole_page
+from pipefish.report_charts import Charts
+from pipefish.report_wall import WallPicture, wall_picture
+from pipefish.unroll import Tell
 
 
 class Report(Charts):
     """Collects the parts of the page. Use `write_report`."""
 
-    def __init__(self, folder: Path, limits: list[tuple[str, float]]) -> None:
+    def __init__(self, folder: Path, limits: list[tuple[str, float]], picture: WallPicture) -> None:
         super().__init__(folder)
+        self.picture = picture
         self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
 
     # ---- texts
@@ -208,6 +193,7 @@ class Report(Charts):
             "remarks": f"<ul class='remarks'>{remarks}</ul>" if remarks else "<p class='muted'>None.</p>",
             "profile": chart_html(diameter) + chart_html(ovality),
             "events": self.events_html(),
+            "wall": self.picture.html,
             "tube": chart_html(tube),
             "line": "".join(map(chart_html, line)),
             "quality": "".join(map(chart_html, quality)),
@@ -221,17 +207,25 @@ class Report(Charts):
         if self.document["status"] != "ok":
             lead += " Parts were not measured: they are left blank and listed."
         charts = [diameter, ovality, tube, *line, *quality]
-        return whole_page("Pipefish measurement", name, lead, fill("report.html", values), charts, self.tiles())
+        main, more = fill("report.html", values), {"wall": self.picture.data} if self.picture.data else {}
+        return whole_page("Pipefish measurement", name, lead, main, charts, self.tiles(), **more)
 
 
 def write_report(
-    folder: Path, out: Path, *, limits: list[tuple[str, float]] | None = None, title: str | None = None
+    folder: Path,
+    out: Path,
+    *,
+    limits: list[tuple[str, float]] | None = None,
+    title: str | None = None,
+    survey: Path | None = None,
+    tell: Tell | None = None,
 ) -> list[dict[str, Any]]:
     """Writes the page about a folder of `pipefish reconstruct`; returns the verdicts on the limits (name of LIMITS,
-    bound in per cent or millimetres). Raises PipefishError, OSError."""
+    bound in per cent or millimetres). survey: the file with the pictures [where it was when it was measured]; where it
+    is not, the page says so. Raises PipefishError, OSError."""
     for name, _ in limits or []:
         if name not in LIMITS:
             raise PipefishError(f"limit {name}: not one of {', '.join(LIMITS)}")
-    report = Report(folder, limits or [])
+    report = Report(folder, limits or [], wall_picture(folder, survey, tell))
     write_atomically(out, report.render(title).encode())
     return report.verdicts

@@ -87,29 +87,6 @@ def _band(
     ]
 
 
-def _choice(names: list[str], per: int, first: int) -> list[dict[str, Any]]:
-    """A menu that shows one group of `per` traces at a time."""
-    buttons = [
-        {
-            "label": name,
-            "method": "restyle",
-            "args": [{"visible": [k == i for k in range(len(names)) for _ in range(per)]}],
-        }
-        for i, name in enumerate(names)
-    ]
-    return [
-        {
-            "buttons": buttons,
-            "active": first,
-            "x": 0,
-            "xanchor": "left",
-            "y": 1.02,
-            "yanchor": "bottom",
-            "showactive": True,
-        }
-    ]
-
-
 class Charts:
     """Charts of a folder of `pipefish reconstruct`."""
 
@@ -213,9 +190,8 @@ class Charts:
                 "yaxis": _axis("%", rangemode="tozero"),
                 "shapes": shapes,
                 "showlegend": False,
-                "updatemenus": _choice(names, 2, 0),
-                "margin": {"t": 48},
             },
+            "choice": {"label": "Definition", "names": names, "traces": 2},
         }
 
     def chart_tube(self) -> Chart:

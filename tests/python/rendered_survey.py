@@ -15,6 +15,20 @@ from synthetic import BOOT, SURVEY, Object, as_object, write_survey
 
 COUNT = 0.0001  # metres of the encoder
 
+# A pipe with a bend, an oval stretch, and white discs of known place.
+DISC = 0.006
+MARKS = [(0.55, 0.0), (0.6, 1.3), (0.66, 3.4), (0.75, 5.1), (0.84, 2.2), (0.9, 4.2), (0.97, 0.4), (1.05, 5.9)]
+SCENE = {
+    "diameter": 0.2,
+    "pieces": [{"length": 0.6}, {"angle": 0.4, "radius": 0.8, "clock": 1.9}, {"length": 1.6}],
+    "ovals": [{"start": 0.8, "end": 1.6, "ramp": 0.1, "ovality": 0.06, "clock": 0.6}],
+    "markers": [{"s": s, "phi": phi, "radius": DISC} for s, phi in MARKS],
+    "texture": {"contrast": 0.5, "wetness": 0.0},
+    "lens": {"width": 400, "height": 400, "circle_radius": 195, "c_u": 199.5, "c_v": 199.5},
+    "motion": {"frames": 60, "start": 0.4, "speed": 0.5, "ramp": 0.05},
+}
+FRAMES = np.arange(0, 31)  # 25 mm from one to the next
+
 
 def fill_observations(obs: pb.Observations, ids: np.ndarray, pixels: np.ndarray, sigma: float) -> None:
     """Tracks of one keyframe, ids ascending from 1; sigma in pixels."""

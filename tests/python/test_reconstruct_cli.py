@@ -10,7 +10,6 @@ import dataclasses
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -300,24 +299,8 @@ def test_the_report_stands_alone_and_its_scene_has_geometry(out, tmp_path, capsy
     assert mesh["type"] == "mesh3d" and len(mesh["i"]) > 500 and max(mesh["k"]) < len(mesh["x"])
     z = np.array([mesh["x"], mesh["y"], mesh["z"]])
     assert np.ptp(z, axis=1).max() > LENGTH and len(charts["tube"]["data"][1]["x"]) > 500
-    menu = [b["label"] for b in charts["ovality"]["layout"]["updatemenus"][0]["buttons"]]
+    menu = charts["ovality"]["choice"]["names"]
     assert any("F1216" in m for m in menu) and any("13508" in m for m in menu) and len(menu) == 5
-
-
-def test_the_report_renders_in_a_browser(out, tmp_path):
-    """Plotly draws every chart, the 3-D scene among them, without an error of the script."""
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no chromium")
-    page = tmp_path / "report.html"
-    assert main(["report", str(out), "-o", str(page), "--json"]) == 0
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
-    command += ["--enable-unsafe-swiftshader", "--virtual-time-budget=15000", "--window-size=1280,2000", "--dump-dom"]
-    command += [f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
-    assert done.stdout.count("js-plotly-plot") >= len(data_of(page.read_text())["charts"])
-    assert "gl-container" in done.stdout and "<canvas" in done.stdout
-    assert 'class="no-webgl' not in done.stdout
 
 
 def test_limits_hold_the_interval_against_the_bound(out):

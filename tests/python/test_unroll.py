@@ -6,7 +6,6 @@ survey file through `reconstruct` and `unroll` (the whole chain)."""
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,21 +14,8 @@ from PIL import Image
 from pipefish.cli import main
 from pipefish.simulate import Scene
 from pipefish.unroll import Unroller, nice_length
-from rendered_survey import rendered_survey
+from rendered_survey import FRAMES, MARKS, SCENE, rendered_survey
 from true_wall import TrueWall, true_wall
-
-DISC = 0.006
-MARKS = [(0.55, 0.0), (0.6, 1.3), (0.66, 3.4), (0.75, 5.1), (0.84, 2.2), (0.9, 4.2), (0.97, 0.4), (1.05, 5.9)]
-SCENE = {
-    "diameter": 0.2,
-    "pieces": [{"length": 0.6}, {"angle": 0.4, "radius": 0.8, "clock": 1.9}, {"length": 1.6}],
-    "ovals": [{"start": 0.8, "end": 1.6, "ramp": 0.1, "ovality": 0.06, "clock": 0.6}],
-    "markers": [{"s": s, "phi": phi, "radius": DISC} for s, phi in MARKS],
-    "texture": {"contrast": 0.5, "wetness": 0.0},
-    "lens": {"width": 400, "height": 400, "circle_radius": 195, "c_u": 199.5, "c_v": 199.5},
-    "motion": {"frames": 60, "start": 0.4, "speed": 0.5, "ramp": 0.05},
-}
-FRAMES = np.arange(0, 31)  # 25 mm from one to the next
 
 
 def brightest(grey: np.ndarray, row: float, column: float, reach: int) -> tuple[float, float]:
@@ -142,15 +128,6 @@ def test_views_beyond_a_right_angle_are_used(wall):
 
 
 # ---------------------------------------------------------------- from a survey file
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory) -> Path:
-    """out/ and survey.mcap: the same pipe measured from its survey file."""
-    folder = tmp_path_factory.mktemp("rendered")
-    survey = rendered_survey(Scene(SCENE), FRAMES, folder / "survey.mcap")
-    assert main(["reconstruct", str(survey), "-o", str(folder / "out"), "--json"]) == 0
-    return folder
 
 
 def test_a_survey_becomes_a_picture_that_says_where_it_is(measured, tmp_path, capsys):
