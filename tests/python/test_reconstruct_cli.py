@@ -11,6 +11,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import read_columns, read_points
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
-from synthetic import BOOT, SURVEY, as_object, picture, write_survey
+from synthetic import BOOT, SURVEY, Object, as_object, picture, write_survey
 from test_page import Outline, data_of
 from tube_tracks import Drive, tube_drive
 
@@ -28,9 +29,8 @@ COUNT = 0.0005  # metres of the encoder
 LENGTH = 2.0
 
 
-def survey_of(
+def objects_of(
     drive: Drive,
-    path: Path,
     *,
     keep: np.ndarray | None = None,
     encoder: bool = True,
@@ -39,8 +39,9 @@ def survey_of(
     gain: float = 1.0,
     frames: np.ndarray | None = None,
     nominal: float = 0.3,
-) -> Path:
-    """A survey file of a drive. keep: (observations,) bool; gain: of the encoder; frames: which, in the order given."""
+) -> list[Object]:
+    """The objects of a drive as a device sends them. keep: (observations,) bool; gain: of the encoder; frames: which,
+    in the order given."""
     order = np.arange(len(drive.poses)) if frames is None else frames
     camera, jpeg = drive.camera, picture(16, 16, 0)
     begin = pb.SurveyStart(survey_id=SURVEY, name="made-up pipe", software="test", width=camera.width)
@@ -77,7 +78,12 @@ def survey_of(
         obs.status.extend([2] * len(ids))
         objects.append(as_object(OBJECT_KEYFRAME, message))
     finish = pb.SurveyEnd(survey_id=SURVEY, keyframes=len(order), frames=5 * len(order), boots=1, reason="done")
-    write_survey(path, objects=[*objects, as_object(OBJECT_END, finish)])
+    return [*objects, as_object(OBJECT_END, finish)]
+
+
+def survey_of(drive: Drive, path: Path, **options: Any) -> Path:
+    """A survey file of a drive; options of objects_of."""
+    write_survey(path, objects=objects_of(drive, **options))
     return path
 
 
