@@ -14,6 +14,7 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
+from pipefish.sectionsigma import diameter_sigma
 from pipefish.structure import REASONS, Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.tube import Tube, fit_tube
@@ -60,13 +61,15 @@ class Scale:
 
 @dataclass
 class Stretch:
-    """One segment of the structure, its frames and its tube. chainage = origin + sign * s."""
+    """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
+    mean diameter over all of it."""
 
     segment: int
     tube: Tube
     frames: np.ndarray
     origin: float
     sign: int
+    d_mean_sigma: float = math.nan
 
     def chainage(self, s: Any) -> Any:
         """Along the survey, from s along the tube."""
@@ -99,8 +102,10 @@ class Measurement:
     index       (K,) index of each keyframe that is here; frames below and in `structure` count these
     encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
     structure   in the unit of `scale`
-    camera_sigma   relative systematic sigma of the diameter by the camera's covariance; None: not known
+    camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
+                not known
     remarks     what one should know, in words, most serious first
+    factors     of each segment: by what the adjustment's unit was multiplied
     """
 
     survey: Survey
@@ -116,6 +121,7 @@ class Measurement:
     residuals: Residuals
     backwards: bool
     remarks: list[str] = field(default_factory=list)
+    factors: list[float] = field(default_factory=list)
 
     @property
     def measured(self) -> list[Stretch]:
@@ -285,8 +291,7 @@ def measure(
             "found, but "
             f"no pipe around them: {'; '.join(reasons)}"
         )
-    m.camera_sigma = _camera_sigma(m)
-    _widen(m)
+    _sigmas(m)
     _check_diameter(m, diameter)
     _remark(m, diameter)
     return m
@@ -338,6 +343,7 @@ def _up(structure: Reconstruction) -> np.ndarray:
 
 def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
     """Brings the structure into metres, or into diameters of each stretch."""
+    m.factors = [1.0] * len(m.structure.sigma)
     if m.structure.unit == "metre":
         sigma = float(m.structure.scale_sigma or 0.0)
         noise = quality.noise_m_per_sqrt_m
@@ -353,7 +359,7 @@ def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell)
         size = tube.summary["d_mean"] if tube.status == "ok" else None
         factors.append((diameter or 1.0) / size if size else 1.0)
         tell(0.5, "scale")
-    m.structure = rescaled(m.structure, factors)
+    m.structure, m.factors = rescaled(m.structure, factors), factors
     m.scale = Scale("diameter", "metre", 0.0) if diameter else Scale("none", "diameter", 0.0)
 
 
@@ -426,50 +432,49 @@ def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool)
     return float(along[first] - sign * s[first]), sign
 
 
-def _camera_sigma(m: Measurement) -> float | None:
-    """What the camera's uncertainty does to a diameter, relative: the same error moves all points, so that their radial
-    sigma does not average away. The median over points of that sigma over the radius; an upper bound where it changes
-    sign with the angle."""
-    if m.structure.systematic is None:
-        return None
+def _sigmas(m: Measurement) -> None:
+    """Sets the stations' sigmas from the adjustment: the tube takes its points' errors as their own, and knows neither
+    camera nor wheel. Random: what the encoder's noise, the poses and the points leave open, the wheel's scale taken
+    out; systematic: that scale and the camera."""
+    found = {s.segment: diameter_sigma(m.structure, s.segment, s.tube) for s in m.measured}
     ratios = []
     for stretch in m.measured:
-        inside = m.structure.point_segment == stretch.segment
-        points, spread = m.structure.points[inside], m.structure.systematic[inside]
-        place = stretch.tube.project(points)
-        on = place["piece"] >= 0
-        axis = stretch.tube.frames(place["s"][on])["centre"]
-        out = points[on] - axis
-        radius = np.linalg.norm(out, axis=1)
-        out /= radius[:, None]
-        ratios.append(np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", out, spread[on], out))) / radius)
-    return float(np.median(np.concatenate(ratios)))
-
-
-def _widen(m: Measurement) -> None:
-    """Adds to the stations' sigmas what the tube, which takes its points' errors as their own, cannot know: the camera
-    (systematic), and the wander of the scale (random): over a diameter it is known as well as the encoder tells it. An
-    upper bound: vision ties a little more than that together."""
-    for stretch in m.measured:
-        stations = stretch.tube.stations
-        local = m.scale.noise / math.sqrt(stretch.tube.summary["d_mean"])
-        for name in ("d_mean", "d_area", "d_max", "d_min", "circumference"):
-            stations[name + "_sigma"] = np.hypot(stations[name + "_sigma"], local * stations[name])
+        exact, factor, stations = found[stretch.segment], m.factors[stretch.segment], stretch.tube.stations
+        stretch.d_mean_sigma = stretch.tube.summary["d_mean_sigma"]
+        if exact is None:
+            continue
+        d = stations["d_mean"]
+        if exact.camera is not None:
+            camera = factor * np.interp(stations["s"], exact.s, exact.camera) / d
+            ratios.append(camera[np.isfinite(camera)])
+        if m.scale.source != "encoder":  # the scale is given: of the wander along the path the tube's sigma tells
+            continue
+        wheel = m.scale.sigma
+        beyond = np.maximum(0, np.interp(stations["s"], exact.s, exact.random) ** 2 - (wheel * d) ** 2)
+        own = np.hypot(stations["d_mean_sigma"], np.sqrt(beyond))
+        span = stations["ovality_sigma"] * d  # of widest less narrowest
+        stations["d_mean_sigma"], stations["circumference_sigma"] = own, np.pi * own
+        stations["d_area_sigma"] = np.hypot(stations["d_area_sigma"], np.sqrt(beyond))
+        for name in ("d_max", "d_min"):
+            stations[name + "_sigma"] = np.hypot(own, 0.5 * span)
         if stretch.tube.nominal:
             stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
+        mean = stretch.tube.summary["d_mean"]
+        rest = math.sqrt(max(0.0, exact.mean_random**2 - (wheel * mean) ** 2))
+        stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
+    m.camera_sigma = float(np.median(np.concatenate(ratios))) if ratios else None
+    for stretch in m.measured:
+        stations = stretch.tube.stations
         for name in [n for n in stations if n.endswith("_systematic")]:
             stations[name] = m.systematic * stations[name.removesuffix("_systematic")]
 
 
 def mean_diameter(m: Measurement) -> tuple[float, float]:
     """Mean over all that was measured, and its random sigma."""
-    tubes = [s.tube for s in m.measured]
-    weight = np.array([t.summary["measured"] for t in tubes], float)
+    weight = np.array([s.tube.summary["measured"] for s in m.measured], float)
     weight /= weight.sum()
-    value = float(sum(w * t.summary["d_mean"] for w, t in zip(weight, tubes, strict=True)))
-    sigma = math.sqrt(sum((w * t.summary["d_mean_sigma"]) ** 2 for w, t in zip(weight, tubes, strict=True)))
-    wander = m.scale.noise / math.sqrt(max(m.structure.length, 1e-3))
-    return value, math.hypot(sigma, wander * value)
+    value = float(sum(w * s.tube.summary["d_mean"] for w, s in zip(weight, m.measured, strict=True)))
+    return value, math.sqrt(sum((w * s.d_mean_sigma) ** 2 for w, s in zip(weight, m.measured, strict=True)))
 
 
 def _check_diameter(m: Measurement, diameter: float | None) -> None:

@@ -39,9 +39,10 @@ def objects_of(
     gain: float = 1.0,
     frames: np.ndarray | None = None,
     nominal: float = 0.3,
+    seed: int = 3,
 ) -> list[Object]:
     """The objects of a drive as a device sends them. keep: (observations,) bool; gain: of the encoder; frames: which,
-    in the order given."""
+    in the order given; seed: of the encoder's noise."""
     order = np.arange(len(drive.poses)) if frames is None else frames
     camera, jpeg = drive.camera, picture(16, 16, 0)
     begin = pb.SurveyStart(survey_id=SURVEY, name="made-up pipe", software="test", width=camera.width)
@@ -50,7 +51,7 @@ def objects_of(
     if encoder:
         begin.encoder.metres_per_count, begin.encoder.metres_per_count_sigma = COUNT, 0.001 * COUNT
     objects = [as_object(OBJECT_START, begin)]
-    tracks, random = drive.tracks, np.random.default_rng(3)
+    tracks, random = drive.tracks, np.random.default_rng(seed)
     keep = np.ones(len(tracks.frame), bool) if keep is None else keep
     steps = np.abs(np.diff(drive.driven[order], prepend=drive.driven[order[0]]))
     driven = np.cumsum(steps + random.normal(0, 0.0005, len(order)) * (np.arange(len(order)) > 0))
