@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import threading
 from collections.abc import Callable
@@ -15,7 +14,7 @@ import numpy as np
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.sectionsigma import diameter_sigma
-from pipefish.structure import REASONS, Encoder, Reconstruction, reconstruct
+from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.tube import Tube, fit_tube
 
@@ -23,10 +22,6 @@ T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
 
 OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are not in the COLMAP model
-THETA_BIN = math.radians(10)
-TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
-BIN_LEAST = 100  # observations, for a bin to be judged
-SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
 DISAGREE_SIGMA = 3.0
 # A tracker's stated covariance is that of one step's noise. Its errors along a track are a walk: in a simulated
@@ -44,7 +39,6 @@ class Scale:
 
     source      "encoder", "diameter" (the given one: then no diameter has been measured), "none"
     unit        "metre", or "diameter": lengths are in mean diameters of their stretch
-    noise       random part of the encoder, metres over a square root of metres: it makes the scale wander
     sigma       relative, shared by all; 0 for a given diameter and without scale: there it is part of the definition
     wheel, wheel_sigma   (true distance over the encoder's) - 1 as estimated; None without an encoder
     check       a given diameter beside an encoder: given, measured, sigma, deviation (in sigmas), consistent
@@ -53,7 +47,6 @@ class Scale:
     source: str
     unit: str
     sigma: float
-    noise: float = 0.0
     wheel: float | None = None
     wheel_sigma: float | None = None
     check: dict[str, Any] | None = None
@@ -232,6 +225,8 @@ def measure(
     tell       is called with a fraction done and a word
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
+    from pipefish.measured_remarks import remark
+
     tell = tell or (lambda fraction, word: None)
     for name, value in (("diameter", diameter), ("nominal", nominal)):
         if value is not None and not (math.isfinite(value) and value > 0):
@@ -282,7 +277,7 @@ def measure(
         backwards=bool(ahead.sum() < 0),
         remarks=remarks,
     )
-    _scale(m, quality, diameter, tell)
+    _scale(m, diameter, tell)
     _fit_stretches(m, threads, tell)
     if not m.measured:
         reasons = sorted({s.tube.reason for s in m.stretches})
@@ -293,7 +288,7 @@ def measure(
         )
     _sigmas(m)
     _check_diameter(m, diameter)
-    _remark(m, diameter)
+    remark(m, diameter)
     return m
 
 
@@ -341,13 +336,12 @@ def _up(structure: Reconstruction) -> np.ndarray:
     return -structure.down if structure.down is not None else np.array([0.0, -1.0, 0.0])
 
 
-def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
+def _scale(m: Measurement, diameter: float | None, tell: Tell) -> None:
     """Brings the structure into metres, or into diameters of each stretch."""
     m.factors = [1.0] * len(m.structure.sigma)
     if m.structure.unit == "metre":
         sigma = float(m.structure.scale_sigma or 0.0)
-        noise = quality.noise_m_per_sqrt_m
-        m.scale = Scale("encoder", "metre", sigma, noise, m.structure.wheel, m.structure.wheel_sigma)
+        m.scale = Scale("encoder", "metre", sigma, m.structure.wheel, m.structure.wheel_sigma)
         return
     m.encoder = None  # of no use: too few of its steps could be used
     factors = []
@@ -498,116 +492,3 @@ def _check_diameter(m: Measurement, diameter: float | None) -> None:
             f"{1000 * diameter:.1f} mm: "
             f"{abs(deviation):.1f} sigma apart. The values are the encoder's.",
         )
-
-
-def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str, Any]]:
-    """Residuals of the inliers by angle from the axis: low, high (degrees), count, mean radial and rms, px."""
-    keep = residuals.inlier
-    out = tracks.pixels[residuals.item[keep]] - np.array([camera.c_u, camera.c_v])
-    radial = np.einsum("ni,ni->n", residuals.pixels[keep], out) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
-    number = (residuals.theta[keep] / THETA_BIN).astype(int)
-    rms = np.einsum("ni,ni->n", residuals.pixels[keep], residuals.pixels[keep]) / 2
-    rows = []
-    for k in np.unique(number):
-        inside = number == k
-        rows.append(
-            {
-                "low_deg": 10.0 * int(k),
-                "high_deg": 10.0 * int(k) + 10.0,
-                "count": int(inside.sum()),
-                "mean_radial_px": float(radial[inside].mean()),
-                "rms_px": float(np.sqrt(rms[inside].mean())),
-            }
-        )
-    return rows
-
-
-def _remark(m: Measurement, diameter: float | None) -> None:
-    """What one should know, most serious first."""
-    remarks: list[str] = []
-    if m.scale.source == "none":
-        remarks.append(
-            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
-            "measured. "
-            "--diameter gives a scale."
-        )
-    if m.scale.source == "diameter" and diameter:
-        remarks.append(
-            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
-            "changes along the pipe, ovality and angles were."
-        )
-    worst = m.residuals.spread
-    if worst > SIGMA_MOST:
-        remarks.append(
-            f"Residuals scatter {worst:.1f} times as far as the tracks' own noise: a wrong profile, a lens that "
-            "has moved, or "
-            "a wall that does?"
-        )
-    bins = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
-    bent = max(bins, key=lambda b: abs(b["mean_radial_px"]), default=None)
-    if bent and abs(bent["mean_radial_px"]) > TREND_PX:
-        remarks.append(
-            f"Residuals have a trend: {bent['mean_radial_px']:+.2f} px outwards between {bent['low_deg']:.0f} and "
-            f"{bent['high_deg']:.0f} degrees from the axis. The profile does not quite fit the camera (or its "
-            "pupil moves), "
-            "and diameters may be off by more than their intervals."
-        )
-    if m.camera.covariance is None:
-        remarks.append(
-            "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
-        )
-    if m.structure.down is None:
-        remarks.append("No inclinometer: the clock is relative to the first keyframe.")
-    if m.backwards:
-        remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
-    for b in m.survey.breaks:
-        if b["restart"]:
-            remarks.append(
-                f"The device restarted before keyframe {b['index']}: what it drove meanwhile nobody counted, and the "
-                "chainage goes on as if it were nothing."
-            )
-    if m.structure.repeated:
-        remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
-    m.remarks = remarks + m.remarks
-
-
-def not_measured(m: Measurement) -> list[dict[str, Any]]:
-    """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
-    rows = []
-    along = np.full(len(m.index), np.nan)
-    along[m.structure.frames] = m.frame_chainage()
-    if m.encoder is not None:
-        along = m.encoder
-
-    def at(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
-
-    for gap in m.structure.gaps:
-        rows.append(
-            {
-                "start": at(along[gap.first]),
-                "end": at(along[gap.last]),
-                "reason": gap.reason,
-                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
-            }
-        )
-    for stretch in m.stretches:
-        if stretch.tube.status != "ok":
-            ends = along[stretch.frames[[0, -1]]]
-            rows.append(
-                {"start": at(ends[0]), "end": at(ends[1]), "reason": stretch.tube.status, "detail": stretch.tube.reason}
-            )
-            continue
-        stations = stretch.tube.stations
-        for good, run in itertools.groupby(range(len(stations["s"])), key=lambda i: stations["status"][i]):
-            if good == "ok":
-                continue
-            inside = list(run)
-            ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
-            what = {
-                "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
-                "one_sided": "nothing: no wall seen over more than 220 degrees",
-                "too_few_points": "nothing: too few points on the wall",
-            }[str(good)]
-            rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
-    return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

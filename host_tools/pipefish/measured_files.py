@@ -17,7 +17,8 @@ from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
-from pipefish.measure import Measurement, Tell, mean_diameter, not_measured, trend
+from pipefish.measure import Measurement, Tell, mean_diameter
+from pipefish.measured_remarks import not_measured, trend
 from pipefish.simulate import quaternion
 
 FORMAT, VERSION = "pipefish-reconstruction", 1

@@ -257,7 +257,7 @@ class Charts:
             "marker": {"size": 1.2, "color": "#7d8a97"},
             "hoverinfo": "skip",
         }
-        data.append({**dots, "name": "points", **at(points)})
+        data.append({**dots, "name": "points", "visible": "legendonly", **at(points)})  # they hide the wall's colour
         path = np.array(self.document["poses"]["centre"], float)
         of_stretch = self.document["poses"]["stretch"]
         rows: list[np.ndarray] = []
@@ -269,7 +269,7 @@ class Charts:
         return {
             "id": "tube",
             "title": "The pipe in 3-D",
-            "text": "Drag to turn, wheel or two fingers to come nearer. Colour: the wall's radius against "
+            "text": "Drag to turn, wheel or two fingers to come nearer; the points are switched on in the legend. Colour: the wall's radius against "
             f"{'nominal' if self.summary['nominal'] and self.unit == 'metre' else 'the mean'}.",
             "data": data,
             "layout": {

@@ -37,6 +37,7 @@
       font: { family: getComputedStyle(document.body).fontFamily, color: colour("--muted") },
       colorway: dark.matches ? ["#4cc3cd", "#f0a35e", "#b79cf0", "#8fc866", "#e8799a", "#d6c24e", "#7aa6f2"]
         : ["#0f7f89", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63", "#8f7a00", "#2f62c0"],
+      uirevision: "keep", // what a reader turned stays when all is drawn again
       margin: { l: 54, r: 12, t: 8, b: 44 }, bargap: 0.06, dragmode: false,
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 12 } },
       hoverlabel: { font: { size: 13 } },
@@ -56,7 +57,13 @@
         axes.scene = { xaxis: side, yaxis: side, zaxis: side };
       }
       const whole = merge(merge(layout, axes), chart.layout);
-      Plotly.react("plot-" + chart.id, chart.data, whole, { displayModeBar: false, responsive: true });
+      const place = document.getElementById("plot-" + chart.id);
+      const eye = whole.scene && whole.scene.camera && whole.scene.camera.eye;
+      if (eye) { // tall windows see as much to the sides from further away
+        const away = Math.min(2.5, Math.max(1, (1.25 * place.clientHeight) / place.clientWidth));
+        whole.scene.camera = { eye: { x: away * eye.x, y: away * eye.y, z: away * eye.z } };
+      }
+      Plotly.react(place, chart.data, whole, { displayModeBar: false, responsive: true });
     }
   };
   draw();
@@ -79,7 +86,7 @@
     const view = document.getElementById("wall-view");
     const caption = document.getElementById("wall-text");
     const cursor = document.getElementById("wall-cursor");
-    let column = Math.floor(wall.columns / 2), row = 0, shown = -1;
+    let column = Math.floor(Math.min(wall.columns, strip.parentElement.clientWidth) / 2), row = 0, shown = -1;
     const hour = (r) => {
       let run = wall.signs.find((s) => at(column) <= s.end) || wall.signs[wall.signs.length - 1];
       const turn = wall.cut / (2 * Math.PI) - run.clock_sign * (r + 0.5) / wall.rows;
