@@ -71,7 +71,10 @@ def run_receive(args: argparse.Namespace) -> Result:
         overwrite=args.overwrite,
         timeout_s=args.timeout,
         quiet=args.json,
+        live=args.live,
     )
+    from pipefish.live import summary_rows
+
     link = summary["link"]
     goodput = link["goodput_bytes_per_s"]
     recovered = summary["recovered_objects"]
@@ -90,6 +93,7 @@ def run_receive(args: argparse.Namespace) -> Result:
         *(("other survey", f"{o['file']}: {o['keyframes']} keyframes") for o in summary["other_surveys"]),
         *(("incomplete", f) for f in summary["incomplete_surveys"]),
         *(("damaged copy", f) for f in summary["damaged_copies"]),
+        *(summary_rows(summary["live"]) if "live" in summary else []),
     ]
     return summary, table(rows)
 
@@ -476,6 +480,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument(
         "-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete"
     )
+    p.add_argument("--live", action="store_true", help="measure the pipe meanwhile: diameter, ovality, warnings")
     p.add_argument("--overwrite", action="store_true", help="start anew; FILE stays until the new survey is complete")
     p.add_argument(
         "--timeout",

@@ -1,4 +1,4 @@
-"""`pipefish reconstruct` and `pipefish report`: from a survey to a measured pipe and what a surveyor hands over."""
+"""`pipefish reconstruct`, `unroll` and `report`: from a survey to a measured pipe and what a surveyor hands over."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ def _millimetres(text: str) -> float:
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"{text} is not a length above zero")
     return value / 1000
+
+
+def _hour(text: str) -> float:
+    value = float(text)
+    if not 0 <= value <= 12:
+        raise argparse.ArgumentTypeError(f"{text} is not on a clock, 0 to 12")
+    return value * math.pi / 6
 
 
 def _limit(text: str) -> tuple[str, float]:
@@ -59,6 +66,22 @@ def add_reconstruct(commands: Any) -> None:
 
     p = add_command(
         commands,
+        "unroll",
+        run_unroll,
+        "Draw the wall as one picture at true scale: chainage by clock, best view of each place, in one light.",
+        "pipefish unroll out/ -o unrolled.png --labels",
+    )
+    p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
+    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
+    p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
+    p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
+    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
+    p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
+
+    p = add_command(
+        commands,
         "report",
         run_report,
         "Write one HTML page about a measured pipe: figures and limits, profile, findings, 3-D, quality. No network.",
@@ -75,6 +98,7 @@ def add_reconstruct(commands: Any) -> None:
         help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
         "reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm)",
     )
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
     p.add_argument("--title", help="of the page [the survey's name]")
 
 
@@ -100,7 +124,9 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
             tell=lambda done, word: bar.update(round(100 * done), word),
         )
         bar.update(97, "writing files")
-        document, files = write_measurement(measured, Path(args.output))
+        document, files = write_measurement(
+            measured, Path(args.output), lambda done, word: bar.update(round(97 + 3 * done), "writing files")
+        )
     return document, reconstruct_text(document, files)
 
 
@@ -160,16 +186,57 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     return table(rows)
 
 
+def run_unroll(args: argparse.Namespace) -> Result:
+    """Runs the command."""
+    from pipefish.progress import Progress
+    from pipefish.unroll import Unroller
+    from pipefish.unroll_files import from_source, write_unrolled
+
+    with Progress("unroll", 100, args.json) as bar:
+
+        def tell(done: float, word: str) -> None:
+            bar.update(round(100 * done), word)
+
+        wall = from_source(Path(args.source), Path(args.survey) if args.survey else None, tell)
+        span = None
+        if args.start is not None or args.end is not None:
+            span = (-math.inf if args.start is None else args.start, math.inf if args.end is None else args.end)
+        if args.mm is not None and wall.unit != "metre":
+            raise UsageError("--mm: there is no scale, lengths are in mean diameters")
+        unroller = Unroller(wall, cell=args.mm, cut=args.cut, span=span, tell=tell)
+        document, files = write_unrolled(unroller, Path(args.output), labels=args.labels, tell=tell)
+    scale = document["scale"]
+    resolved = f", the pictures resolve {scale['resolved']:.2g}" if scale["resolved"] else ""
+    rows: list[tuple[str, object]] = [
+        ("picture", f"{document['columns']} x {document['rows']} pixels"),
+        ("scale", f"{scale['along']:.4g} {scale['unit']} along, {scale['around']:.4g} around{resolved}"),
+        ("seen", f"{100 * document['seen']:.2f} % of the wall"),
+        ("keyframes", len({k["keyframe"] for k in document["keyframes"]})),
+        *(("not seen", f"{n['start']:.2f} to {n['end']:.2f}") for n in document["not_seen"]),
+        *(("written", file) for file in files),
+    ]
+    return document, table(rows)
+
+
 def run_report(args: argparse.Namespace) -> Result:
     """Runs the command."""
     from pipefish.measured_texts import LIMITS
+    from pipefish.progress import Progress
     from pipefish.report import write_report
 
     unknown = [name for name, _ in args.limit if name not in LIMITS]
     if unknown:
         raise UsageError(f"--limit {unknown[0]}: not one of {', '.join(LIMITS)}")
     out = Path(args.output)
-    verdicts = write_report(Path(args.folder), out, limits=args.limit, title=args.title)
+    with Progress("report", 100, args.json) as bar:
+        verdicts = write_report(
+            Path(args.folder),
+            out,
+            limits=args.limit,
+            title=args.title,
+            survey=Path(args.survey) if args.survey else None,
+            tell=lambda done, word: bar.update(round(100 * done), word),
+        )
     document = {"file": str(out), "bytes": out.stat().st_size, "limits": verdicts}
     rows = [(f"limit {v['name']}", v["text"]) for v in verdicts]
     return document, table([*rows, ("written", str(out))])

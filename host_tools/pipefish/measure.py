@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import threading
 from collections.abc import Callable
@@ -14,8 +13,9 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
-from pipefish.health import VERDICTS, ProfileCheck, check_profile
-from pipefish.structure import REASONS, Encoder, Reconstruction, reconstruct
+from pipefish.health import ProfileCheck, check_profile
+from pipefish.sectionsigma import diameter_sigma
+from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.tube import Tube, fit_tube
 
@@ -23,10 +23,6 @@ T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
 
 OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are not in the COLMAP model
-THETA_BIN = math.radians(10)
-TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
-BIN_LEAST = 100  # observations, for a bin to be judged
-SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
 DISAGREE_SIGMA = 3.0
 # A tracker's stated covariance is that of one step's noise. Its errors along a track are a walk: in a simulated
@@ -44,7 +40,6 @@ class Scale:
 
     source      "encoder", "diameter" (the given one: then no diameter has been measured), "none"
     unit        "metre", or "diameter": lengths are in mean diameters of their stretch
-    noise       random part of the encoder, metres over a square root of metres: it makes the scale wander
     sigma       relative, shared by all; 0 for a given diameter and without scale: there it is part of the definition
     wheel, wheel_sigma   (true distance over the encoder's) - 1 as estimated; None without an encoder
     check       a given diameter beside an encoder: given, measured, sigma, deviation (in sigmas), consistent
@@ -53,7 +48,6 @@ class Scale:
     source: str
     unit: str
     sigma: float
-    noise: float = 0.0
     wheel: float | None = None
     wheel_sigma: float | None = None
     check: dict[str, Any] | None = None
@@ -61,13 +55,15 @@ class Scale:
 
 @dataclass
 class Stretch:
-    """One segment of the structure, its frames and its tube. chainage = origin + sign * s."""
+    """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
+    mean diameter over all of it."""
 
     segment: int
     tube: Tube
     frames: np.ndarray
     origin: float
     sign: int
+    d_mean_sigma: float = math.nan
 
     def chainage(self, s: Any) -> Any:
         """Along the survey, from s along the tube."""
@@ -100,9 +96,11 @@ class Measurement:
     index       (K,) index of each keyframe that is here; frames below and in `structure` count these
     encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
     structure   in the unit of `scale`
-    camera_sigma   relative systematic sigma of the diameter by the camera's covariance; None: not known
+    camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
+                not known
     health      what the survey says of its profile
     remarks     what one should know, in words, most serious first
+    factors     of each segment: by what the adjustment's unit was multiplied
     """
 
     survey: Survey
@@ -119,6 +117,7 @@ class Measurement:
     backwards: bool
     health: ProfileCheck | None = None
     remarks: list[str] = field(default_factory=list)
+    factors: list[float] = field(default_factory=list)
 
     @property
     def measured(self) -> list[Stretch]:
@@ -229,6 +228,8 @@ def measure(
     tell       is called with a fraction done and a word
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
+    from pipefish.measured_remarks import remark
+
     tell = tell or (lambda fraction, word: None)
     for name, value in (("diameter", diameter), ("nominal", nominal)):
         if value is not None and not (math.isfinite(value) and value > 0):
@@ -279,7 +280,7 @@ def measure(
         backwards=bool(ahead.sum() < 0),
         remarks=remarks,
     )
-    _scale(m, quality, diameter, tell)
+    _scale(m, diameter, tell)
     _fit_stretches(m, threads, tell)
     if not m.measured:
         reasons = sorted({s.tube.reason for s in m.stretches})
@@ -288,8 +289,7 @@ def measure(
             "found, but "
             f"no pipe around them: {'; '.join(reasons)}"
         )
-    m.camera_sigma = _camera_sigma(m)
-    _widen(m)
+    _sigmas(m)
     _check_diameter(m, diameter)
     m.health = _while_telling(
         lambda: check_profile(
@@ -304,7 +304,7 @@ def measure(
         ),
         lambda: tell(0.9, "profile"),
     )
-    _remark(m, diameter)
+    remark(m, diameter)
     return m
 
 
@@ -352,12 +352,12 @@ def _up(structure: Reconstruction) -> np.ndarray:
     return -structure.down if structure.down is not None else np.array([0.0, -1.0, 0.0])
 
 
-def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell) -> None:
+def _scale(m: Measurement, diameter: float | None, tell: Tell) -> None:
     """Brings the structure into metres, or into diameters of each stretch."""
+    m.factors = [1.0] * len(m.structure.sigma)
     if m.structure.unit == "metre":
         sigma = float(m.structure.scale_sigma or 0.0)
-        noise = quality.noise_m_per_sqrt_m
-        m.scale = Scale("encoder", "metre", sigma, noise, m.structure.wheel, m.structure.wheel_sigma)
+        m.scale = Scale("encoder", "metre", sigma, m.structure.wheel, m.structure.wheel_sigma)
         return
     m.encoder = None  # of no use: too few of its steps could be used
     factors = []
@@ -369,7 +369,7 @@ def _scale(m: Measurement, quality: Encoder, diameter: float | None, tell: Tell)
         size = tube.summary["d_mean"] if tube.status == "ok" else None
         factors.append((diameter or 1.0) / size if size else 1.0)
         tell(0.5, "scale")
-    m.structure = rescaled(m.structure, factors)
+    m.structure, m.factors = rescaled(m.structure, factors), factors
     m.scale = Scale("diameter", "metre", 0.0) if diameter else Scale("none", "diameter", 0.0)
 
 
@@ -442,50 +442,49 @@ def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool)
     return float(along[first] - sign * s[first]), sign
 
 
-def _camera_sigma(m: Measurement) -> float | None:
-    """What the camera's uncertainty does to a diameter, relative: the same error moves all points, so that their radial
-    sigma does not average away. The median over points of that sigma over the radius; an upper bound where it changes
-    sign with the angle."""
-    if m.structure.systematic is None:
-        return None
+def _sigmas(m: Measurement) -> None:
+    """Sets the stations' sigmas from the adjustment: the tube takes its points' errors as their own, and knows neither
+    camera nor wheel. Random: what the encoder's noise, the poses and the points leave open, the wheel's scale taken
+    out; systematic: that scale and the camera."""
+    found = {s.segment: diameter_sigma(m.structure, s.segment, s.tube) for s in m.measured}
     ratios = []
     for stretch in m.measured:
-        inside = m.structure.point_segment == stretch.segment
-        points, spread = m.structure.points[inside], m.structure.systematic[inside]
-        place = stretch.tube.project(points)
-        on = place["piece"] >= 0
-        axis = stretch.tube.frames(place["s"][on])["centre"]
-        out = points[on] - axis
-        radius = np.linalg.norm(out, axis=1)
-        out /= radius[:, None]
-        ratios.append(np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", out, spread[on], out))) / radius)
-    return float(np.median(np.concatenate(ratios)))
-
-
-def _widen(m: Measurement) -> None:
-    """Adds to the stations' sigmas what the tube, which takes its points' errors as their own, cannot know: the camera
-    (systematic), and the wander of the scale (random): over a diameter it is known as well as the encoder tells it. An
-    upper bound: vision ties a little more than that together."""
-    for stretch in m.measured:
-        stations = stretch.tube.stations
-        local = m.scale.noise / math.sqrt(stretch.tube.summary["d_mean"])
-        for name in ("d_mean", "d_area", "d_max", "d_min", "circumference"):
-            stations[name + "_sigma"] = np.hypot(stations[name + "_sigma"], local * stations[name])
+        exact, factor, stations = found[stretch.segment], m.factors[stretch.segment], stretch.tube.stations
+        stretch.d_mean_sigma = stretch.tube.summary["d_mean_sigma"]
+        if exact is None:
+            continue
+        d = stations["d_mean"]
+        if exact.camera is not None:
+            camera = factor * np.interp(stations["s"], exact.s, exact.camera) / d
+            ratios.append(camera[np.isfinite(camera)])
+        if m.scale.source != "encoder":  # the scale is given: of the wander along the path the tube's sigma tells
+            continue
+        wheel = m.scale.sigma
+        beyond = np.maximum(0, np.interp(stations["s"], exact.s, exact.random) ** 2 - (wheel * d) ** 2)
+        own = np.hypot(stations["d_mean_sigma"], np.sqrt(beyond))
+        span = stations["ovality_sigma"] * d  # of widest less narrowest
+        stations["d_mean_sigma"], stations["circumference_sigma"] = own, np.pi * own
+        stations["d_area_sigma"] = np.hypot(stations["d_area_sigma"], np.sqrt(beyond))
+        for name in ("d_max", "d_min"):
+            stations[name + "_sigma"] = np.hypot(own, 0.5 * span)
         if stretch.tube.nominal:
             stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
+        mean = stretch.tube.summary["d_mean"]
+        rest = math.sqrt(max(0.0, exact.mean_random**2 - (wheel * mean) ** 2))
+        stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
+    m.camera_sigma = float(np.median(np.concatenate(ratios))) if ratios else None
+    for stretch in m.measured:
+        stations = stretch.tube.stations
         for name in [n for n in stations if n.endswith("_systematic")]:
             stations[name] = m.systematic * stations[name.removesuffix("_systematic")]
 
 
 def mean_diameter(m: Measurement) -> tuple[float, float]:
     """Mean over all that was measured, and its random sigma."""
-    tubes = [s.tube for s in m.measured]
-    weight = np.array([t.summary["measured"] for t in tubes], float)
+    weight = np.array([s.tube.summary["measured"] for s in m.measured], float)
     weight /= weight.sum()
-    value = float(sum(w * t.summary["d_mean"] for w, t in zip(weight, tubes, strict=True)))
-    sigma = math.sqrt(sum((w * t.summary["d_mean_sigma"]) ** 2 for w, t in zip(weight, tubes, strict=True)))
-    wander = m.scale.noise / math.sqrt(max(m.structure.length, 1e-3))
-    return value, math.hypot(sigma, wander * value)
+    value = float(sum(w * s.tube.summary["d_mean"] for w, s in zip(weight, m.measured, strict=True)))
+    return value, math.sqrt(sum((w * s.d_mean_sigma) ** 2 for w, s in zip(weight, m.measured, strict=True)))
 
 
 def _check_diameter(m: Measurement, diameter: float | None) -> None:
@@ -509,118 +508,3 @@ def _check_diameter(m: Measurement, diameter: float | None) -> None:
             f"{1000 * diameter:.1f} mm: "
             f"{abs(deviation):.1f} sigma apart. The values are the encoder's.",
         )
-
-
-def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str, Any]]:
-    """Residuals of the inliers by angle from the axis: low, high (degrees), count, mean radial and rms, px."""
-    keep = residuals.inlier
-    out = tracks.pixels[residuals.item[keep]] - np.array([camera.c_u, camera.c_v])
-    radial = np.einsum("ni,ni->n", residuals.pixels[keep], out) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
-    number = (residuals.theta[keep] / THETA_BIN).astype(int)
-    rms = np.einsum("ni,ni->n", residuals.pixels[keep], residuals.pixels[keep]) / 2
-    rows = []
-    for k in np.unique(number):
-        inside = number == k
-        rows.append(
-            {
-                "low_deg": 10.0 * int(k),
-                "high_deg": 10.0 * int(k) + 10.0,
-                "count": int(inside.sum()),
-                "mean_radial_px": float(radial[inside].mean()),
-                "rms_px": float(np.sqrt(rms[inside].mean())),
-            }
-        )
-    return rows
-
-
-def _remark(m: Measurement, diameter: float | None) -> None:
-    """What one should know, most serious first."""
-    remarks: list[str] = []
-    if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
-        remarks.append(m.health.text)
-    if m.scale.source == "none":
-        remarks.append(
-            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
-            "measured. "
-            "--diameter gives a scale."
-        )
-    if m.scale.source == "diameter" and diameter:
-        remarks.append(
-            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
-            "changes along the pipe, ovality and angles were."
-        )
-    worst = m.residuals.spread
-    if worst > SIGMA_MOST:
-        remarks.append(
-            f"Residuals scatter {worst:.1f} times as far as the tracks' own noise: a wrong profile, a lens that "
-            "has moved, or "
-            "a wall that does?"
-        )
-    bins = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
-    bent = max(bins, key=lambda b: abs(b["mean_radial_px"]), default=None)
-    if bent and abs(bent["mean_radial_px"]) > TREND_PX:
-        remarks.append(
-            f"Residuals have a trend: {bent['mean_radial_px']:+.2f} px outwards between {bent['low_deg']:.0f} and "
-            f"{bent['high_deg']:.0f} degrees from the axis. The profile does not quite fit the camera (or its "
-            "pupil moves), "
-            "and diameters may be off by more than their intervals."
-        )
-    if m.camera.covariance is None:
-        remarks.append(
-            "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
-        )
-    if m.structure.down is None:
-        remarks.append("No inclinometer: the clock is relative to the first keyframe.")
-    if m.backwards:
-        remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
-    for b in m.survey.breaks:
-        if b["restart"]:
-            remarks.append(
-                f"The device restarted before keyframe {b['index']}: what it drove meanwhile nobody counted, and the "
-                "chainage goes on as if it were nothing."
-            )
-    if m.structure.repeated:
-        remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
-    m.remarks = remarks + m.remarks
-
-
-def not_measured(m: Measurement) -> list[dict[str, Any]]:
-    """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
-    rows = []
-    along = np.full(len(m.index), np.nan)
-    along[m.structure.frames] = m.frame_chainage()
-    if m.encoder is not None:
-        along = m.encoder
-
-    def at(value: float) -> float | None:
-        return float(value) if math.isfinite(value) else None
-
-    for gap in m.structure.gaps:
-        rows.append(
-            {
-                "start": at(along[gap.first]),
-                "end": at(along[gap.last]),
-                "reason": gap.reason,
-                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
-            }
-        )
-    for stretch in m.stretches:
-        if stretch.tube.status != "ok":
-            ends = along[stretch.frames[[0, -1]]]
-            rows.append(
-                {"start": at(ends[0]), "end": at(ends[1]), "reason": stretch.tube.status, "detail": stretch.tube.reason}
-            )
-            continue
-        stations = stretch.tube.stations
-        for good, run in itertools.groupby(range(len(stations["s"])), key=lambda i: stations["status"][i]):
-            if good == "ok":
-                continue
-            inside = list(run)
-            ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
-            what = {
-                "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
-                "one_sided": "nothing: no wall seen over more than 220 degrees",
-                "too_few_points": "nothing: too few points on the wall",
-            }[str(good)]
-            rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
-    return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

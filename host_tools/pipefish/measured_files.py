@@ -17,7 +17,8 @@ from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
-from pipefish.measure import Measurement, mean_diameter, not_measured, trend
+from pipefish.measure import Measurement, Tell, mean_diameter
+from pipefish.measured_remarks import not_measured, trend
 from pipefish.simulate import quaternion
 
 FORMAT, VERSION = "pipefish-reconstruction", 1
@@ -262,22 +263,39 @@ def points_ply(m: Measurement) -> bytes:
 
 def tube_ply(m: Measurement) -> bytes:
     """The wall: rings of RING vertices; deviation: radius less half of the nominal (or mean) diameter."""
+    columns, faces = wall_columns(m)
+    size = reference_diameter(m)
+    comments = (f"unit: {m.scale.unit}", f"rings of {RING} vertices", f"deviation from a radius of {size / 2:.6g}")
+    return ply_bytes(columns, faces, comments)
+
+
+def reference_diameter(m: Measurement) -> float:
+    """What deviations are against: the nominal diameter, or the mean where there is none or no scale."""
+    return m.nominal if m.nominal and m.scale.unit == "metre" else mean_diameter(m)[0]
+
+
+def wall_columns(m: Measurement) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Vertices of the wall by column, and triangles (M,3)."""
     vertices, faces, pieces, rows = [], [], [], 0
-    size = m.nominal if m.nominal and m.scale.unit == "metre" else mean_diameter(m)[0]
+    along, stretches = [], []
+    size = reference_diameter(m)
     for stretch in m.measured:
         points, triangles = stretch.tube.mesh(around=RING)
         rings = points.reshape(-1, RING, 3)
         deviation = np.linalg.norm(rings - rings.mean(axis=1, keepdims=True), axis=2) - size / 2
         vertices.append(np.column_stack([points, deviation.ravel()]))
         faces.append(triangles + rows)
+        along.append(np.repeat(stretch.chainage(np.concatenate(stretch.tube.ring_places())), RING))
+        stretches.append(np.full(len(points), stretch.segment))
         pieces.append(_piece_of(len(points), triangles) + sum(p.max() + 1 for p in pieces))
         rows += len(points)
     table = np.vstack(vertices)
     columns = dict(zip(("x", "y", "z", "deviation"), table.T.astype(np.float32), strict=True))
     columns |= _colours(table[:, 3], size)
+    columns["chainage"] = np.concatenate(along).astype(np.float32)
+    columns["stretch"] = np.concatenate(stretches).astype(np.int32)
     columns["piece"] = np.concatenate(pieces).astype(np.int32)
-    comments = (f"unit: {m.scale.unit}", f"rings of {RING} vertices", f"deviation from a radius of {size / 2:.6g}")
-    return ply_bytes(columns, np.vstack(faces), comments)
+    return columns, np.vstack(faces)
 
 
 def _piece_of(count: int, triangles: np.ndarray) -> np.ndarray:
@@ -355,10 +373,14 @@ def _only(line: str, held: set[int]) -> str:
     return " ".join(words)
 
 
-def write_measurement(m: Measurement, folder: Path) -> tuple[dict[str, Any], list[str]]:
+def write_measurement(m: Measurement, folder: Path, tell: Tell | None = None) -> tuple[dict[str, Any], list[str]]:
     """Writes all files; returns the document of reconstruction.json and the files' paths. Raises OSError."""
+    from pipefish.gltf import gltf_files
+
     model, note = colmap_model(m)
     document = document_of(m, [note] if note else [])
+    scenes, note = gltf_files(m, document, tell)
+    document["remarks"] += [note] if note else []
     table = stations(m)
     contents = {
         "profile.csv": csv_bytes(table),
@@ -366,6 +388,7 @@ def write_measurement(m: Measurement, folder: Path) -> tuple[dict[str, Any], lis
         "events.csv": _events_csv(document["events"]),
         "points.ply": points_ply(m),
         "tube.ply": tube_ply(m),
+        **scenes,
         **{f"colmap/{name}": data for name, data in model.items()},
     }
     files = [str(folder / name) for name in (*contents, "reconstruction.json")]

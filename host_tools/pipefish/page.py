@@ -338,10 +338,16 @@ def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False) 
 
 
 def chart_html(chart: Chart) -> str:
-    """The place of a chart, with its title and text."""
+    """The place of a chart, with its title and text. A chart with a `choice` (label, names; `traces` of each) shows one
+    of them at a time."""
+    choice, menu = chart.get("choice"), ""
+    if choice:
+        options = "".join(f"<option>{html.escape(n)}</option>" for n in choice["names"])
+        menu = f"<label class='choice'>{html.escape(choice['label'])} <select id='choice-{chart['id']}'>{options}"
+        menu += "</select></label>"
     return (
         f"<figure class='card chart'><figcaption><h3>{html.escape(chart['title'])}</h3>"
-        f"<p>{html.escape(chart['text'])}</p></figcaption>"
+        f"<p>{html.escape(chart['text'])}</p>{menu}</figcaption>"
         f"<div class='plot' id='plot-{chart['id']}' role='img' "
         f"aria-label='{html.escape(chart['title'], quote=True)}'></div></figure>"
     )

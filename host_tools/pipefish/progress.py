@@ -20,6 +20,7 @@ class Progress:
     def __init__(self, what: str, total: float | None = None, quiet: bool = False) -> None:
         self._what, self._total = what, total
         self._start = time.monotonic()
+        self._quiet = quiet
         self._enabled = not quiet and sys.stderr.isatty()
         self._bar: Any = None
         self._task: Any = None
@@ -39,6 +40,18 @@ class Progress:
         if self._bar is None:
             self._open()
         self._bar.update(self._task, completed=completed, total=self._total, note=note)
+
+    @property
+    def shows(self) -> bool:
+        """Whether there is a terminal to show a bar on."""
+        return self._enabled
+
+    def say(self, text: str) -> None:
+        """A line that stays, above the bar where there is one; nothing where all is to be quiet."""
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False)
+        elif not self._quiet:
+            print(text, file=sys.stderr, flush=True)
 
     def _open(self) -> None:
         from rich.console import Console

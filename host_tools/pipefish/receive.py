@@ -12,6 +12,7 @@ from typing import Any
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import ACCEPT, AGAIN, STORED, Client, NoDevice, ObjectHandlers
 from pipefish.errors import PipefishError
+from pipefish.live import Live, progress_text
 from pipefish.progress import Progress
 from pipefish.surveystore import SurveyStore
 from pipefish.surveywrite import (
@@ -31,6 +32,7 @@ SURVEY_KINDS = (OBJECT_START, OBJECT_KEYFRAME, OBJECT_END)
 
 
 ASK_AGAIN_S = 0.5  # pause between the questions whether anything is left
+LINE_S = 1.0  # from one line of the live measurement to the next, where there is no terminal
 MISSING_NAMED = 10  # indices in a message
 
 
@@ -41,8 +43,17 @@ class Interrupted(PipefishError):
 class Receiver(ObjectHandlers):
     """Stores what one device sends. Use `receive`."""
 
-    def __init__(self, transport: Transport, store: SurveyStore, link: Any = None, quiet: bool = False) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        store: SurveyStore,
+        link: Any = None,
+        quiet: bool = False,
+        live: Live | None = None,
+    ) -> None:
         self.store = store
+        self.live = live
+        self._line: tuple[float, str] = (-LINE_S, "")  # of the live measurement: when it was last written, what
         self.client = Client(transport, self, link=link)
         self.status: pb.Status | None = None
         self.again = 0
@@ -91,6 +102,8 @@ class Receiver(ObjectHandlers):
         self._last_object = now
         self.received += 1
         self.received_bytes += len(data)
+        if self.live is not None:
+            self.live.take(kind, data)
         return STORED
 
     def on_status(self, status: pb.Status) -> None:
@@ -145,6 +158,7 @@ class Receiver(ObjectHandlers):
                 self._learn()
                 completed, total = self._progress()
                 bar.update(completed, self._note(start), total)
+                self.show_live(bar)
                 if self.complete or stop():
                     return True
                 self._check_rest()
@@ -209,6 +223,17 @@ class Receiver(ObjectHandlers):
                 if reply.status.spool.objects == 0:
                     return
 
+    def show_live(self, bar: Progress) -> None:
+        """Warnings of the live measurement; without a terminal a line of values now and then."""
+        if self.live is None:
+            return
+        for warning in self.live.poll():
+            bar.say(f"! {warning}")
+        text, now = progress_text(self.live.progress), time.monotonic()
+        if not bar.shows and text != self._line[1] and now - self._line[0] >= LINE_S and self.live.progress:
+            self._line = now, text
+            bar.say(text)
+
     def _progress(self) -> tuple[int, int | None]:
         waiting = self.status.spool.objects if self.status else None
         return self.received, None if waiting is None else self.received + waiting
@@ -217,6 +242,8 @@ class Receiver(ObjectHandlers):
         if not self.client.up:
             return "waiting for the device"
         seconds = max(time.monotonic() - (self._first_object or start), 0.1)
+        if self.live is not None:
+            return progress_text(self.live.progress)
         stats = self.client.link.stats
         waiting = f", {self.status.spool.objects} waiting" if self.status else ""
         return f"{self.received_bytes / seconds / 1000:.0f} kB/s{waiting}, {stats['crc_errors']} damaged frames"
@@ -260,15 +287,29 @@ def receive(
     stop: Callable[[], bool] = lambda: False,
     quiet: bool = False,
     link: Any = None,
+    live: bool = False,
 ) -> dict[str, Any]:
     """Receives one survey into `path` (docs/survey.md). Returns the summary: figures of the link and of each file.
 
+    live       measure the pipe meanwhile, in a process of its own; lines on stderr, and "live" in the summary
     timeout_s  give up when no device answers for so long; 0 = wait for ever
     stop       asked several times a second; True ends the reception early
     Raises PipefishError (also when stopped early: Interrupted), OSError. What has arrived stays in `<path>.partial`.
     """
     store = SurveyStore(path, overwrite)
-    receiver = Receiver(transport, store, link, quiet)
+    measuring = Live(partial_of(path)) if live else None
+    try:
+        return _receive(Receiver(transport, store, link, quiet, measuring), timeout_s, stop, quiet)
+    finally:
+        if measuring is not None:
+            measuring.close()
+
+
+def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], quiet: bool) -> dict[str, Any]:
+    """The run of `receive`."""
+    store = receiver.store
+    if receiver.live is not None and store.recovered and store.primary in store.writers:
+        receiver.live.resume(store.writers[store.primary].partial)
     recovered = store.recovered
     why = "stopped"
     try:
@@ -306,7 +347,16 @@ def receive(
     if file not in keyframes:  # it was complete before, under another name
         content = read_content(file)
         keyframes[file], lost[file] = len(content.indices), content.lost
+    live = {}
+    if receiver.live is not None:
+        with Progress("measuring", None, quiet) as bar:
+            for warning in receiver.live.finish():
+                bar.say(f"! {warning}")
+            if not bar.shows:
+                bar.say(progress_text(receiver.live.progress))
+        live = {"live": receiver.live.summary}
     return {
+        **live,
         "file": str(file),
         "keyframes": keyframes[file],
         "lost": lost[file],

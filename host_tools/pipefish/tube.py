@@ -108,16 +108,19 @@ class Tube:
         rows = self.surface.project(np.ascontiguousarray(np.asarray(points, float).reshape(-1, 3)))
         return self._places(rows)
 
+    def ring_places(self, along: float | None = None) -> list[np.ndarray]:
+        """Chainages of the rings of `mesh`, an array a piece."""
+        self._need()
+        along = along or 0.1 * self.summary["d_mean"]
+        return [np.linspace(a, b, max(2, math.ceil((b - a) / along) + 1)) for a, b in self.surface.pieces]
+
     def mesh(self, along: float | None = None, around: int = 72) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (n*around,3) and triangles (m,3) of the wall, a ring each `along` metres [0.1 d_mean]; pieces are
         not joined, so that joints stay visible. Triangles face inwards."""
-        self._need()
         clock = np.arange(around) * 2 * np.pi / around
         vertices, faces, base = [], [], 0
-        along = along or 0.1 * self.summary["d_mean"]
-        for k, (start, end) in enumerate(self.surface.pieces):
-            rings = max(2, math.ceil((end - start) / along) + 1)
-            s = np.linspace(start, end, rings)
+        for k, s in enumerate(self.ring_places(along)):
+            rings = len(s)
             vertices.append(self._rings(s, clock, k).reshape(-1, 3))
             i, j = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
             a = base + (i * around + j).ravel()

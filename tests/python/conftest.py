@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from crawler import Crawler, write_recording
+from pipefish.cli import main
+from pipefish.simulate import Scene
+from rendered_survey import FRAMES, SCENE, rendered_survey
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,3 +41,14 @@ def crawler(tmp_path: Path) -> Iterator[Crawler]:
     yield crawler
     if crawler.process is not None:
         crawler.kill()
+
+
+@pytest.fixture(scope="session")
+def measured(tmp_path_factory) -> Path:
+    """A folder with survey.mcap, of rendered keyframes of the pipe of rendered_survey.py, and out/, measured from it.
+
+    Not to be written into."""
+    folder = tmp_path_factory.mktemp("rendered")
+    survey = rendered_survey(Scene(SCENE), FRAMES, folder / "survey.mcap")
+    assert main(["reconstruct", str(survey), "-o", str(folder / "out"), "--json"]) == 0
+    return folder

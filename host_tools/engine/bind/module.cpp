@@ -15,6 +15,7 @@ void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
 void bind_sim_studio(nb::module_ &m);
 void bind_tube(nb::module_ &m);
+void bind_unroll(nb::module_ &m);
 
 NB_MODULE(_engine, m)
 {
@@ -31,4 +32,5 @@ NB_MODULE(_engine, m)
     bind_sim(m);
     bind_sim_studio(m);
     bind_tube(m);
+    bind_unroll(m);
 }

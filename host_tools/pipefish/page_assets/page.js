@@ -37,6 +37,7 @@
       font: { family: getComputedStyle(document.body).fontFamily, color: colour("--muted") },
       colorway: dark.matches ? ["#4cc3cd", "#f0a35e", "#b79cf0", "#8fc866", "#e8799a", "#d6c24e", "#7aa6f2"]
         : ["#0f7f89", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63", "#8f7a00", "#2f62c0"],
+      uirevision: "keep", // what a reader turned stays when all is drawn again
       margin: { l: 54, r: 12, t: 8, b: 44 }, bargap: 0.06, dragmode: false,
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 12 } },
       hoverlabel: { font: { size: 13 } },
@@ -56,9 +57,72 @@
         axes.scene = { xaxis: side, yaxis: side, zaxis: side };
       }
       const whole = merge(merge(layout, axes), chart.layout);
-      Plotly.react("plot-" + chart.id, chart.data, whole, { displayModeBar: false, responsive: true });
+      const place = document.getElementById("plot-" + chart.id);
+      const eye = whole.scene && whole.scene.camera && whole.scene.camera.eye;
+      if (eye) { // tall windows see as much to the sides from further away
+        const away = Math.min(2.5, Math.max(1, (1.25 * place.clientHeight) / place.clientWidth));
+        whole.scene.camera = { eye: { x: away * eye.x, y: away * eye.y, z: away * eye.z } };
+      }
+      Plotly.react(place, chart.data, whole, { displayModeBar: false, responsive: true });
     }
   };
   draw();
   dark.addEventListener("change", draw);
+
+  for (const chart of page.charts.filter((c) => c.choice)) {
+    const select = document.getElementById("choice-" + chart.id);
+    const show = () => {
+      chart.data.forEach((trace, i) => { trace.visible = Math.floor(i / chart.choice.traces) === select.selectedIndex; });
+      draw();
+    };
+    select.addEventListener("change", show);
+    show(); // browsers keep a choice when a page is loaded again
+  }
+
+  // The unrolled wall: the place under the pointer, and the keyframe that shows it.
+  const wall = page.wall;
+  if (wall) {
+    const strip = document.getElementById("wall-strip");
+    const view = document.getElementById("wall-view");
+    const caption = document.getElementById("wall-text");
+    const cursor = document.getElementById("wall-cursor");
+    let column = Math.floor(Math.min(wall.columns, strip.parentElement.clientWidth) / 2), row = 0, shown = -1;
+    const hour = (r) => {
+      let run = wall.signs.find((s) => at(column) <= s.end) || wall.signs[wall.signs.length - 1];
+      const turn = wall.cut / (2 * Math.PI) - run.clock_sign * (r + 0.5) / wall.rows;
+      const minutes = Math.round((turn - Math.floor(turn)) * 720) % 720;
+      return (Math.floor(minutes / 60) || 12) + ":" + String(minutes % 60).padStart(2, "0");
+    };
+    const at = (c) => wall.start + (c + 0.5) * wall.cell;
+    const show = () => {
+      let run = wall.runs.findLastIndex((r) => r[0] <= column);
+      const number = run < 0 ? -1 : wall.runs[run][1];
+      if (number !== shown) {
+        shown = number;
+        view.src = number < 0 ? "data:," : wall.frames[number].src;
+        view.alt = number < 0 ? "No keyframe shows this place" : "Keyframe beside this place";
+      }
+      const frame = number < 0 ? "no keyframe shows this place" : wall.frames[number].text;
+      caption.textContent = at(column).toFixed(2) + " " + wall.unit + ", " + hour(row) + " o'clock; " + frame;
+      cursor.style.left = (100 * (column + 0.5)) / wall.columns + "%";
+    };
+    const point = (event) => {
+      const box = strip.getBoundingClientRect();
+      const inside = (x, n) => Math.min(n - 1, Math.max(0, Math.floor(x * n)));
+      column = inside((event.clientX - box.left) / box.width, wall.columns);
+      row = inside((event.clientY - box.top) / box.height, wall.rows);
+      show();
+    };
+    strip.addEventListener("pointermove", point);
+    strip.addEventListener("click", point);
+    strip.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      if (!step) return;
+      column = Math.min(wall.columns - 1, Math.max(0, column + Math.round((step * wall.rows) / 20)));
+      show();
+      event.preventDefault();
+      cursor.scrollIntoView({ block: "nearest", inline: "nearest" });
+    });
+    show();
+  }
 })();

@@ -1,0 +1,135 @@
+"""What one should know about a measurement: residuals by angle, remarks, stretches not measured."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+
+from pipefish.camera import Camera
+from pipefish.health import VERDICTS
+from pipefish.measure import Measurement, Residuals
+from pipefish.structure import REASONS
+from pipefish.survey import Tracks
+
+THETA_BIN = math.radians(10)
+TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
+BIN_LEAST = 100  # observations, for a bin to be judged
+SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
+
+
+def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str, Any]]:
+    """Residuals of the inliers by angle from the axis: low, high (degrees), count, mean radial and rms, px."""
+    keep = residuals.inlier
+    out = tracks.pixels[residuals.item[keep]] - np.array([camera.c_u, camera.c_v])
+    radial = np.einsum("ni,ni->n", residuals.pixels[keep], out) / np.maximum(np.linalg.norm(out, axis=1), 1e-9)
+    number = (residuals.theta[keep] / THETA_BIN).astype(int)
+    rms = np.einsum("ni,ni->n", residuals.pixels[keep], residuals.pixels[keep]) / 2
+    rows = []
+    for k in np.unique(number):
+        inside = number == k
+        rows.append(
+            {
+                "low_deg": 10.0 * int(k),
+                "high_deg": 10.0 * int(k) + 10.0,
+                "count": int(inside.sum()),
+                "mean_radial_px": float(radial[inside].mean()),
+                "rms_px": float(np.sqrt(rms[inside].mean())),
+            }
+        )
+    return rows
+
+
+def remark(m: Measurement, diameter: float | None) -> None:
+    """What one should know, most serious first."""
+    remarks: list[str] = []
+    if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
+        remarks.append(m.health.text)
+    if m.scale.source == "none":
+        remarks.append(
+            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
+            "measured. "
+            "--diameter gives a scale."
+        )
+    if m.scale.source == "diameter" and diameter:
+        remarks.append(
+            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
+            "changes along the pipe, ovality and angles were."
+        )
+    worst = m.residuals.spread
+    if worst > SIGMA_MOST:
+        remarks.append(
+            f"Residuals scatter {worst:.1f} times as far as the tracks' own noise: a wrong profile, a lens that "
+            "has moved, or "
+            "a wall that does?"
+        )
+    bins = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
+    bent = max(bins, key=lambda b: abs(b["mean_radial_px"]), default=None)
+    if bent and abs(bent["mean_radial_px"]) > TREND_PX:
+        remarks.append(
+            f"Residuals have a trend: {bent['mean_radial_px']:+.2f} px outwards between {bent['low_deg']:.0f} and "
+            f"{bent['high_deg']:.0f} degrees from the axis. The profile does not quite fit the camera (or its "
+            "pupil moves), "
+            "and diameters may be off by more than their intervals."
+        )
+    if m.camera.covariance is None:
+        remarks.append(
+            "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
+        )
+    if m.structure.down is None:
+        remarks.append("No inclinometer: the clock is relative to the first keyframe.")
+    if m.backwards:
+        remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
+    for b in m.survey.breaks:
+        if b["restart"]:
+            remarks.append(
+                f"The device restarted before keyframe {b['index']}: what it drove meanwhile nobody counted, and the "
+                "chainage goes on as if it were nothing."
+            )
+    if m.structure.repeated:
+        remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
+    m.remarks = remarks + m.remarks
+
+
+def not_measured(m: Measurement) -> list[dict[str, Any]]:
+    """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
+    rows = []
+    along = np.full(len(m.index), np.nan)
+    along[m.structure.frames] = m.frame_chainage()
+    if m.encoder is not None:
+        along = m.encoder
+
+    def at(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
+    for gap in m.structure.gaps:
+        rows.append(
+            {
+                "start": at(along[gap.first]),
+                "end": at(along[gap.last]),
+                "reason": gap.reason,
+                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
+            }
+        )
+    for stretch in m.stretches:
+        if stretch.tube.status != "ok":
+            ends = along[stretch.frames[[0, -1]]]
+            rows.append(
+                {"start": at(ends[0]), "end": at(ends[1]), "reason": stretch.tube.status, "detail": stretch.tube.reason}
+            )
+            continue
+        stations = stretch.tube.stations
+        for good, run in itertools.groupby(range(len(stations["s"])), key=lambda i: stations["status"][i]):
+            if good == "ok":
+                continue
+            inside = list(run)
+            ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
+            what = {
+                "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
+                "one_sided": "nothing: no wall seen over more than 220 degrees",
+                "too_few_points": "nothing: too few points on the wall",
+            }[str(good)]
+            rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
+    return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

@@ -1,0 +1,433 @@
+"""The charts of the report and its 3-D scene."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipefish.cloudfile import read_columns
+from pipefish.colours import DIVERGING
+from pipefish.errors import FormatError
+from pipefish.measured_files import COLOUR_SPAN, RING
+from pipefish.measured_texts import Z95, column, events_text, read_measured
+from pipefish.page import Chart
+
+MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # of the 3-D scene: a phone turns that
+NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
+
+OVALITIES = (
+    ("ovality", "(max - min) / mean"),
+    ("ovality_nominal", "(max - min) / nominal"),
+    ("ovality_astm", "ASTM F1216: (mean - min) / mean"),
+    ("ovality_astm_max", "ASTM F1216: (max - mean) / mean"),
+    ("reduction_nominal", "EN 13508-2 BAA: (nominal - min) / nominal"),
+)
+DIAMETERS = (
+    ("d_mean", "mean (perimeter / pi)"),
+    ("d_max", "widest"),
+    ("d_min", "narrowest"),
+    ("d_area", "of equal area"),
+)
+COLOURS = ("#1f8a94", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63")
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, **more}
+
+
+def _numbers(values: Iterable[float], digits: int = 3) -> list[float | None]:
+    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
+
+
+def _runs(x: np.ndarray, y: np.ndarray, stretch: np.ndarray) -> list[np.ndarray]:
+    """Indices of what may be joined: neighbours of one stretch that have values."""
+    runs: list[list[int]] = []
+    for i in np.flatnonzero(np.isfinite(y)):
+        if runs and runs[-1][-1] == i - 1 and stretch[i] == stretch[i - 1]:
+            runs[-1].append(int(i))
+        else:
+            runs.append([int(i)])
+    return [np.array(r) for r in runs]
+
+
+def _band(
+    x: np.ndarray,
+    y: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    stretch: np.ndarray,
+    name: str,
+    colour: str,
+    **more: Any,
+) -> list[dict[str, Any]]:
+    """A line with its band, broken where nothing was measured."""
+    line_x, line_y, area_x, area_y = ([] for _ in range(4))
+    for run in _runs(x, y, stretch):
+        line_x += [*_numbers(x[run]), None]
+        line_y += [*_numbers(y[run]), None]
+        area_x += [*_numbers(x[run]), *_numbers(x[run][::-1]), None]
+        area_y += [*_numbers(high[run]), *_numbers(low[run][::-1]), None]
+    area = {"type": "scatter", "mode": "none", "x": area_x, "y": area_y, "fill": "toself", "fillcolor": colour + "38"}
+    line = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": line_x,
+        "y": line_y,
+        "name": name,
+        "line": {"color": colour, "width": 2},
+    }
+    return [
+        {**area, "legendgroup": name, "showlegend": False, "hoverinfo": "skip", **more},
+        {**line, "legendgroup": name, **more},
+    ]
+
+
+class Charts:
+    """Charts of a folder of `pipefish reconstruct`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.document = read_measured(folder)
+        self.summary = self.document["summary"]
+        self.unit = self.summary["unit"]
+        self.factor, self.short = (1000.0, "mm") if self.unit == "metre" else (1.0, "diameters")
+        self.along_unit = "m" if self.unit == "metre" else "diameters"
+        self.x = column(self.document, "chainage")
+        self.stretch = column(self.document, "stretch")
+
+    def along(self, **more: Any) -> dict[str, Any]:
+        """The axis along the pipe, the same range in all charts."""
+        low, high = float(np.nanmin(self.x)), float(np.nanmax(self.x))
+        margin = 0.02 * max(high - low, 1e-3)
+        return _axis(f"chainage, {self.along_unit}", range=[round(low - margin, 3), round(high + margin, 3)], **more)
+
+    def shapes(self) -> list[dict[str, Any]]:
+        """Grey where nothing was measured, lines where something was found."""
+        shapes: list[dict[str, Any]] = []
+        for gap in self.document["not_measured"]:
+            if gap["start"] is not None and gap["end"] is not None:
+                shapes.append(
+                    {
+                        "type": "rect",
+                        "xref": "x",
+                        "yref": "paper",
+                        "x0": gap["start"],
+                        "x1": gap["end"],
+                        "y0": 0,
+                        "y1": 1,
+                        "fillcolor": "rgba(128,128,128,0.18)",
+                        "line": {"width": 0},
+                        "layer": "below",
+                    }
+                )
+        return shapes
+
+    def chart_diameter(self) -> Chart:
+        """All named diameters with their bands, one at a time and together with nominal."""
+        data: list[dict[str, Any]] = []
+        for (name, words), colour in zip(DIAMETERS, COLOURS, strict=False):
+            value, sigma = (self.factor * column(self.document, n) for n in (name, name + "_sigma"))
+            shown: dict[str, Any] = {} if name != "d_area" else {"visible": "legendonly"}
+            reach = Z95 * sigma
+            data += _band(self.x, value, value - reach, value + reach, self.stretch, words, colour, **shown)
+        for trace in data[1::2]:
+            trace["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} {self.short}"
+        shapes = self.shapes()
+        if self.summary["nominal"] and self.unit == "metre":
+            line = {
+                "type": "line",
+                "xref": "paper",
+                "x0": 0,
+                "x1": 1,
+                "line": {"dash": "dot", "width": 1.5, "color": "#888"},
+            }
+            shapes.append({**line, "y0": 1000 * self.summary["nominal"], "y1": 1000 * self.summary["nominal"]})
+        shared = Z95 * self.factor * self.summary["d_mean_systematic"]
+        digits = 1 if self.unit == "metre" else 4
+        return {
+            "id": "diameter",
+            "title": "Diameter along the pipe",
+            "text": "Bands: 95 % intervals of repeatability. What all values share (scale, camera) is not in them: "
+            f"± {shared:.{digits}f} {self.short} (95 %). Dotted: nominal. Grey: not measured. Names in the legend "
+            "switch on "
+            "and off.",
+            "data": data,
+            "layout": {"xaxis": self.along(), "yaxis": _axis(self.short), "shapes": shapes, "hovermode": "x unified"},
+        }
+
+    def chart_ovality(self) -> Chart:
+        """The definitions of ovality, to choose from."""
+        data: list[dict[str, Any]] = []
+        names = []
+        for name, words in OVALITIES:
+            value = 100 * column(self.document, name)
+            if not np.isfinite(value).any():
+                continue
+            if name == "ovality":
+                low, high = (100 * column(self.document, n) for n in ("ovality_lo", "ovality_hi"))
+            else:
+                reach = Z95 * 100 * column(self.document, name + "_sigma")
+                low, high = value - reach, value + reach
+            colour = COLOURS[0]
+            data += _band(self.x, value, low, high, self.stretch, words, colour, visible=not names)
+            data[-1]["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} %<extra></extra>"
+            names.append(words)
+        shapes = self.shapes()
+        return {
+            "id": "ovality",
+            "title": "Ovality along the pipe",
+            "text": "Choose the definition. Noise makes any circle look oval: its share is taken off, and the "
+            "lower end of an "
+            "interval may be zero.",
+            "data": data,
+            "layout": {
+                "xaxis": self.along(),
+                "yaxis": _axis("%", rangemode="tozero"),
+                "shapes": shapes,
+                "showlegend": False,
+            },
+            "choice": {"label": "Definition", "names": names, "traces": 2},
+        }
+
+    def chart_tube(self) -> Chart:
+        """The 3-D scene: wall coloured by deviation, points, path of the camera, findings."""
+        wall = read_columns(self.folder / "tube.ply")
+        missing = {"x", "y", "z", "deviation", "piece"} - set(wall)
+        if missing or len(wall["x"]) % RING:
+            raise FormatError(self.folder / "tube.ply", "vertex", "not a wall that `pipefish reconstruct` wrote")
+        shape = (-1, RING)
+        xyz = np.stack([wall[k].astype(float).reshape(shape) for k in "xyz"], -1)[:, :: RING // AROUND]
+        deviation = self.factor * wall["deviation"].astype(float).reshape(shape)[:, :: RING // AROUND]
+        piece = wall["piece"].reshape(shape)[:, 0]
+        keep = np.arange(len(xyz)) % max(1, math.ceil(len(xyz) / MOST_RINGS)) == 0
+        keep |= np.diff(piece, prepend=-1) != 0
+        keep |= np.diff(piece, append=-1) != 0
+        xyz, deviation, piece = xyz[keep], deviation[keep], piece[keep]
+        same = np.flatnonzero(piece[1:] == piece[:-1])
+        j = np.arange(AROUND)
+        a = (same[:, None] * AROUND + j).ravel()
+        b = (same[:, None] * AROUND + (j + 1) % AROUND).ravel()
+        faces = np.concatenate([np.c_[a, a + AROUND, b], np.c_[b, a + AROUND, b + AROUND]])
+        centre = xyz.mean(axis=(0, 1))
+
+        def at(points: np.ndarray) -> dict[str, list[float | None]]:
+            moved = points.reshape(-1, 3) - centre
+            # Plotly's third axis points upwards: camera x, z, -y.
+            return {"x": _numbers(moved[:, 0], 4), "y": _numbers(moved[:, 2], 4), "z": _numbers(-moved[:, 1], 4)}
+
+        reach = max(1e-6, min(float(np.nanpercentile(np.abs(deviation), 99)), self.factor * COLOUR_SPAN))
+        size = self.summary["nominal"] if self.summary["nominal"] and self.unit == "metre" else self.summary["d_mean"]
+        scale = [[k / (len(DIVERGING) - 1), "rgb({:.0f},{:.0f},{:.0f})".format(*c)] for k, c in enumerate(DIVERGING)]
+        data: list[dict[str, Any]] = [
+            {
+                "type": "mesh3d",
+                "name": "wall",
+                **at(xyz),
+                **{n: faces[:, k].tolist() for k, n in enumerate("ijk")},
+                "intensity": _numbers(deviation.ravel(), 3),
+                "colorscale": scale,
+                "cmin": -reach,
+                "cmax": reach,
+                "opacity": 0.55,
+                "flatshading": False,
+                "lighting": {"ambient": 0.7, "diffuse": 0.5, "specular": 0.1},
+                "colorbar": {
+                    "title": {"text": f"radius - {self.factor * size / 2:.4g}, {self.short}", "side": "top"},
+                    "orientation": "h",
+                    "thickness": 10,
+                    "len": 0.8,
+                    "y": 0,
+                    "yanchor": "bottom",
+                },
+                "hovertemplate": f"%{{intensity:.2f}} {self.short}<extra>wall</extra>",
+            }
+        ]
+        cloud = read_columns(self.folder / "points.ply")
+        points = np.stack([cloud[k].astype(float) for k in "xyz"], -1)
+        near = np.abs(cloud["distance"]) < 0.25 * size  # far ones would shrink the pipe to a dot
+        points = points[near][:: max(1, math.ceil(near.sum() / MOST_POINTS))]
+        dots = {
+            "type": "scatter3d",
+            "mode": "markers",
+            "marker": {"size": 1.2, "color": "#7d8a97"},
+            "hoverinfo": "skip",
+        }
+        data.append({**dots, "name": "points", "visible": "legendonly", **at(points)})  # they hide the wall's colour
+        path = np.array(self.document["poses"]["centre"], float)
+        of_stretch = self.document["poses"]["stretch"]
+        rows: list[np.ndarray] = []
+        for _, run in itertools.groupby(range(len(path)), key=lambda k: of_stretch[k]):
+            rows += [path[list(run)], np.full((1, 3), np.nan)]
+        line = {"type": "scatter3d", "mode": "lines", "line": {"width": 4, "color": "#d8a012"}, "hoverinfo": "skip"}
+        data.append({**line, "name": "camera", **at(np.vstack(rows))})
+        data += self._marks(at)
+        return {
+            "id": "tube",
+            "title": "The pipe in 3-D",
+            "text": "Drag to turn, wheel or two fingers to come nearer; the points are switched on in the legend. Colour: the wall's radius against "
+            f"{'nominal' if self.summary['nominal'] and self.unit == 'metre' else 'the mean'}.",
+            "data": data,
+            "layout": {
+                "scene": {
+                    "aspectmode": "data",
+                    "xaxis": {"title": {"text": ""}},
+                    "yaxis": {"title": {"text": self.along_unit}},
+                    "zaxis": {"title": {"text": ""}},
+                    "camera": {"eye": {"x": 0.75, "y": -1.85, "z": 0.75}},  # along the pipe: fits tall and wide
+                },
+                "margin": {"l": 0, "r": 0, "t": 28, "b": 0},
+                "dragmode": "orbit",
+            },
+        }
+
+    def _marks(self, at: Any) -> list[dict[str, Any]]:
+        """Findings, on the axis."""
+        found = [e for e in self.document["events"] if e["kind"] != "not_measured"]
+        if not found:
+            return []
+        axis = np.stack([column(self.document, k) for k in "xyz"], -1)
+        order = np.argsort(self.x)
+        place = np.stack(
+            [np.interp([e["chainage"] for e in found], self.x[order], axis[order, k]) for k in range(3)], -1
+        )
+        return [
+            {
+                "type": "scatter3d",
+                "mode": "markers+text",
+                "name": "findings",
+                **at(place),
+                "marker": {"size": 5, "symbol": "diamond", "color": "#b83a63"},
+                "text": [e["kind"] for e in found],
+                "textposition": "top center",
+                "hovertext": [f"{e['kind']} {events_text(e, self.unit)}" for e in found],
+                "hoverinfo": "text",
+            }
+        ]
+
+    def charts_line(self) -> list[Chart]:
+        """Where the axis goes: plan, and height where gravity is known."""
+        axis = np.stack([column(self.document, k) for k in "xyz"], -1)
+        start = axis[0]
+        down = self.document["structure"]["down"]
+        up = -np.array(down if down else [0.0, 1.0, 0.0])
+        heading = np.array([column(self.document, k)[0] for k in ("tx", "ty", "tz")])
+        ahead = heading - (heading @ up) * up
+        if np.linalg.norm(ahead) < 0.2:  # a shaft: any two directions across
+            ahead = np.cross(up, [1.0, 0.0, 0.0])
+        ahead /= np.linalg.norm(ahead)
+        side = np.cross(ahead, up)
+        flat = (axis - start) @ np.stack([ahead, side], -1)
+        height = (axis - start) @ up
+        breaks = np.diff(self.stretch, prepend=self.stretch[0]) != 0
+        line = {"type": "scatter", "mode": "lines", "line": {"width": 2, "color": COLOURS[0]}}
+
+        def cut(values: np.ndarray) -> list[float | None]:
+            return _numbers(np.insert(values, np.flatnonzero(breaks), np.nan), 4)
+
+        unit = self.along_unit
+        known = "by the inclinometer" if down else "up in the first keyframe's picture"
+        return [
+            {
+                "id": "plan",
+                "title": "Centreline from above",
+                "text": "Ahead as the pipe starts, and to the right of it.",
+                "data": [{**line, "x": cut(flat[:, 0]), "y": cut(flat[:, 1])}],
+                "layout": {
+                    "xaxis": _axis(f"ahead, {unit}"),
+                    "yaxis": _axis(f"right, {unit}", scaleanchor="x", autorange="reversed"),
+                },
+            },
+            {
+                "id": "height",
+                "title": "Height of the centreline",
+                "text": f"Above where the pipe starts; up is {known}.",
+                "data": [{**line, "x": cut(self.x), "y": cut(self.factor * height)}],
+                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short)},
+            },
+        ]
+
+    def charts_quality(self) -> list[Chart]:
+        """Points on the wall, residuals by angle, encoder against vision."""
+        quality = self.document["quality"]
+        bins = quality["residuals_by_angle"]
+        names = [f"{b['low_deg']:.0f}-{b['high_deg']:.0f}°" for b in bins]
+        charts: list[Chart] = [
+            {
+                "id": "angle",
+                "title": "Residuals by angle from the axis",
+                "text": f"{quality['observations']} observations, {quality['outliers']} of them outliers and left "
+                "out here. "
+                "A mean outward residual away from zero says that the profile does not fit the camera; judged at "
+                "0.15 px.",
+                "data": [
+                    {
+                        "type": "bar",
+                        "name": "rms",
+                        "x": names,
+                        "y": _numbers(b["rms_px"] for b in bins),
+                        "customdata": [b["count"] for b in bins],
+                        "hovertemplate": "%{y:.3f} px rms of %{customdata}<extra></extra>",
+                    },
+                    {
+                        "type": "scatter",
+                        "mode": "lines+markers",
+                        "name": "mean outwards",
+                        "x": names,
+                        "y": _numbers(b["mean_radial_px"] for b in bins),
+                        "hovertemplate": "%{y:+.3f} px outwards<extra></extra>",
+                    },
+                ],
+                "layout": {"xaxis": _axis("", type="category"), "yaxis": _axis("px")},
+            },
+            {
+                "id": "points",
+                "title": "Points behind each section",
+                "text": "Points within 0.375 diameters of each station. Under 20 nothing is given.",
+                "data": [
+                    {
+                        "type": "scatter",
+                        "mode": "lines",
+                        "x": _numbers(self.x),
+                        "y": _numbers(column(self.document, "inliers"), 0),
+                        "line": {"color": COLOURS[0]},
+                    }
+                ],
+                "layout": {
+                    "xaxis": self.along(),
+                    "yaxis": _axis("points", rangemode="tozero"),
+                    "shapes": self.shapes(),
+                },
+            },
+        ]
+        encoder = quality["encoder"]
+        if encoder and self.unit == "metre":
+            excess = np.array([np.nan if v is None else v for v in encoder["vision_minus_encoder"]], float)
+            along = np.array([np.nan if v is None else v for v in encoder["chainage"]], float)
+            last = excess[np.isfinite(excess)]
+            total = float(np.nanmax(along) - np.nanmin(along)) or math.nan
+            share = f" {100 * last[-1] / total:+.2f} % at the end." if len(last) else ""
+            charts.append(
+                {
+                    "id": "encoder",
+                    "title": "Camera's path against the encoder",
+                    "text": f"How much further the camera's path is than the encoder says.{share} Steps are slips "
+                    "of the wheel or "
+                    "of the tracking.",
+                    "data": [
+                        {
+                            "type": "scatter",
+                            "mode": "lines",
+                            "x": _numbers(along),
+                            "y": _numbers(1000 * excess, 2),
+                            "line": {"color": COLOURS[1]},
+                        }
+                    ],
+                    "layout": {"xaxis": _axis("chainage by the encoder, m"), "yaxis": _axis("mm")},
+                }
+            )
+        return charts

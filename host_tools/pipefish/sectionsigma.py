@@ -1,0 +1,80 @@
+"""How well a diameter is known: the adjustment's covariance through the fit of a section, all correlation kept.
+
+Points share the errors of the poses and of the camera, so what a section's points have in common does not average away,
+and what a pose shares with the next (a drift) hardly changes a diameter. Both come out right where the diameter is a
+linear function of the points, 2 sum a_j n_j . X_j, a the row of the least-squares fit of a circle that may be oval, and
+its variance is taken from the whole covariance (RECONSTRUCTION section 12)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipefish.structure import Reconstruction
+from pipefish.tube import SECTION, Tube
+
+MOST = 60  # stations of a stretch that are computed; between them it is interpolated
+LEAST = 30  # points
+
+
+@dataclass
+class DiameterSigma:
+    """Of the mean diameter along a stretch, in the structure's own unit.
+
+    s (K,); random (K,) standard deviations with the weights of the adjustment, the encoder's scale included; camera
+    (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all
+    """
+
+    s: np.ndarray
+    random: np.ndarray
+    camera: np.ndarray | None
+    mean_random: float
+    mean_camera: float | None
+
+
+def diameter_function(tube: Tube, s: float, diameter: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n,), places among the tube's, and derivatives (n,3) of the mean diameter at s by them."""
+    p = tube.points
+    on = np.flatnonzero((np.abs(p["s"] - s) < 0.5 * SECTION * diameter) & (p["weight"] > 0) & (p["piece"] >= 0))
+    if len(on) < LEAST:
+        return on[:0], np.zeros((0, 3))
+    clock, frame = p["clock"][on], tube.frames(p["s"][on])
+    c, d = np.cos(clock), np.sin(clock)
+    normal = c[:, None] * frame["up"] + d[:, None] * frame["right"]
+    rows = np.column_stack([np.ones(len(on)), c, d, np.cos(2 * clock), np.sin(2 * clock)])
+    weighed = rows * (p["weight"][on] / p["sigma"][on] ** 2)[:, None]
+    radius = np.linalg.lstsq(rows.T @ weighed, weighed.T, rcond=None)[0][0]
+    return on, 2 * radius[:, None] * normal
+
+
+def diameter_sigma(structure: Reconstruction, segment: int, tube: Tube) -> DiameterSigma | None:
+    """None where no station has enough points. The tube's points are those of the segment, in their order."""
+    first = int(np.searchsorted(structure.point_segment, segment))
+    table = tube.stations
+    known = np.flatnonzero(np.isfinite(table["d_mean"]))
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), MOST)).round().astype(int))]
+    total = np.zeros((len(tube.points["s"]), 3))
+    places, random, camera = [], [], []
+    whole = structure.parts[segment][1] is not None
+    factor = structure.variance_factor[segment]  # of the residuals: encoder and floor were weighed without it
+    for k in chosen:
+        on, by = diameter_function(tube, float(table["s"][k]), float(table["d_mean"][k]))
+        if not len(on):
+            continue
+        total[on] += by
+        places.append(float(table["s"][k]))
+        random.append(float(structure.functions_covariance(first + on, by[None])[0, 0]) / factor)
+        if whole:
+            camera.append(float(structure.functions_covariance(first + on, by[None], systematic=True)[0, 0]))
+    if not places:
+        return None
+    on = np.flatnonzero(total.any(axis=1))
+    by = total[None, on] / len(places)
+    mean = float(structure.functions_covariance(first + on, by)[0, 0]) / factor
+    added = added_mean = None
+    if whole:
+        added = np.sqrt(np.maximum(0, np.array(camera) - random))
+        added_mean = float(structure.functions_covariance(first + on, by, systematic=True)[0, 0]) - mean
+        added_mean = float(np.sqrt(max(0.0, added_mean)))
+    return DiameterSigma(np.array(places), np.sqrt(random), added, float(np.sqrt(mean)), added_mean)

@@ -1,0 +1,143 @@
+"""`pipefish receive --live`: measured while it arrives, told in plain lines, and the file is as without it.
+
+How exact a measurement is, is the subject of test_reconstruct.py; here its newest stretch only has to be right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device import Device
+from pipefish import pipefish_pb2 as pb
+from pipefish.cli import main
+from pipefish.live import Course, Live, progress_text, summary_rows
+from pipefish.receive import Interrupted, receive
+from pipefish.survey import Survey
+from pipefish.surveywrite import OBJECT_KEYFRAME
+from pipefish.transport import open_transport
+from synthetic import SURVEY, Object, as_object
+from test_reconstruct_cli import objects_of
+from tube_tracks import Drive, tube_drive
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    """2.5 m of DN300, 3 % oval, 51 keyframes."""
+    return tube_drive(4, 2.5, density=500.0)
+
+
+@pytest.fixture(scope="module")
+def objects(drive) -> list[Object]:
+    return objects_of(drive)
+
+
+def changed(objects: list[Object], index: int, change) -> list[Object]:
+    """The objects with one keyframe changed."""
+    out = list(objects)
+    at = next(i for i, (_, k, d) in enumerate(out) if k == OBJECT_KEYFRAME and pb.Keyframe.FromString(d).index == index)
+    message = pb.Keyframe.FromString(out[at][2])
+    change(message)
+    out[at] = as_object(OBJECT_KEYFRAME, message)
+    return out
+
+
+def fed(objects: list[Object], path: Path) -> tuple[Course, list[str]]:
+    """All objects through the measuring part, without processes; and its warnings."""
+    course, told = Course(path), []
+    for _, kind, data in objects:
+        told += course.take(kind, data)
+        if course.due():
+            told += course.measure()
+    while course.due(over=True):
+        told += course.measure()
+    return course, told
+
+
+def test_the_newest_stretch_is_measured_as_it_arrives(objects, tmp_path):
+    course, told = fed(objects, tmp_path / "a.mcap")
+    assert not told
+    summary = course.summary()
+    assert summary["d_mean"] == pytest.approx(0.3, rel=0.005)
+    assert 0.0 < summary["from"] < 0.3 and summary["to"] > 2.3 and summary["stations"] > 25
+    assert summary["ovality_most"] == pytest.approx(0.03, abs=0.006)
+    text = progress_text(course.progress())
+    assert text.startswith("2.50 m: diameter ") and "oval " in text
+    assert dict(summary_rows(summary))["warnings"] == "none"
+
+
+def test_slip_darkness_and_a_break_are_told_once_and_where(objects, tmp_path):
+    def slip(m: pb.Keyframe) -> None:
+        m.telemetry.encoder_count += 60  # 30 mm that the camera did not go
+
+    def dark(m: pb.Keyframe) -> None:
+        m.tracking.dark = True
+
+    slipped = objects
+    for index in range(30, 51):
+        slipped = changed(slipped, index, slip)
+    for index in (10, 11, 12):
+        slipped = changed(slipped, index, dark)
+    _, told = fed(slipped, tmp_path / "a.mcap")
+    assert [t for t in told if "dark (lamp out?)" in t] == ["0.50 m: dark (lamp out?)"]
+    (at,) = [float(t.split(" m:")[0]) for t in told if "slip" in t]
+    assert at == pytest.approx(1.53, abs=0.06)
+
+
+def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):
+    random = np.random.default_rng(0)
+    sparse = objects_of(drive, keep=random.uniform(size=len(drive.tracks.frame)) < 0.03)
+    course, told = fed(sparse, tmp_path / "a.mcap")
+    assert any("not measured: nothing could be measured" in t for t in told) and len(told) < 4
+    assert "nothing" in dict(summary_rows(course.summary()))["measured live"]
+
+
+def test_the_file_is_the_one_that_arrives_without(objects, tmp_path, capfd):
+    """The same objects in the same order; plain lines where there is no terminal; a summary."""
+    with Device(objects, SURVEY) as device:
+        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=10, live=True)
+    lines = capfd.readouterr().err.splitlines()
+    assert summary["live"]["d_mean"] == pytest.approx(0.3, rel=0.005)
+    assert lines and all(": diameter " in line or "not measured yet" in line for line in lines)
+    with Device(objects, SURVEY) as device:
+        receive(open_transport(device.address), tmp_path / "b.mcap", timeout_s=10, quiet=True)
+    a, b = (Survey.open(tmp_path / name) for name in ("a.mcap", "b.mcap"))
+    assert [r.sha256 for r in a.receipts] == [r.sha256 for r in b.receipts]
+    assert [k.message.SerializeToString() for k in a.keyframes] == [k.message.SerializeToString() for k in b.keyframes]
+    assert {p.name for p in tmp_path.iterdir()} == {"a.mcap", "b.mcap"}
+
+
+def test_an_interrupted_reception_is_measured_from_its_beginning(objects, tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    with Device(objects, SURVEY) as device:
+        with pytest.raises(Interrupted):
+            receive(
+                open_transport(device.address),
+                path,
+                timeout_s=10,
+                quiet=True,
+                live=True,
+                stop=lambda: len(device.acknowledged) >= 20,
+            )
+        capsys.readouterr()
+        assert main(["receive", device.address, "-o", str(path), "--live", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["recovered_objects"] >= 20
+    live = document["live"]
+    assert live["keyframes"] == 51 and live["from"] < 0.3 and live["d_mean"] == pytest.approx(0.3, rel=0.005)
+
+
+def test_a_measurement_that_dies_does_not_end_the_reception(objects, tmp_path, monkeypatch):
+    taken = Live.take
+
+    def killed(self: Live, kind: int, data: bytes) -> None:
+        taken(self, kind, data)
+        self._process.kill()
+
+    monkeypatch.setattr(Live, "take", killed)
+    with Device(objects, SURVEY) as device:
+        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=10, quiet=True, live=True)
+    assert summary["keyframes"] == 51 and summary["live"] is None
+    assert dict(summary_rows(None))["measured live"].startswith("no")

@@ -1,0 +1,107 @@
+"""The report of a pipe with pictures: the unrolled wall and its keyframes, and the page in a browser."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from browser import ask_page
+from pipefish.cli import main
+from rendered_survey import MARKS
+from test_page import Outline, data_of
+
+
+@pytest.fixture(scope="module")
+def page(measured, tmp_path_factory) -> Path:
+    """The report."""
+    out = tmp_path_factory.mktemp("report") / "report.html"
+    assert main(["report", str(measured / "out"), "-o", str(out), "--limit", "ovality=5", "--json"]) == 0
+    return out
+
+
+def test_the_page_holds_the_wall_and_the_keyframes_that_show_it(page):
+    text = page.read_text()
+    outline, wall = Outline(text), data_of(text)["wall"]
+    assert not outline.open and all(a.startswith("data:") for a in outline.addresses)
+    parts = [i for i in outline.images if i["src"].startswith("data:image/webp")]
+    pictures = [Image.open(io.BytesIO(base64.b64decode(p["src"].split(",")[1]))) for p in parts]
+    assert [p.size for p in pictures] == [(int(p["width"]), int(p["height"])) for p in parts]
+    assert sum(p.width for p in pictures) == wall["columns"] and pictures[0].height == wall["rows"]
+    runs = np.array(wall["runs"])
+    assert (np.diff(runs[:, 0]) > 0).all() and runs[0, 0] == 0 and runs[:, 1].max() == len(wall["frames"]) - 1
+    for s, _ in MARKS[2:6]:
+        column = (s - 0.4 - wall["start"]) / wall["cell"]
+        frame = wall["frames"][runs[np.searchsorted(runs[:, 0], column, "right") - 1, 1]]
+        at = float(re.search(r"taken at ([\d.]+) m", frame["text"])[1])
+        assert abs(at - (s - 0.4)) < 0.04 and frame["src"].startswith("data:image/jpeg")
+
+
+SCRIPT = """
+  await new Promise((done) => setTimeout(done, 1500));
+  const plots = [...document.querySelectorAll(".plot")];
+  const select = document.querySelector(".choice select");
+  select.selectedIndex = 2;
+  select.dispatchEvent(new Event("change"));
+  const strip = document.getElementById("wall-strip"), box = strip.getBoundingClientRect();
+  const texts = [0.1, 0.5].map((x) => {
+    const at = { clientX: box.left + x * box.width, clientY: box.top + box.height / 2, bubbles: true };
+    strip.dispatchEvent(new PointerEvent("pointermove", at));
+    return document.getElementById("wall-text").textContent;
+  });
+  const scene = document.getElementById("plot-tube");
+  const drawn = scene._fullLayout.scene._scene;
+  return {
+    inner: innerWidth, scroll: document.documentElement.scrollWidth, texts,
+    view: document.getElementById("wall-view").naturalWidth,
+    plots: plots.map((p) => [p.clientWidth, p.querySelector(".main-svg").clientWidth]),
+    select: select.getBoundingClientRect().right,
+    shown: document.getElementById("plot-ovality").data.map((t) => t.visible),
+    triangles: Math.max(...drawn.glplot.objects.map((o) => o.triangleCount || 0)),
+    picture: await Plotly.toImage(scene, { format: "png", width: 400, height: 400 }),
+  };
+"""
+
+
+@pytest.mark.parametrize("width", [390, 1280], ids=["phone", "desktop"])
+def test_the_page_draws_itself_in_a_browser(page, tmp_path, width):
+    """Nothing is wider than the window, charts fill their cards, the 3-D scene shows triangles, the menu chooses, the
+    pointer on the wall brings the keyframe beside it."""
+    found = ask_page(page, SCRIPT, width, tmp_path)
+    assert found["inner"] == width and found["scroll"] <= width and found["select"] < width
+    assert len(found["plots"]) == len(data_of(page.read_text())["charts"])
+    assert all(inner == outer > 0.5 * min(width, 500) for inner, outer in found["plots"])
+    assert [bool(v) for v in found["shown"][:6]] == [False] * 4 + [True] * 2
+    assert found["triangles"] > 500
+    picture = Image.open(io.BytesIO(base64.b64decode(found["picture"].split(",")[1]))).convert("RGB")
+    colours = picture.quantize(64).getcolors()
+    assert len(colours) > 20, "the wall is shaded and coloured: an empty scene has a handful of colours"
+    wall = data_of(page.read_text())["wall"]
+    for text, share in zip(found["texts"], (0.1, 0.5), strict=True):
+        at, taken = (
+            float(x) for x in re.search(r"^([\d.]+) m, (?:6:0|5:5)\d o'clock.*taken at ([\d.]+) m", text).groups()
+        )
+        assert at == pytest.approx(wall["start"] + share * wall["columns"] * wall["cell"], abs=0.01)
+        assert abs(at - taken) < 0.04
+    assert found["view"] > 100, "the picture of the keyframe is there"
+
+
+def test_without_the_survey_the_page_says_that_the_pictures_are_missing(measured, tmp_path, capsys):
+    moved = shutil.copytree(measured / "out", tmp_path / "deep" / "out")
+    document = (moved / "reconstruction.json").read_text()
+    (moved / "reconstruction.json").write_text(document.replace("survey.mcap", "gone.mcap"))
+    page = tmp_path / "r.html"
+    assert main(["report", str(moved), "-o", str(page), "--json"]) == 0
+    text = page.read_text()
+    assert "gone.mcap: the survey with the pictures is not there" in text and "wall" not in data_of(text)
+    survey = str(measured / "survey.mcap")
+    assert main(["report", str(moved), "-o", str(page), "--survey", survey, "--json"]) == 0
+    assert "wall" in data_of(page.read_text())
+    assert main(["report", str(moved), "-o", str(page), "--survey", str(tmp_path / "no.mcap")]) == 1
+    assert "no.mcap" in capsys.readouterr().err
