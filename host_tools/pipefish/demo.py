@@ -23,6 +23,7 @@ PRESET = "demo"
 BAUD = 3_000_000
 BENCH_TIMEOUT_S = 120
 START_TIMEOUT_S = 10
+DRAIN_S = 900  # tracking is faster than the cable: 10 m are tracked in 20 s and sent in two minutes
 LOG_LINES = 12  # of a program that failed, shown with the error
 
 
@@ -129,6 +130,7 @@ def config_text(recording: Recording, profile: Path, run: Path) -> str:
         "encoder": {"metres_per_count": repr(truth["scene"]["telemetry"]["metres_per_count"])},
         "link": {"transport": "serial", "device": (run / "crawler").absolute(), "baud": BAUD},
         "spool": {"path": (run / "spool.db").absolute()},
+        "daemon": {"drain_s": DRAIN_S},
     }
     return "\n".join(
         f"[{section}]\n" + "".join(f"{key} = {value}\n" for key, value in keys.items())

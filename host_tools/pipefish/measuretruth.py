@@ -12,10 +12,16 @@ from pipefish.measured_files import stations
 from pipefish.simulate import Scene
 
 DIRECTIONS = np.arange(180) * math.pi / 180
+FINDINGS = ("deposits", "holes", "cracks", "laterals", "roots", "water")  # lie on the pipe's wall, or lead out of it
+
+
+def bare(scene: Scene) -> Scene:
+    """The scene's pipe without what is found in it: what its diameters are."""
+    return Scene({**scene.spec, **{name: [] for name in FINDINGS}})
 
 
 def true_section(scene: Scene, s: float) -> tuple[float, float, float]:
-    """Perimeter / pi, widest and narrowest caliper width of the pipe at arc length s, metres, without reliefs."""
+    """Perimeter / pi, widest and narrowest caliper width of the pipe at arc length s, metres, with all its reliefs."""
     y = scene.outline(s, 720)
     chords = np.linalg.norm(np.roll(y, -1, axis=0) - y, axis=1).sum()
     reach = y @ np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)])
@@ -56,7 +62,8 @@ def against_truth(m: Measurement, scene: Scene) -> dict[str, Any] | None:
     known = np.flatnonzero(np.isfinite(table["d_mean"]) & np.isfinite(place))
     if not len(known) or m.scale.unit != "metre":
         return None
-    truth = np.array([true_section(scene, float(s)) for s in place[known]])
+    pipe = bare(scene)
+    truth = np.array([true_section(pipe, float(s)) for s in place[known]])
     error = table["d_mean"][known] / truth[:, 0] - 1
     sigma = np.hypot(table["d_mean_sigma"], table["d_mean_systematic"])[known] / truth[:, 0]
     nominal = scene.spec["diameter"]

@@ -83,6 +83,7 @@ class Reconstruction:
     standing         frames not used: nothing had moved since the one before
     gaps             list of Gap
     down             (3,) direction of gravity in the world, None without an inclinometer
+    sag              px^2, of each segment: the tracks' common sag
     camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
     cost             sum of half the squared residuals
     """
@@ -115,6 +116,7 @@ class Reconstruction:
     camera_change: Floats | None
     camera_parameters: tuple[str, ...]
     cost: float
+    sag: list[float] = field(default_factory=list)
     iterations: list[int] = field(default_factory=list)
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
@@ -213,6 +215,7 @@ def reconstruct(
     threads: int | None = None,
     seed: int = 0,
     still: float = 0.5,
+    sag_sigma: float = 0.0,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
 
@@ -224,6 +227,8 @@ def reconstruct(
                results but for rounding
     threads    None: all cores; the result is the same for any number
     still      px: frames in which tracks moved less (median) are not used
+    sag_sigma  px^2, above 0: tracks have a common sag that is not known, as those of a tracker with a window have in a
+               tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
     that are wrong in themselves.
@@ -261,6 +266,7 @@ def reconstruct(
         float(attitude_sigma),
         uncertain,
         None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
+        float(sag_sigma),
     )
     return _result(found, names, frames, step, encoder, camera)
 
@@ -337,6 +343,7 @@ def _result(
         camera_change=first["camera"] if first and len(first["camera"]) else None,
         camera_parameters=camera.covariance_parameters,
         cost=sum(s["cost"] for s in segments),
+        sag=[s["sag"] for s in segments],
         iterations=[s["iterations"] for s in segments],
         parts=[(s["random"], s["total"]) for s in segments],
         turns=[move[:, :3] for move in moves[: len(segments)]],

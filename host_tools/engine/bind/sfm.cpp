@@ -196,6 +196,7 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["iterations"] = segment.report.summary.iterations;
     out["converged"] = segment.report.summary.status == pipefish::optim::Status::converged;
     out["wheel"] = segment.report.wheel;
+    out["sag"] = segment.report.sag;
     out["down"] = to_numpy<double>(segment.report.down.data(), {3});
     out["camera"] = to_numpy<double>(segment.report.camera.data(), {static_cast<size_t>(segment.report.camera.size())});
     return out;
@@ -212,7 +213,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::string &method, uint64_t seed, int threads, double still,
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
-                     const std::optional<Square> &uncertainty)
+                     const std::optional<Square> &uncertainty, double sag_sigma)
 {
     Extras extras;
     sfm::ReconstructOptions options;
@@ -220,6 +221,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     options.limits.seed = seed;
     options.threads = threads;
     options.still = still;
+    options.sag_sigma = sag_sigma;
     if (step && step_sigma) {
         extras.odometry.step.assign(step->data(), step->data() + step->shape(0));
         extras.odometry.sigma.assign(step_sigma->data(), step_sigma->data() + step_sigma->shape(0));
@@ -279,7 +281,7 @@ void bind_sfm(nb::module_ &m)
         .def_prop_ro("point", &point_covariances, "(N,3,3)")
         .def_prop_ro(
             "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); },
-            "Of wheel, gravity (2) and camera, those that were estimated.")
+            "Of wheel, gravity (2), sag and camera, those that were estimated.")
         .def("functions", &functions, nb::arg("points").noconvert(), nb::arg("jacobian").noconvert(),
              "(m,m) covariance of m linear functions of points (n,) int32: jacobian (m,n,3).");
     m.def("reconstruct", &reconstruct, nb::arg("camera"), nb::arg("frames"), nb::arg("tracks"),
@@ -287,8 +289,19 @@ void bind_sfm(nb::module_ &m)
           nb::arg("covariance").noconvert().none(), nb::arg("sigma"), nb::arg("method"), nb::arg("seed"),
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
-          nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(),
+          nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("sag_sigma"),
           "Poses and points from tracks; see pipefish.structure.");
+    m.def(
+        "sag",
+        [](const Values &first, const Values &now, double f) {
+            std::vector<double> out;
+            for (size_t i = 0; i < now.shape(0); i++) {
+                out.push_back(sfm::sag_of(first.data()[i], now.data()[i], f));
+            }
+            return to_numpy<double>(out.data(), {out.size()});
+        },
+        nb::arg("first").noconvert(), nb::arg("now").noconvert(), nb::arg("f"),
+        "Pixels outwards for each px^2 of the sag, of tracks seen first and now at these angles (N,) from the axis.");
     m.def("sampson_squared", &sampson_squared, nb::arg("camera"), nb::arg("pose").noconvert(),
           nb::arg("uv1").noconvert(), nb::arg("uv2").noconvert(), nb::arg("sigma"),
           "Squared Sampson distances (N,) of pairs of pixels with noise sigma under cam2_from_cam1 (3,4).");

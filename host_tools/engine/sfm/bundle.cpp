@@ -24,6 +24,7 @@ struct State {
     std::vector<Vector3d> centre, point;
     double wheel = 0.0;
     Vector3d down = Vector3d::UnitY();
+    double sag = 0.0;
     Eigen::VectorXd camera;
 };
 
@@ -41,18 +42,20 @@ public:
             state_.rotation.push_back(pose.r);
             state_.centre.push_back(pose.centre());
         }
+        if (options.only) {
+            wanted_ = *options.only;
+            std::sort(wanted_.begin(), wanted_.end());
+        }
         offset_.push_back(0);
         for (size_t p = 0; p < map.tracks.size(); p++) {
             const size_t before = place_.size();
             const std::span<const Observation> seen = table.of_track(map.tracks[p]);
             for (size_t i = seen.size(); i-- > 0;) {
                 const Observation &o = seen[i];
-                if (!map.has(o.frame)) {
-                    continue;
-                }
-                const double squared = reprojection_squared(camera, map.pose(o.frame), map.points[p], o);
-                if (std::isfinite(squared) && (options.gate <= 0.0 || squared < options.gate * options.gate)) {
-                    place_.push_back(static_cast<int>(&o - table.observations().data()));
+                const int place = static_cast<int>(&o - table.observations().data());
+                if (map.has(o.frame) &&
+                    is_wanted(place, reprojection_squared(camera, map.pose(o.frame), map.points[p], o))) {
+                    place_.push_back(place);
                     frame_.push_back(o.frame - first_);
                     block_.push_back(block_of(o.frame - first_));
                 }
@@ -91,10 +94,11 @@ public:
         }
         const size_t point = static_cast<size_t>(e);
         RowsX j_border = RowsX::Zero(2, border_);
+        const bool shared = camera_columns_ > 0 || sag_at_ >= 0 || measures_pupil();
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
             const Observation &o = table_[place_[k]];
             const size_t f = static_cast<size_t>(frame_[k]);
-            const Vector3d x = state_.rotation[f] * (state_.point[point] - state_.centre[f]);
+            const Vector3d x = seen_from(f, state_.point[point]);
             Vector2d uv;
             Rows<2, 3> slope;
             Rows<2, PF_CAMERA_PARAMS> by_camera;
@@ -102,17 +106,23 @@ public:
                                   camera_columns_ ? by_camera.data() : nullptr) != PF_OK) {
                 continue;
             }
-            const Vector2d r = o.whiten * (uv - o.sight.uv);
-            const Rows<2, 3> whitened = o.whiten * slope;
+            const Vector2d r = o.whiten * (uv + state_.sag * o.sag - o.sight.uv);
+            const Rows<2, 3> whitened = o.whiten * slope / yardstick();
             const Rows<2, 3> j_point = whitened * state_.rotation[f];
             Rows<2, 6> j_pose;
             if (is_held(frame_[k])) {
                 j_pose.setZero();
             } else {
                 for (int row = 0; row < 2; row++) { // d(R (X - c)) = w x x - R dc
-                    j_pose.row(row).head<3>() = x.cross(Vector3d(whitened.row(row))).transpose();
+                    j_pose.row(row).head<3>() = yardstick() * x.cross(Vector3d(whitened.row(row))).transpose();
                 }
                 j_pose.rightCols<3>() = -j_point;
+            }
+            if (measures_pupil()) {
+                j_border.col(0) = -whitened * x;
+            }
+            if (sag_at_ >= 0) {
+                j_border.col(sag_at_) = o.whiten * o.sag;
             }
             for (int c = 0; c < camera_columns_; c++) {
                 j_border.col(camera_at_ + c) =
@@ -120,7 +130,7 @@ public:
             }
             const std::array<const double *, 1> j_f{j_pose.data()};
             sink.add(2, r.data(), options_.loss, j_point.data(), std::span(&block_[k], 1), j_f,
-                     camera_columns_ ? j_border.data() : nullptr);
+                     shared ? j_border.data() : nullptr);
         }
     }
 
@@ -136,7 +146,7 @@ public:
                 return std::numeric_limits<double>::infinity();
             }
             const Observation &o = table_[place_[k]];
-            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) - o.sight.uv;
+            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + state_.sag * o.sag - o.sight.uv;
             sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
         }
         return sum;
@@ -159,6 +169,9 @@ public:
             state_.down =
                 (saved_.down + geometry::tangent_basis(saved_.down) * step.g.segment<2>(down_at_)).normalized();
         }
+        if (sag_at_ >= 0) {
+            state_.sag = saved_.sag + step.g[sag_at_];
+        }
         if (camera_columns_ > 0) {
             state_.camera = saved_.camera + step.g.tail(camera_columns_);
             camera_ = changed_camera(original_, *options_.camera_prior, state_.camera);
@@ -180,6 +193,7 @@ public:
     }
 
     const State &state() const { return state_; }
+    const std::vector<int> &used() const { return place_; }
     int observations() const { return static_cast<int>(place_.size()); }
     int down_at() const { return down_at_; }
 
@@ -192,6 +206,15 @@ public:
     }
 
 private:
+    // The pupil's shift is a length, and would say how long the wheel's metre is: in truth it is known too badly for
+    // that, and what is wrong with the tracks would be read as a scale. So it is taken in the wheel's metres, too.
+    bool measures_pupil() const { return options_.odometry && original_.pupil_e1 != 0.0; }
+    double yardstick() const { return measures_pupil() ? 1.0 + state_.wheel : 1.0; }
+    Vector3d seen_from(size_t f, const Vector3d &x) const
+    {
+        return state_.rotation[f] * (x - state_.centre[f]) / yardstick();
+    }
+
     // All pixels in one batch, which takes a tenth of the time of one by one.
     void project_all()
     {
@@ -202,8 +225,7 @@ private:
         for (size_t p = 0; p < state_.point.size(); p++) {
             for (size_t k = offset_[p]; k < offset_[p + 1]; k++) {
                 const size_t f = static_cast<size_t>(frame_[k]);
-                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) =
-                    state_.rotation[f] * (state_.point[p] - state_.centre[f]);
+                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) = seen_from(f, state_.point[p]);
             }
         }
         pf_camera_project_n(&camera_, n, in_camera_.data(), pixel_.data(), seen_.data());
@@ -212,6 +234,14 @@ private:
     // Blocks run from the last frame to the first, which is held: the covariance then grows along the recursion that
     // makes it, block by block. The other way round it would be what is left of differences, of the far end's.
     int block_of(int f) const { return banded() - 1 - f; }
+
+    bool is_wanted(int place, double squared) const
+    {
+        if (options_.only) {
+            return std::binary_search(wanted_.begin(), wanted_.end(), place);
+        }
+        return std::isfinite(squared) && (options_.gate <= 0.0 || squared < options_.gate * options_.gate);
+    }
 
     bool is_held(int f) const { return f < options_.held_front || f >= banded() - options_.held_back; }
 
@@ -234,6 +264,10 @@ private:
                 sum += state_.rotation[f].transpose() * down;
             }
             state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
+        }
+        if (options_.sag_sigma > 0.0) {
+            sag_at_ = border_++;
+            extra_rows_++;
         }
         if (options_.camera_prior) {
             camera_at_ = border_;
@@ -305,6 +339,9 @@ private:
                 }
             }
         }
+        if (sag_at_ >= 0) {
+            sum += std::pow(state_.sag / options_.sag_sigma, 2);
+        }
         if (camera_columns_ > 0) {
             sum += (camera_root_ * state_.camera).squaredNorm();
         }
@@ -337,6 +374,12 @@ private:
         }
         if (options_.gravity) {
             linearize_gravity(sink);
+        }
+        if (sag_at_ >= 0) {
+            RowsX j = RowsX::Zero(1, border_);
+            j(0, sag_at_) = 1.0 / options_.sag_sigma;
+            const double r = state_.sag / options_.sag_sigma;
+            sink.add(1, &r, plain, nullptr, {}, {}, j.data());
         }
         if (camera_columns_ > 0) {
             RowsX j = RowsX::Zero(camera_columns_, border_);
@@ -410,7 +453,8 @@ private:
     std::vector<int> place_, frame_, block_, track_;
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
-    int border_ = 0, down_at_ = 0, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
+    std::vector<int> wanted_; // ascending
+    int border_ = 0, down_at_ = 0, sag_at_ = -1, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
     Eigen::MatrixXd camera_root_;
     double start_length_ = 1.0;
 };
@@ -454,7 +498,9 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.redundancy = std::max(problem.redundancy(), 1);
     report.wheel = problem.state().wheel;
     report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
+    report.sag = problem.state().sag;
     report.camera = problem.state().camera;
+    report.used = problem.used();
     if (covariance) {
         auto known = solver.covariance(problem, options.threads);
         *covariance = BundleCovariance(std::move(solver), std::move(known));

@@ -346,6 +346,7 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     settings.threads = options.threads;
     settings.odometry = segment.metric ? options.odometry : nullptr;
     settings.gravity = options.gravity;
+    settings.sag_sigma = options.sag_sigma;
     settings.min_views = 3;
     int observations = 0;
     for (int cycle = 0; cycle < 3; cycle++) {
@@ -375,6 +376,8 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     settings.cost_tolerance = 0.01 / std::max(observations, 1);
     segment.report = adjust(map, table, central, settings, &segment.random);
     if (options.camera_prior) {
+        const std::vector<int> used = segment.report.used; // or the two covariances would be of different points
+        settings.only = &used;
         settings.camera_prior = options.camera_prior;
         segment.report = adjust(map, table, central, settings, &segment.total);
     }

@@ -3,9 +3,29 @@
 #include <Eigen/LU>
 
 #include <algorithm>
+#include <cmath>
 
 namespace pipefish::sfm
 {
+
+namespace
+{
+
+double polar_angle(const Vector3d &ray)
+{
+    return std::atan2(ray.head<2>().norm(), ray.z());
+}
+
+} // namespace
+
+double sag_of(double first, double now, double f)
+{
+    const auto potential = [](double theta) {
+        const double t = std::clamp(theta, 0.2, 2.9); // nearer to the axis nothing is tracked over any angle
+        return std::cos(t) / std::sin(t) + 2.0 * t;
+    };
+    return (potential(first) - potential(now)) / f;
+}
 
 TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::span<const int> frame,
                        std::span<const int> track, const double *uv, const double *covariance, double sigma)
@@ -17,7 +37,7 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
             outside_++;
             continue;
         }
-        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse()});
+        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse(), Vector2d::Zero()});
     }
     const auto before = [](const Observation &a, const Observation &b) {
         return a.track != b.track ? a.track < b.track : a.frame < b.frame;
@@ -32,6 +52,11 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
     repeated_ = static_cast<int>(all_.end() - end);
     all_.erase(end, all_.end());
     index(frames, tracks);
+    for (Observation &o : all_) {
+        const double first = polar_angle(of_track(o.track).front().sight.ray), now = polar_angle(o.sight.ray);
+        const Vector2d out = o.sight.uv - Vector2d(camera.c_u, camera.c_v);
+        o.sag = sag_of(first, now, camera.f_u) * out.stableNormalized();
+    }
 }
 
 TrackTable TrackTable::only(std::span<const int> kept) const

@@ -21,8 +21,17 @@ using geometry::Vector3d;
 struct Observation {
     int frame, track;
     Sight sight;
-    Eigen::Matrix2d whiten; // of a pixel error: root^-1
+    Eigen::Matrix2d whiten;          // of a pixel error: root^-1
+    Vector2d sag = Vector2d::Zero(); // pixels by which it is off for each px^2 of the sag, see sag_of()
 };
+
+// A window that is fitted by an affine map, as trackers do, follows the mean of the motion over it, which is its
+// centre's only where the motion has no curvature. In a tube, seen along its axis, the polar angle moves by
+// sin(theta)^2 times the distance driven over the radius, whose second derivative pulls the window by half its second
+// moment each step. Summed up from the track's first sight to now: moment / f (E(first) - E(now)) outwards, E =
+// cot(theta) + 2 theta. All tracks share it, so that it does not average out: it bends the scale along the pipe.
+// Radians to px per px^2 of the moment, for a lens of f pixels a radian.
+double sag_of(double first, double now, double f);
 
 // Sorted by track, then frame; at most one observation a track and frame, all of them inside the camera's model.
 class TrackTable

@@ -125,6 +125,7 @@ void Surface::lay_out(const Reference &reference, double knot)
     }
     pinned_.assign(control_.size(), 0);
     tau_.assign(control_.size(), 0.0);
+    give_.assign(control_.size(), {1.0, 1.0, 1.0, 1.0});
     // A frame that turns as little as it can.
     Vector3d tangent, first;
     for (const Piece &piece : piece_) {
@@ -375,35 +376,53 @@ bool Surface::solve(int rounds, bool adapt)
             moved = std::max({moved, (control_[c] - where[c]).norm() / std::sqrt(v(0, 0) + v(1, 1)),
                               std::abs(shape_[rho] - before[rho]) / std::sqrt(v(2, 2))});
         }
-        // Fellner and Schall: the variance of each group of second differences, from their sizes and from what the
-        // data left of their freedom. A pseudo-observation of almost nothing keeps few rows from infinity.
-        std::array<double, 4> rows{}, squares{}, trace{};
-        problem.each_prior([&](double r, std::span<const int> f, std::span<const double *const> jf, int g) {
-            if (g < 0) {
-                return;
-            }
-            const auto k = static_cast<size_t>(g);
-            rows[k] += 1.0;
-            squares[k] += r * r / stiffness_[k];
-            for (size_t a = 0; a < f.size(); a++) {
-                for (size_t b = 0; b < f.size(); b++) {
-                    trace[k] += *jf[a] * *jf[b] * between(static_cast<size_t>(f[a]), static_cast<size_t>(f[b]));
-                }
-            }
-        });
-        freedom_ = static_cast<double>(each * control_.size());
-        const double least = 1e-4 * 0.5 * diameter_, most = 0.3 * 0.5 * diameter_;
-        for (size_t k = 0; k < 4; k++) {
-            freedom_ -= trace[k];
-            if (adapt && rows[k] > 0.0) {
-                const double wanted = (std::max(0.0, rows[k] - trace[k]) + 1.0) / (squares[k] + least * least);
-                stiffness_[k] = std::clamp(std::clamp(wanted, stiffness_[k] / 30.0, stiffness_[k] * 30.0),
-                                           1.0 / (most * most), 1.0 / (least * least));
-            }
-        }
+        smooth(problem, between, adapt);
     }
     reweigh(false);
     return moved < 0.3;
+}
+
+// Fellner and Schall: the variance of each group of second differences, from their sizes and from what the data left of
+// their freedom. A pseudo-observation of almost nothing keeps few rows from infinity. A pipe is straight and round over
+// metres and then changes over decimetres: second differences are not normal but Student's, with GIVE degrees of
+// freedom; their local factors are that distribution's weights, at the expected squares.
+void Surface::smooth(const SurfaceProblem &problem, const SurfaceVariance &variance, bool adapt)
+{
+    constexpr double GIVE = 2.0;
+    std::array<double, 4> rows{}, squares{}, trace{};
+    std::vector<std::array<double, 4>> local(control_.size()), count(control_.size());
+    problem.each_prior([&](double r, std::span<const int> f, std::span<const double *const> jf, int g) {
+        if (g < 0) {
+            return;
+        }
+        const auto k = static_cast<size_t>(g), c = static_cast<size_t>(f[f.size() / 2] / problem.each());
+        double left = 0.0;
+        for (size_t a = 0; a < f.size(); a++) {
+            for (size_t b = 0; b < f.size(); b++) {
+                left += *jf[a] * *jf[b] * variance(static_cast<size_t>(f[a]), static_cast<size_t>(f[b]));
+            }
+        }
+        rows[k] += 1.0;
+        squares[k] += r * r / stiffness_[k];
+        trace[k] += left;
+        local[c][k] += (r * r + left) / give_[c][k];
+        count[c][k] += 1.0;
+    });
+    freedom_ = static_cast<double>(problem.each()) * static_cast<double>(control_.size());
+    const double least = 1e-4 * 0.5 * diameter_, most = 0.3 * 0.5 * diameter_;
+    for (size_t k = 0; k < 4; k++) {
+        freedom_ -= trace[k];
+        if (adapt && rows[k] > 0.0) {
+            const double before = stiffness_[k],
+                         wanted = (std::max(0.0, rows[k] - trace[k]) + 1.0) / (squares[k] + least * least);
+            // Not faster: where the pipe changes, the fit must give way before it is flattened.
+            stiffness_[k] =
+                std::clamp(std::clamp(wanted, before / 30.0, before * 4.0), 1.0 / (most * most), 1.0 / (least * least));
+            for (size_t c = 0; c < control_.size(); c++) {
+                give_[c][k] = (GIVE + count[c][k]) / (GIVE + local[c][k] * stiffness_[k] / before);
+            }
+        }
+    }
 }
 
 void Surface::widen(int order)

@@ -8,6 +8,7 @@
 #include <Eigen/Core>
 
 #include <array>
+#include <functional>
 #include <vector>
 
 namespace pipefish::tube
@@ -52,6 +53,8 @@ struct OnSurface {      // a point's place
 };
 
 struct Stretch;
+class SurfaceProblem;
+using SurfaceVariance = std::function<double(size_t, size_t)>; // of two of the problem's scalars
 
 class Surface
 {
@@ -95,6 +98,7 @@ private:
     int choose_order() const;
     bool solve(int rounds, bool adapt);
     void widen(int order);
+    void smooth(const SurfaceProblem &problem, const SurfaceVariance &variance, bool adapt);
     void tabulate();
     void describe();
     void count_around(Station &station) const;
@@ -115,7 +119,9 @@ private:
     std::vector<char> pinned_;                             // a control: no ellipse
     std::vector<std::vector<Eigen::MatrixXd>> covariance_; // [control][back]
     std::array<double, 4> stiffness_{}; // 1 / variance of second differences: axis, rho, ellipse, harmonics
-    std::vector<int> of_piece_;         // a point: piece or -1
+    std::vector<std::array<double, 4>>
+        give_;                  // a control: factor of the stiffness, small where the pipe changes at once
+    std::vector<int> of_piece_; // a point: piece or -1
     std::vector<double> u_, distance_, noise_, weight_, robust_;
     std::vector<char> used_;  // a point: takes part in the fit
     std::vector<double> tau_; // a control

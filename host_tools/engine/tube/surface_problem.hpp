@@ -108,7 +108,8 @@ public:
         });
     }
 
-    // Calls take(residual, scalars, derivatives, group) for each second difference along the pipe; group -1: a pin.
+    // Calls take(residual, scalars, derivatives, group) for each second difference along the pipe, those of a control
+    // one after the other; group -1: a pin.
     template <class Take> void each_prior(const Take &take) const
     {
         constexpr double PIN = 1e-4; // of the radius: a circle for all that matters
@@ -120,7 +121,8 @@ public:
             for (int c = piece.first + 1; c < piece.first + piece.intervals + 2; c++) {
                 const size_t mid = static_cast<size_t>(c);
                 for (int p = 0; p < each_; p++) {
-                    const double root = std::sqrt(t_.stiffness_[static_cast<size_t>(group(p))]);
+                    const auto g = static_cast<size_t>(group(p));
+                    const double root = std::sqrt(t_.stiffness_[g] * t_.give_[mid][g]);
                     double r = 0.0;
                     size_t used = 0;
                     for (size_t k = 0; k < 3; k++) {

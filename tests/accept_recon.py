@@ -1,0 +1,372 @@
+"""Reconstruction against theory and truth: what takes too long for `make test`.
+
+table       covariances of points and cameras against section medians that an independent prototype found
+drives      20 simulated drives of 30 m through a DN300: keyframes every 5 cm, tracks with 0.3 px noise, a camera of 180
+            degrees, with an encoder (0.5 mm a step) and without: errors beside their posterior, per section of 0.75 D
+tubes       the same drives through `fit_tube`: diameters and ovality of its stations
+two_view    400 pairs of views in a tube, errors beside the bound of Cramer and Rao
+long        time and memory of 300 m against 30 m
+video       three pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
+
+Each piece's figures are kept in build/accept/recon/NAME.json and taken from there while the package and its engine are
+the same: what was interrupted goes on where it stopped.
+
+    python tests/accept_recon.py                  prints one JSON list of {name, value, bound, holds}
+    python tests/accept_recon.py drives           only pieces whose name contains the word
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pipefish as pf
+from pipefish import _engine
+from pipefish.files import write_atomically
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests/python"))
+from tube_tracks import Drive, fisheye, pair_bound, tube_drive, tube_pair  # noqa: E402
+
+FOLDER = ROOT / "build/accept/recon"
+SEEDS, LENGTH, DIAMETER, OVALITY, SIGMA_STEP = 20, 30.0, 0.3, 0.03, 0.0005
+NORMAL_95 = 1.95996
+
+# Of the specification, medians in mm: points along the radius, around, along the pipe; last camera sideways.
+REFERENCE = {
+    5: (0.89, 0.17, 1.25, 0.07),
+    10: (0.48, 0.12, 0.36, 0.06),
+    20: (0.31, 0.13, 0.30, 0.13),
+    40: (0.33, 0.20, 0.30, 0.38),
+    80: (0.56, 0.48, 0.57, 1.20),
+}
+
+
+def row(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> dict[str, Any]:
+    """One row of the table: holds between low and high."""
+    bound = f"{low} to {high}" if math.isfinite(low) and math.isfinite(high) else f"<= {high}"
+    bound = f">= {low}" if math.isinf(high) else bound
+    return {
+        "name": f"recon.{name}",
+        "value": round(float(value), 6),
+        "bound": bound,
+        "holds": bool(low <= value <= high),
+    }
+
+
+def state() -> str:
+    """What the figures depend on."""
+    digest = hashlib.sha256(Path(_engine.__file__).read_bytes())
+    for path in sorted([*(ROOT / "host_tools/pipefish").glob("*.py"), *Path(__file__).parent.glob("accept_recon*.py")]):
+        digest.update(path.read_bytes())
+    digest.update((ROOT / "tests/python/tube_tracks.py").read_bytes())
+    return digest.hexdigest()
+
+
+def kept(name: str, work: Callable[[], Any]) -> Any:
+    """The result of `work`, from its file where that is of the same state."""
+    file, key = FOLDER / f"{name}.json", state()
+    stored = json.loads(file.read_text()) if file.exists() else {}
+    if stored.get("state") != key:
+        started = time.monotonic()
+        stored = {"state": key, "result": work()}
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(stored).encode())
+        print(f"  {name}: {time.monotonic() - started:.0f} s", file=sys.stderr)
+    return stored["result"]
+
+
+def reference_medians(views: int, seed: int) -> list[float]:
+    """Medians of posterior sigmas, mm, in the reference's scene and gauge (first pose, distance to the last)."""
+    random, camera = np.random.default_rng(seed), fisheye(90, k2=0.0, k3=0.0)
+    k = np.arange(views)
+    centres = np.column_stack([0.02 * np.sin(0.3 * k), 0.02 * np.cos(0.23 * k), 0.05 * k])
+    length = 0.05 * (views - 1)
+    count = round(400 * (length + 0.6))
+    phi = random.uniform(0, 2 * np.pi, count)
+    points = np.column_stack([0.2 * np.cos(phi), 0.2 * np.sin(phi), random.uniform(-0.1, length + 0.5, count)])
+    frame, track, pixels = [], [], []
+    for i in range(views):
+        x = points - centres[i]
+        theta = np.arctan2(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
+        seen = np.flatnonzero((np.radians(15) < theta) & (theta < np.radians(85)))
+        frame.append(np.full(len(seen), i))
+        track.append(seen)
+        pixels.append(camera.project(x[seen])[0] + random.normal(0, 0.3, (len(seen), 2)))
+    tracks = pf.Tracks(np.concatenate(frame), np.concatenate(track), np.concatenate(pixels))
+    rec = pf.reconstruct(tracks, camera)
+    scale = 1000 * np.linalg.norm(centres[-1] - centres[0]) / math.sqrt(rec.variance_factor[0])
+    wall = points[rec.track]
+    outwards = np.column_stack([wall[:, :2] / 0.2, np.zeros(len(wall))])
+    around = np.column_stack([-outwards[:, 1], outwards[:, 0], np.zeros(len(wall))])
+    along = np.tile([0.0, 0.0, 1.0], (len(wall), 1))
+    medians = [np.median(np.sqrt(np.einsum("ni,nij,nj->n", d, rec.covariance, d))) for d in (outwards, around, along)]
+    last = math.sqrt(np.trace(rec.pose_covariance[-1, 3:5, 3:5]) / 2)
+    return [float(scale * value) for value in (*medians, last)]
+
+
+def check_table() -> list[dict[str, Any]]:
+    """Within 15 % of the reference, which is given to two digits: half a unit of the last one is added."""
+    rows = []
+    for views, reference in REFERENCE.items():
+        found = kept(f"table-{views}", lambda n=views: np.mean([reference_medians(n, s) for s in range(5)], 0).tolist())
+        for name, value, expected in zip(("radial", "tangential", "axial", "camera"), found, reference, strict=True):
+            low, high = round(0.85 * (expected - 0.005), 4), round(1.15 * (expected + 0.005), 4)
+            rows.append(row(f"table.{views}.{name}_mm", value, low, high))
+    return rows
+
+
+def readings(drive: Drive, seed: int) -> np.ndarray:
+    """Encoder: the true path with independent noise a step."""
+    steps = np.diff(drive.driven)
+    noise = np.random.default_rng(seed + 1000).normal(0, SIGMA_STEP, len(steps))
+    return np.append(0.0, np.cumsum(steps + noise))
+
+
+def aligned(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation that take found (n,3) nearest to truth."""
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, _, v = np.linalg.svd(b.T @ a)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    return turn, truth.mean(0) - turn @ found.mean(0)
+
+
+def section_rows(found: np.ndarray, true: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of mean diameter and of (max - min) of one section of points, and the weights (2,n,3) with which the
+    points' errors make them: least squares over motion, radius and ellipse.
+
+    found, true (n,3), true along z; spread (n,3,3) covariance of found."""
+    turn, move = aligned(found, true)
+    error = found @ turn.T + move - true
+    phi = np.arctan2(true[:, 1], true[:, 0])
+    # The wall is an ellipse with its long axis upright: its normal leans from the radius by the ovality times a sine.
+    lean = phi - OVALITY * np.sin(2 * phi)
+    normal = np.column_stack([np.cos(lean), np.sin(lean), np.zeros(len(phi))])
+    # A motion of the whole section is none of its shape: three shifts, three turns. The turn about the pipe is also what
+    # would turn the ellipse.
+    arm = np.cross((true - true.mean(0)) / DIAMETER, normal)
+    columns = np.column_stack([np.ones(len(phi)), np.cos(2 * phi), normal[:, :2], arm])
+    in_found = normal @ turn
+    weight = 1 / np.einsum("ni,nij,nj->n", in_found, spread, in_found)
+    solved = np.linalg.solve(columns.T * weight @ columns, columns.T * weight)
+    # (max - min) = 2 (D_y - D_x) / 2, which the second harmonic of the radius makes by -4 e_c.
+    wanted = np.stack([2 * solved[0], -4 * solved[1]])
+    values = wanted @ np.einsum("ni,ni->n", normal, error)
+    return values, wanted[:, :, None] * in_found[None]
+
+
+def drive_figures(seed: int, with_encoder: bool) -> dict[str, Any]:
+    """Errors and posterior sigmas of one drive: of diameter and ovality of each section, of length and drift."""
+    drive = tube_drive(seed, LENGTH)
+    # The wheel's scale is right, and known to be: what is examined is the random part.
+    encoder = {"chainage": readings(drive, seed), "encoder": pf.Encoder(scale_sigma=1e-5)} if with_encoder else {}
+    rec = pf.reconstruct(drive.tracks, drive.camera, **encoder)
+    scale = 1.0 if with_encoder else float(np.linalg.norm(drive.centres[-1] - drive.centres[0]))
+    r, t = drive.poses[0, :, :3], drive.poses[0, :, 3]
+    true_here = drive.points[rec.track]
+    found = scale * rec.points
+    z = true_here[:, 2]
+    out: dict[str, Any] = {"status": rec.status, "diameter": [], "ovality": [], "length": [], "drift": []}
+    marks = []
+    for start in np.arange(0.1, LENGTH - 0.225, 0.75 * DIAMETER):
+        inside = np.flatnonzero((z >= start) & (z < start + 0.75 * DIAMETER))
+        spread = rec.covariance[inside] * scale**2
+        values, rows = section_rows(found[inside], true_here[inside], spread)
+        variance = np.diag(rec.functions_covariance(inside, scale * rows))
+        for name, value, sigma in zip(("diameter", "ovality"), values, np.sqrt(variance), strict=True):
+            out[name].append([float(value / DIAMETER), float(sigma / DIAMETER)])
+        marks.append(inside)
+    # Length and drift: where eleven sections are, along the pipe from each to the next, across it from the first.
+    axes = r.T  # its rows: the axes of the pipe, in the first camera
+    chosen = [marks[i] for i in np.linspace(0, len(marks) - 1, 11).round().astype(int)]
+    points = np.concatenate(chosen)
+    mean = np.zeros((33, len(points), 3))
+    begin = 0
+    for k, inside in enumerate(chosen):
+        for axis in range(3):
+            mean[3 * k + axis, begin : begin + len(inside)] = axes[axis] / len(inside)
+        begin += len(inside)
+    covariance = rec.functions_covariance(points, scale * mean)
+    errors = np.einsum("mni,ni->m", mean, found[points] - (true_here[points] @ r.T + t))
+    for k in range(10):
+        a, b = 3 * k + 2, 3 * k + 5
+        sigma = math.sqrt(covariance[a, a] + covariance[b, b] - 2 * covariance[a, b])
+        out["length"].append([float(errors[b] - errors[a]), sigma])
+        for axis in range(2):
+            i = 3 * (k + 1) + axis
+            out["drift"].append([float(errors[i]), math.sqrt(covariance[i, i])])
+    return out
+
+
+def check_drives() -> list[dict[str, Any]]:
+    """Errors over posterior, and how often 95 % intervals hold the truth."""
+    rows = []
+    for name, with_encoder in (("encoder", True), ("free", False)):
+        every = [kept(f"drives-{name}-{s}", lambda s=s, e=with_encoder: drive_figures(s, e)) for s in range(SEEDS)]
+        rows.append(row(f"{name}.failed", sum(d["status"] != "ok" for d in every), high=0))
+        for quantity in ("diameter", "ovality", "length", "drift"):
+            error, sigma = np.concatenate([np.array(d[quantity]) for d in every]).T
+            ratio = math.sqrt(np.mean(error**2) / np.mean(sigma**2))
+            rows.append(row(f"{name}.{quantity}_over_sigma", ratio, high=1.1))
+            if quantity in ("diameter", "ovality"):
+                held = np.mean(np.abs(error) <= NORMAL_95 * sigma)
+                rows.append(row(f"{name}.{quantity}_held", held, 0.90, 0.98))
+            if quantity == "diameter":
+                worst = float(np.percentile(np.abs(error), 95))
+                limits = (0.2, 0.5) if with_encoder else (math.inf, math.inf)
+                rows.append(row(f"{name}.diameter_rms_pct", 100 * math.sqrt(np.mean(error**2)), high=limits[0]))
+                rows.append(row(f"{name}.diameter_p95_pct", 100 * worst, high=limits[1]))
+            if quantity == "ovality":
+                limit = 0.15 if with_encoder else math.inf
+                rows.append(row(f"{name}.ovality_rms_points", 100 * math.sqrt(np.mean(error**2)), high=limit))
+    return rows
+
+
+def tube_figures(seed: int) -> dict[str, Any]:
+    """Errors and sigmas of a tube's stations, as `measure` states them."""
+    drive = tube_drive(seed, LENGTH)
+    quality = pf.Encoder(scale_sigma=1e-5)
+    rec = pf.reconstruct(drive.tracks, drive.camera, readings(drive, seed), encoder=quality)
+    tube = pf.fit_tube(rec.points, rec.covariance, rec.centres, nominal=DIAMETER)
+    stations = {name: np.array(values) for name, values in tube.stations.items()}
+    a, b = DIAMETER / 2 * (1 - OVALITY / 2), DIAMETER / 2 * (1 + OVALITY / 2)
+    h = ((a - b) / (a + b)) ** 2
+    true = (a + b) * (1 + 3 * h / (10 + math.sqrt(4 - 3 * h)))  # perimeter over pi (Ramanujan)
+    wander = quality.noise_m_per_sqrt_m / math.sqrt(DIAMETER)
+    known = np.isfinite(stations["ovality"])
+    return {
+        "diameter": (stations["d_mean"][known] / true - 1).tolist(),
+        "sigma": np.hypot(stations["d_mean_sigma"][known] / true, wander).tolist(),
+        "ovality": ((stations["d_max"] - stations["d_min"])[known] / DIAMETER - OVALITY).tolist(),
+        "held": ((stations["ovality_lo"] <= 2 * (b - a) / (a + b)) & (stations["ovality_hi"] >= 2 * (b - a) / (a + b)))[
+            known
+        ].tolist(),
+        "events": len(tube.events),
+    }
+
+
+def check_tubes() -> list[dict[str, Any]]:
+    """The fitted tube's stations."""
+    every = [kept(f"tubes-{s}", lambda s=s: tube_figures(s)) for s in range(SEEDS)]
+    diameter, sigma, ovality, held = (
+        np.concatenate([d[name] for d in every]) for name in ("diameter", "sigma", "ovality", "held")
+    )
+    return [
+        row("tubes.diameter_rms_pct", 100 * math.sqrt(np.mean(diameter**2)), high=0.2),
+        row("tubes.diameter_p95_pct", 100 * float(np.percentile(np.abs(diameter), 95)), high=0.5),
+        row("tubes.diameter_held", float(np.mean(np.abs(diameter) <= NORMAL_95 * sigma)), low=0.9),
+        row("tubes.ovality_rms_points", 100 * math.sqrt(np.mean(ovality**2)), high=0.15),
+        row("tubes.ovality_held", float(np.mean(held)), 0.90, 0.98),
+        row("tubes.events_per_drive", sum(d["events"] for d in every) / SEEDS, high=0.05),
+    ]
+
+
+def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, float]) -> list[float]:
+    """rms of the whitened errors of rotation and direction, failures."""
+    turns, directions, failed, runs = [], [], 0, 400
+    for seed in range(runs):
+        pair = tube_pair(seed, motion, limits=limits, camera=fisheye(105))
+        found = pf.two_view(pair.camera, *pair.pixels, seed=seed)
+        if found.status != "ok":
+            failed += 1
+            continue
+        bound, bound_direction = pair_bound(pair)
+        t = -pair.rotation @ pair.centre / np.linalg.norm(pair.centre)
+        w = found.rotation @ pair.rotation.T
+        w = np.array([w[2, 1] - w[1, 2], w[0, 2] - w[2, 0], w[1, 0] - w[0, 1]]) / 2
+        d = found.direction - t
+        turns.append(w @ np.linalg.solve(bound, w) / 3)
+        directions.append(d @ np.linalg.pinv(bound_direction, rcond=1e-6) @ d / 2)
+    return [math.sqrt(np.mean(turns)), math.sqrt(np.mean(directions)), failed / runs]
+
+
+def check_two_view() -> list[dict[str, Any]]:
+    """Errors over the bound of the right pairs; 30 % are wrong."""
+    rows = []
+    for name, motion in (("forward", (0.003, 0.002, 0.05)), ("sideways", (0.03, 0.0, 0.002))):
+        for high in (88, 103):
+            found = kept(f"two_view-{name}-{high}", lambda m=motion, h=high: two_view_figures(m, (15, h)))
+            for quantity, value in zip(("rotation", "direction"), found[:2], strict=True):
+                rows.append(row(f"two_view.{name}_{high}.{quantity}_over_bound", value, high=1.1))
+            rows.append(row(f"two_view.{name}_{high}.failed", found[2], high=0.01))
+    return rows
+
+
+def long_figures(length: float) -> dict[str, float]:
+    """CPU seconds of one drive, without making its tracks, and the peak of this process's memory."""
+    drive = tube_drive(77, length)
+    chainage = readings(drive, 77)
+    started = time.process_time()
+    rec = pf.reconstruct(drive.tracks, drive.camera, chainage, threads=1)
+    seconds = time.process_time() - started
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return {"seconds": seconds, "frames": len(rec.frames), "ok": rec.status == "ok", "peak_gb": peak}
+
+
+def check_long() -> list[dict[str, Any]]:
+    """Ten times as long: ten times the time. Each in a process of its own, for the memory's sake."""
+
+    def measured(length: float) -> dict[str, float]:
+        command = [sys.executable, __file__, "--long", str(length)]
+        return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+    short, long = (kept(f"long-{n}", lambda n=n: measured(float(n))) for n in (30, 300))
+    per_frame = (long["seconds"] / long["frames"]) / (short["seconds"] / short["frames"])
+    return [
+        row("long.failed", 2 - short["ok"] - long["ok"], high=0),
+        row("long.seconds_300m", long["seconds"]),
+        row("long.time_per_frame_ratio", per_frame, high=1.3),
+        row("long.memory_gb", long["peak_gb"], high=4.0),
+    ]
+
+
+def check_video() -> list[dict[str, Any]]:
+    """Rendered pipes; see accept_recon_video.py."""
+    from accept_recon_video import SCENES, video_figures
+
+    rows = []
+    for name in SCENES:
+        rows += [
+            row(f"video.{name}.{key}", *limits)
+            for key, *limits in kept(f"video-{name}", lambda n=name: video_figures(n))
+        ]
+    return rows
+
+
+CHECKS = {
+    "table": check_table,
+    "drives": check_drives,
+    "tubes": check_tubes,
+    "two_view": check_two_view,
+    "long": check_long,
+    "video": check_video,
+}
+
+
+def main() -> int:
+    """All pieces, or those whose name has the word in it."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("word", nargs="?", default="")
+    parser.add_argument("--long", type=float, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.long is not None:
+        print(json.dumps(long_figures(arguments.long)))
+        return 0
+    rows = [r for name, check in CHECKS.items() if arguments.word in name for r in check()]
+    print(json.dumps(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
