@@ -420,7 +420,9 @@ static bool attempt_searched(pf_tracker *t, pf_track *track, uint16_t slot, cons
 
 /* Attempts at one track, each only if those before it failed: by its template, warped as is expected, from where it is
  * expected and from where around it looks most like it; from half resolution or the top of the pyramid, without a warp;
- * by its warped template from where that came to; from the other starts; from where its neighbours went. */
+ * by its warped template from where that came to; from the other starts; in a slow drive too by its template where it
+ * is expected, if it is not that the way back led elsewhere (at the rim of a brick pipe and beside beads of water a
+ * patch changes too much from frame to frame, and is the same still); from where its neighbours went. */
 static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const pf_point_q16 *around)
 {
     const pf_expected expected = t->slots[slot].expected;
@@ -444,6 +446,9 @@ static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const
         return PF_TRACK_OK;
     for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
+    if (!warped && expected.at.x != PF_NO_GUESS && worth_another(reason) && reason != PF_TRACK_BACKWARD && may_try(t) &&
+        attempt_warped(t, track, slot, expected.warp_q16, expected.at) == PF_TRACK_OK)
+        return PF_TRACK_OK;
     pf_point_q16 near = around ? *around : (pf_point_q16){0, 0}, miss;
     if (!worth_another(reason) || (!around && !look_around(t, track->pos, &near, &miss)))
         return reason;
