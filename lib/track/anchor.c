@@ -183,27 +183,9 @@ static int32_t smoothing_at(int64_t v)
     return (f * (32768 - f)) >> 16;
 }
 
-/* Bends the template as the wall will be seen to bend around `centre`: to the first order, what lies at x comes from
- * x - bow(x). */
-static void bend_reference(pf_klt *klt, const pf_anchor *anchor, pf_point_q16 centre)
-{
-    pf_bow bow;
-    if (!klt->lens.ray || !pf_bow_between(&klt->lens, klt->half, anchor->x, anchor->y, centre, &bow))
-        return;
-    const int32_t *c = bow.c;
-    for (int32_t r = 0; r < klt->window; r++)
-        for (int32_t i = 0; i < klt->window; i++) {
-            const int32_t k = r * PATCH_ROW + i, x = i - klt->half, y = r - klt->half;
-            const int32_t u = (c[0] * x * x + c[1] * x * y + c[2] * y * y) >> 9,
-                          v = (c[3] * x * x + c[4] * x * y + c[5] * y * y) >> 9; /* Q15 */
-            /* gradients are Q3, the template Q4 */
-            klt->t[k] = (int16_t)(klt->t[k] - ((klt->gx[k] * u + klt->gy[k] * v + (1 << 13)) >> 14));
-        }
-}
-
 /* Unpacks the template, smoothed as sampling will smooth the image: by the mean over the window's centre and corners,
  * for where the warp turns or scales, the fraction differs from pixel to pixel. Unsmoothed, fine texture would pull by
- * a hundredth of a pixel. */
+ * a hundredth of a pixel. With a lens, bent as the wall will be seen to bend around `centre`. */
 static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 centre,
                            pf_reference *out)
 {
@@ -219,7 +201,9 @@ static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *
     images.smooth[0] = (int16_t)(x / 9);
     images.smooth[1] = (int16_t)(y / 9);
     PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
-    bend_reference(klt, anchor, centre);
+    pf_bow bow;
+    if (klt->lens.ray && pf_bow_between(&klt->lens, klt->half, anchor->x, anchor->y, centre, &bow))
+        PF_KERNEL(bend)(bow.c, klt->window, klt->groups, &images);
     pf_affine_sums s;
     pf_rhs rhs;
     PF_KERNEL(affine)(klt->t, &images, klt->window, klt->groups, &s);

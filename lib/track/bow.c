@@ -41,44 +41,52 @@ static bool follow_ray(const pf_track_lens *lens, const pf_way *way, const pf_ra
     return rho >= STEEP && lens->project(lens->camera, &moved, at);
 }
 
-/* Second differences of the nine places, 2 half^2 times the derivatives by xx, xy, yy (Q16), through the inverse of the
- * warp; false where there is none of use, or a place has run away. */
-static bool bend_of(const pf_point_q16 p[9], int32_t half, pf_bow *bow)
+/* The places at which a patch is looked at, from its middle, in half windows: by symmetric differences of seven a
+ * quadratic is known. */
+enum { MIDDLE, RIGHT, LEFT, BELOW, ABOVE, RIGHT_BELOW, LEFT_ABOVE, PLACES };
+static const int32_t place[PLACES][2] = {{0, 0}, {1, 0}, {-1, 0}, {0, 1}, {0, -1}, {1, 1}, {-1, -1}};
+
+/* The bow of a patch of which these places came to p: second differences, half^2 times Q16, through the inverse of the
+ * warp. False where that is of no use, or a place has run away. */
+static bool bend_of(const pf_point_q16 p[PLACES], int32_t half, pf_bow *bow)
 {
     const int64_t far = ((int64_t)FAR * half) << 16, least = (int64_t)LEAN * 4 * half * half;
-    int64_t x[9], y[9];
-    for (int32_t k = 0; k < 9; k++) {
-        x[k] = (int64_t)p[k].x - p[4].x;
-        y[k] = (int64_t)p[k].y - p[4].y;
-        if (x[k] > far || x[k] < -far || y[k] > far || y[k] < -far)
+    int64_t d[2][PLACES], a[2][2], bend[3][2];
+    for (int32_t k = 0; k < PLACES; k++) {
+        d[0][k] = (int64_t)p[k].x - p[MIDDLE].x;
+        d[1][k] = (int64_t)p[k].y - p[MIDDLE].y;
+        if (d[0][k] > far || d[0][k] < -far || d[1][k] > far || d[1][k] < -far)
             return false;
     }
-    const int64_t a[4] = {x[5] - x[3], x[7] - x[1], y[5] - y[3], y[7] - y[1]}; /* the warp, 2 half times Q16 */
-    const int64_t det = (a[0] * a[3] - a[1] * a[2]) >> 16;
-    const int64_t bx[3] = {x[5] + x[3], (x[8] - x[6] - x[2] + x[0]) / 2, x[7] + x[1]},
-                  by[3] = {y[5] + y[3], (y[8] - y[6] - y[2] + y[0]) / 2, y[7] + y[1]};
-    const int64_t most = ((int64_t)1 << 24) / (3 * half * half);
+    for (int32_t k = 0; k < 2; k++) {
+        const int64_t *v = d[k];
+        a[k][0] = v[RIGHT] - v[LEFT]; /* the warp, 2 half times Q16 */
+        a[k][1] = v[BELOW] - v[ABOVE];
+        bend[0][k] = v[RIGHT] + v[LEFT]; /* twice the coefficients */
+        bend[2][k] = v[BELOW] + v[ABOVE];
+        bend[1][k] = v[RIGHT_BELOW] + v[LEFT_ABOVE] - bend[0][k] - bend[2][k];
+    }
+    const int64_t det = (a[0][0] * a[1][1] - a[0][1] * a[1][0]) >> 16;
+    const int32_t most = ((1 << 24) - (1 << 12)) / (3 * half * half);
     if (det < least)
         return false;
     for (int32_t k = 0; k < 3; k++) { /* 2^57 at most */
-        bow->c[k] = pf_clamp_i64((a[3] * bx[k] - a[1] * by[k]) * 256 / det / half, (int32_t)most);
-        bow->c[3 + k] = pf_clamp_i64((a[0] * by[k] - a[2] * bx[k]) * 256 / det / half, (int32_t)most);
+        bow->c[k] = pf_clamp_i64((a[1][1] * bend[k][0] - a[0][1] * bend[k][1]) * 256 / det / half, most);
+        bow->c[3 + k] = pf_clamp_i64((a[0][0] * bend[k][1] - a[1][0] * bend[k][0]) * 256 / det / half, most);
     }
     return true;
 }
 
 bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t y, pf_point_q16 to, pf_bow *bow)
 {
-    const pf_ray_q30 from = lens->ray(lens->rays, (pf_point_q16){x * 65536, y * 65536}),
-                     there = lens->ray(lens->rays, to);
-    pf_point_q16 p[9];
-    pf_way way;
-    if (!pf_ray_valid(&from) || !pf_ray_valid(&there) || !way_between(&from, &there, &way))
-        return false;
-    for (int32_t k = 0; k < 9; k++) {
-        const pf_point_q16 pixel = {(x + (k % 3 - 1) * half) * 65536, (y + (k / 3 - 1) * half) * 65536};
+    const pf_ray_q30 there = lens->ray(lens->rays, to);
+    pf_point_q16 p[PLACES];
+    pf_way way = {0, 0, 0};
+    for (int32_t k = 0; k < PLACES; k++) {
+        const pf_point_q16 pixel = {(x + place[k][0] * half) * 65536, (y + place[k][1] * half) * 65536};
         const pf_ray_q30 ray = lens->ray(lens->rays, pixel);
-        if (!pf_ray_valid(&ray) || !follow_ray(lens, &way, &ray, &p[k]))
+        if (!pf_ray_valid(&ray) || (k == MIDDLE && (!pf_ray_valid(&there) || !way_between(&ray, &there, &way))) ||
+            !follow_ray(lens, &way, &ray, &p[k]))
             return false;
     }
     return bend_of(p, half, bow);
