@@ -140,6 +140,7 @@ static void add_track(pf_tracker *t, pf_point_q16 at)
     s->sure = false;
     s->from = at;
     s->clipped = pf_mask_clipped(t, image, at);
+    s->first_cov = (uint64_t)track->cov_xx_q20 + track->cov_yy_q20;
     track->id = ++t->last_id;
     t->slot_of[row] = slot;
     t->spare_n--;
