@@ -54,6 +54,31 @@ static void forget_motion(pf_tracking *p)
         pf_predictor_assume(&p->predictor, (int32_t)lround(c->encoder.metres_per_count / radius * 1073741824.0 / 8));
 }
 
+/* The camera in integers and its table of rays. */
+static bool open_camera(pf_tracking *p, char *error, size_t n)
+{
+    const pf_daemon *d = p->daemon;
+    if (!d->has_profile)
+        return true;
+    size_t size = pf_camera_fixed_workspace_size(&d->profile.camera);
+    if (size == 0) {
+        (void)snprintf(error, n, "the profile's lens is beyond the range of fixed point");
+        return false;
+    }
+    p->camera_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+    if (p->camera_workspace != NULL &&
+        pf_camera_fixed_init(&p->camera, &d->profile.camera, p->camera_workspace, size) == PF_OK) {
+        uint32_t step = pf_camera_rays_step(p->camera);
+        size = pf_camera_rays_workspace_size(p->camera, step);
+        p->bearing_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+        if (p->bearing_workspace != NULL &&
+            pf_camera_rays_init(&p->bearings, p->camera, step, p->bearing_workspace, size) == PF_OK)
+            return true;
+    }
+    (void)snprintf(error, n, "no memory for the camera's tables");
+    return false;
+}
+
 static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size_t n)
 {
     const pf_daemon *d = p->daemon;
@@ -81,6 +106,7 @@ static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size
                            .circle_radius_q16 = (uint32_t)lround(radius * 65536.0),
                            .no_static_mask = !c->tracker.static_mask,
                            .polar = c->tracker.cells == PF_CELLS_POLAR,
+                           .lens = p->camera != NULL ? pf_track_lens_of(p->bearings, p->camera) : (pf_track_lens){0},
                            .mask = mask->data ? mask : NULL};
     size_t size = pf_tracker_workspace_size(&t);
     if (t.polar && radius <= 0) {
@@ -105,31 +131,6 @@ static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size
         return false;
     }
     return true;
-}
-
-/* The camera in integers and its table of rays. */
-static bool open_camera(pf_tracking *p, char *error, size_t n)
-{
-    const pf_daemon *d = p->daemon;
-    if (!d->has_profile)
-        return true;
-    size_t size = pf_camera_fixed_workspace_size(&d->profile.camera);
-    if (size == 0) {
-        (void)snprintf(error, n, "the profile's lens is beyond the range of fixed point");
-        return false;
-    }
-    p->camera_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
-    if (p->camera_workspace != NULL &&
-        pf_camera_fixed_init(&p->camera, &d->profile.camera, p->camera_workspace, size) == PF_OK) {
-        uint32_t step = pf_camera_rays_step(p->camera);
-        size = pf_camera_rays_workspace_size(p->camera, step);
-        p->bearing_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
-        if (p->bearing_workspace != NULL &&
-            pf_camera_rays_init(&p->bearings, p->camera, step, p->bearing_workspace, size) == PF_OK)
-            return true;
-    }
-    (void)snprintf(error, n, "no memory for the camera's tables");
-    return false;
 }
 
 /* The tracker, with the user's mask. */
@@ -186,7 +187,7 @@ bool pf_tracking_open(pf_tracking **tracking, const pf_daemon *daemon, char *err
         return false;
     }
     p->daemon = daemon;
-    if (!open_tracking(p, error, n) || !open_camera(p, error, n)) {
+    if (!open_camera(p, error, n) || !open_tracking(p, error, n)) {
         pf_tracking_close(p);
         return false;
     }

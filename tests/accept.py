@@ -134,7 +134,7 @@ def check_daemon_kills() -> list[dict]:
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 
 
-GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "02754de9"
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "5fc711b5"
 
 
 def check_golden_replay() -> list[dict]:

@@ -104,6 +104,8 @@ static int64_t plane_part(const pf_klt *klt, const int64_t a[3], const int64_t b
 void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anchor *anchor, uint8_t *pixels)
 {
     const int32_t ix = (at.x + 32768) >> 16, iy = (at.y + 32768) >> 16, w = row_bytes(klt), half = klt->half;
+    anchor->x = ix;
+    anchor->y = iy;
     anchor->offset = (pf_point_q16){at.x - ix * 65536, at.y - iy * 65536};
     anchor->a[0] = anchor->a[3] = 65536;
     anchor->a[1] = anchor->a[2] = 0;
@@ -183,7 +185,7 @@ static int32_t smoothing_at(int64_t v)
 
 /* Unpacks the template, smoothed as sampling will smooth the image: by the mean over the window's centre and corners,
  * for where the warp turns or scales, the fraction differs from pixel to pixel. Unsmoothed, fine texture would pull by
- * a hundredth of a pixel. */
+ * a hundredth of a pixel. With a lens, bent as the wall will be seen to bend around `centre`. */
 static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 centre,
                            pf_reference *out)
 {
@@ -199,6 +201,9 @@ static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *
     images.smooth[0] = (int16_t)(x / 9);
     images.smooth[1] = (int16_t)(y / 9);
     PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
+    pf_bow bow;
+    if (klt->lens.ray && pf_bow_between(&klt->lens, klt->half, anchor->x, anchor->y, centre, &bow))
+        PF_KERNEL(bend)(bow.c, klt->window, klt->groups, &images);
     pf_affine_sums s;
     pf_rhs rhs;
     PF_KERNEL(affine)(klt->t, &images, klt->window, klt->groups, &s);

@@ -12,3 +12,13 @@ bool pf_track_project(const void *fixed, const pf_ray_q30 *ray, pf_point_q16 *at
 {
     return pf_camera_fixed_project(fixed, *ray, at) == PF_OK;
 }
+
+static pf_ray_q30 ray_of(const void *rays, pf_point_q16 pixel)
+{
+    return pf_camera_rays_at(rays, pixel);
+}
+
+pf_track_lens pf_track_lens_of(const pf_camera_rays *rays, const pf_camera_fixed *fixed)
+{
+    return (pf_track_lens){ray_of, pf_track_project, rays, fixed};
+}

@@ -11,6 +11,10 @@
  * lost ones. */
 #define FAINT 12583
 
+/* Nor does one of whose window more than a fortieth is clipped: it stands at the edge of the glare, which goes with the
+ * camera. On PVC two thirds of what was lost to the glare had begun there. */
+#define GLARE 40u
+
 static bool weaker(const pf_corner *a, const pf_corner *b)
 {
     if (a->strength != b->strength)
@@ -101,7 +105,7 @@ static int32_t bin_of(const pf_tracker *t, pf_point_q16 at)
 static bool has_room(const pf_tracker *t, pf_point_q16 at)
 {
     const uint32_t most = (3u * t->config.max_tracks + 2u * SECTORS * RINGS - 1u) / (2u * SECTORS * RINGS);
-    if (CLIPPED * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
+    if (GLARE * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
         return false;
     if (!t->config.polar)
         return true;
@@ -136,6 +140,7 @@ static void add_track(pf_tracker *t, pf_point_q16 at)
     s->sure = false;
     s->from = at;
     s->clipped = pf_mask_clipped(t, image, at);
+    s->first_cov = (uint64_t)track->cov_xx_q20 + track->cov_yy_q20;
     track->id = ++t->last_id;
     t->slot_of[row] = slot;
     t->spare_n--;

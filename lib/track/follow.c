@@ -22,9 +22,14 @@
 #define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
-/* px^2, Q20: beyond 0.3 px of standard deviation (root of the sum of both variances) it is no longer known well enough
- * that this is the point first seen. Covariances leave out what light does to relief: then errors are twice as large */
-#define VAGUE       94372u
+/* Sums of both variances, px^2 Q20. Beyond 0.4 px a track is no longer known well enough that this is the point first
+ * seen. Beyond 0.22 px it is lost where that is 8 times what it was at first sight: its marks have faded, been drawn
+ * out, or no longer explain what is seen; with relief in a light that moves errors are then several times what is
+ * stated. The ratio tells wrong places from right ones better than the deviation itself: the strongest marks of brick,
+ * and beads of water on clay, are relief. */
+#define VAGUE       167772u
+#define WORN        50332u
+#define WORSE       8u
 #define CLIP_CHANGE 20u /* a twentieth of the window: with it the worst is at 5 sigma */
 
 static int32_t median3(int32_t a, int32_t b, int32_t c)
@@ -420,7 +425,9 @@ static bool attempt_searched(pf_tracker *t, pf_track *track, uint16_t slot, cons
 
 /* Attempts at one track, each only if those before it failed: by its template, warped as is expected, from where it is
  * expected and from where around it looks most like it; from half resolution or the top of the pyramid, without a warp;
- * by its warped template from where that came to; from the other starts; from where its neighbours went. */
+ * by its warped template from where that came to; from the other starts; in a slow drive too by its template where it
+ * is expected, if it is not that the way back led elsewhere (at the rim of a brick pipe and beside beads of water a
+ * patch changes too much from frame to frame, and is the same still); from where its neighbours went. */
 static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const pf_point_q16 *around)
 {
     const pf_expected expected = t->slots[slot].expected;
@@ -444,6 +451,9 @@ static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const
         return PF_TRACK_OK;
     for (uint32_t i = 1; i < n && worth_another(reason) && may_try(t); i++)
         reason = attempt(t, track, slot, start[i], top, 0, &other);
+    if (!warped && expected.at.x != PF_NO_GUESS && worth_another(reason) && reason != PF_TRACK_BACKWARD && may_try(t) &&
+        attempt_warped(t, track, slot, expected.warp_q16, expected.at) == PF_TRACK_OK)
+        return PF_TRACK_OK;
     pf_point_q16 near = around ? *around : (pf_point_q16){0, 0}, miss;
     if (!worth_another(reason) || (!around && !look_around(t, track->pos, &near, &miss)))
         return reason;
@@ -451,6 +461,12 @@ static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const
         if (!farther(near, start[i], SAME_START))
             return reason;
     return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
+}
+
+static bool is_vague(const pf_track *track, const pf_slot *slot)
+{
+    const uint64_t now = (uint64_t)track->cov_xx_q20 + track->cov_yy_q20;
+    return now > VAGUE || (now > WORN && now > WORSE * slot->first_cov);
 }
 
 /* Finds one track. What is expected of it is first put right by how far its neighbours were from where they were
@@ -467,7 +483,7 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
         e->at = (pf_point_q16){pf_guess_clamp((int64_t)given.x + miss.x, t->config.width),
                                pf_guess_clamp((int64_t)given.y + miss.y, t->config.height)};
     pf_track_reason reason = seek(t, track, slot, has_near ? &around : NULL);
-    if (reason == PF_TRACK_OK && (uint64_t)track->cov_xx_q20 + track->cov_yy_q20 > VAGUE)
+    if (reason == PF_TRACK_OK && is_vague(track, s))
         reason = PF_TRACK_DRIFT;
     e->at.x = PF_NO_GUESS;
     s->miss = (pf_point_q16){0, 0};

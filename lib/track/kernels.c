@@ -82,6 +82,24 @@ void pf_c_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int
     }
 }
 
+void pf_c_bend(const int32_t bow[6], int32_t window, int32_t groups, const pf_gradients *g)
+{
+    const int32_t half = window / 2;
+    for (int32_t r = 0; r < window; r++) {
+        const int32_t y = r - half;
+        const int32_t yy[2] = {(bow[2] * y * y) >> 9, (bow[5] * y * y) >> 9},
+                      xy[2] = {(bow[1] * y) >> 9, (bow[4] * y) >> 9};
+        for (int32_t i = 0; i < 8 * groups; i++) {
+            const int32_t k = r * PATCH_ROW + i, x = i - half;
+            /* Q15; wrong beyond the window, where gradients are zero */
+            const int16_t u = (int16_t)(((bow[0] * x * x) >> 9) + xy[0] * x + yy[0]),
+                          v = (int16_t)(((bow[3] * x * x) >> 9) + xy[1] * x + yy[1]);
+            const int32_t t = g->t[k] - mul_q15(2 * g->gx[k], u) - mul_q15(2 * g->gy[k], v); /* Q3 to Q4 */
+            g->t[k] = (int16_t)(t > PIXEL_MID ? PIXEL_MID : t < -PIXEL_MID ? -PIXEL_MID : t);
+        }
+    }
+}
+
 void pf_c_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out)
 {
     const int32_t half = window / 2, *a = warp->a;

@@ -134,6 +134,9 @@ typedef struct pf_tensor_row {
     /* A template's pixels, (window + 2)^2 bytes and 8 readable ones behind, to patch and gradients. */                \
     void set##_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, int32_t groups,                      \
                       const pf_gradients *out);                                                                        \
+    /* Bends such a template by `bow`, Q24 per pixel (pf_bow): what lies at x comes from x - bow(x), to the first      \
+     * order. Displacements are below a pixel; the template stays within +-PIXEL_MID. */                               \
+    void set##_bend(const int32_t bow[6], int32_t window, int32_t groups, const pf_gradients *g);                      \
     /* Samples the warped window, which lies inside the image with a pixel to spare. */                                \
     void set##_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out);           \
     void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);  \

@@ -19,6 +19,7 @@
 
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {
+    pf_track_lens lens;
     int32_t window, half;
     int32_t groups; /* of 8 columns, that hold the window; the surplus columns are masked */
     int32_t iterations;
@@ -46,6 +47,7 @@ typedef struct pf_fit {
 /* The patch of a track as it was when it was first seen or last renewed: whole pixels, nothing interpolated. The
  * warp takes template coordinates x (relative to the centre pixel) to `centre + a x` in the current frame. */
 typedef struct pf_anchor {
+    int32_t x, y;        /* the template's centre pixel, in its own picture */
     pf_point_q16 offset; /* of the track's point from the template's centre pixel, |.| <= 1/2 */
     int32_t a[4];        /* Q16.16, row-major */
     int32_t inverse[21]; /* Q12.20, of the scaled 6x6 normal matrix, lower triangle; order dx dy, the warp by rows */
@@ -112,6 +114,18 @@ void pf_anchor_carry(const pf_anchor *anchor, uint32_t noise_q8, int64_t carried
 /* Covariance of the position, what the template carries included, along the picture's axes; gain as the fit gave it.
  * Fills the three fields of `track`. */
 void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t gain_q14, pf_track *track);
+
+/* --- the wall (bow.c) --- */
+
+/* How a patch of a tube's wall bends beyond its affine warp: its pixel x lies at `centre + a (x + bow (x))` with bow =
+ * (c[0] xx + c[1] xy + c[2] yy, c[3] xx + c[4] xy + c[5] yy), Q24 per pixel; displacements stay below a pixel. */
+typedef struct pf_bow {
+    int32_t c[6];
+} pf_bow;
+
+/* The bow of the patch around the whole pixel (x, y) once it is seen around `to`, the tube along the optical axis, the
+ * camera driven along it or turned about it. False, and no bow, where the lens does not tell. */
+bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t y, pf_point_q16 to, pf_bow *bow);
 
 /* --- bearings (rotation.c) --- */
 

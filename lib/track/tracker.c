@@ -127,6 +127,7 @@ pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config,
     lay_out(&c, workspace, t);
     t->config = c;
     pf_klt_init(&t->klt, c.window, c.iterations, c.min_eigen / FLAT_FRACTION, c.noise_q8);
+    t->klt.lens = c.lens;
     t->klt.circle = c.circle;
     t->klt.radius_q16 = (int32_t)c.circle_radius_q16;
     pf_mask_init(t, c.mask);

@@ -20,6 +20,7 @@ typedef struct pf_slot {  /* the hidden part of a live track */
     pf_expected expected; /* by the caller, of the next frame */
     pf_point_q16 from;    /* where it was when the current window of PF_SCENE_WINDOW frames began */
     uint32_t clipped;     /* pixels of its template's window */
+    uint64_t first_cov;   /* the sum of its variances at first sight */
     pf_anchor anchor;
 } pf_slot;
 

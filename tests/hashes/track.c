@@ -30,8 +30,7 @@ static void make_frame(uint32_t k, uint8_t *out)
 
 uint32_t hash_track(size_t *ram)
 {
-    const pf_tracker_config config = {
-        .width = WIDTH, .height = HEIGHT, .max_tracks = TRACKS, .levels = 3, .window = 11};
+    pf_tracker_config config = {.width = WIDTH, .height = HEIGHT, .max_tracks = TRACKS, .levels = 3, .window = 11};
     const pf_keyframe_config choice = {.parallax_urad = 30000, .min_common = 10};
     const pf_camera_fixed *fixed;
     const pf_camera_rays *bearings;
@@ -42,9 +41,11 @@ uint32_t hash_track(size_t *ram)
     for (uint32_t i = 0; i < sizeof texture; i++)
         texture[i] = (uint8_t)(texture[i] - hash_random(&state) % 3u);
     *ram = pf_tracker_workspace_size(&config);
+    if (pf_camera_fixed_init(&fixed, &CAMERAS[0], camera_block, sizeof camera_block) != PF_OK ||
+        pf_camera_rays_init(&bearings, fixed, 16, rays_block, sizeof rays_block) != PF_OK)
+        return 0;
+    config.lens = pf_track_lens_of(bearings, fixed);
     if (pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK ||
-        pf_camera_fixed_init(&fixed, &CAMERAS[0], camera_block, sizeof camera_block) != PF_OK ||
-        pf_camera_rays_init(&bearings, fixed, 16, rays_block, sizeof rays_block) != PF_OK ||
         pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK)
         return 0;
     for (uint32_t k = 0; k < FRAMES; k++) {

@@ -135,17 +135,20 @@ static uint32_t hash_guesses(uint32_t crc, const pf_track *tracks, uint32_t n, c
 /* False: the tracker could not be made. */
 static bool golden_replay(uint32_t frames, golden *out)
 {
+    *out = (golden){0, 0, 0, 0};
+    if (!make_lens())
+        return false;
     const pf_tracker_config config = {.width = WIDTH,
                                       .height = HEIGHT,
                                       .max_tracks = TRACKS,
                                       .window = 15,
                                       .circle = {(WIDTH / 2) << 16, (HEIGHT / 2) << 16},
-                                      .circle_radius_q16 = 150u << 16};
+                                      .circle_radius_q16 = 150u << 16,
+                                      .lens = pf_track_lens_of(table, camera)};
     const pf_keyframe_config choice = {.step_counts = 30, .parallax_urad = 60000, .min_common = 40};
     pf_tracker *tracker;
-    *out = (golden){0, 0, 0, 0};
     make_texture();
-    if (!make_lens() || pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK ||
+    if (pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK ||
         pf_predictor_init(&predictor, TRACKS, predictor_block, sizeof predictor_block) != PF_OK ||
         pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK)
         return false;

@@ -141,6 +141,20 @@ static void test_affine_kernels_are_the_same_bits(void)
             }
             for (uint32_t k = 0; k < 5; k++)
                 memcpy(in[k], got[0].out[k], sizeof in[k]);
+            const int32_t most = ((1 << 24) - (1 << 12)) / (3 * (window / 2) * (window / 2)); /* of pf_bow_between */
+            int32_t bow[6];
+            for (uint32_t k = 0; k < 6; k++)
+                bow[k] = kind % 4u == 0   ? most
+                         : kind % 4u == 1 ? -most
+                                          : (int32_t)(next_random() % 512u) * most / 256 - most;
+            clear();
+            memcpy(got[0].out[0], in[0], sizeof in[0]);
+            memcpy(got[1].out[0], in[0], sizeof in[0]);
+            BOTH(bend, bow, window, groups, &(pf_gradients){r->out[0], in[1], in[2], in[3], in[4], {0, 0}});
+            compare("bend", 1);
+            for (int32_t i = 0; i < window * PATCH_ROW; i++)
+                TEST_ASSERT_TRUE(i % PATCH_ROW >= 8 * groups ||
+                                 (got[0].out[0][i] >= -2040 && got[0].out[0][i] <= 2040));
             fill(kind / 7u);
             /* near identity, as tracks are; and now and then whatever */
             const uint32_t range = kind % 5u == 0 ? 60000u : 18000u;

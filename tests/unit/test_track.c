@@ -444,6 +444,39 @@ static void test_faint_marks_make_no_tracks(void)
     TEST_ASSERT_GREATER_THAN_UINT32(8, n);
 }
 
+/* Proves: what fades is given up once it is known with 8 times the variance of its first sight and 0.22 px, and not
+ * before; what is still known to 0.22 px is kept. */
+static void test_tracks_that_fade_are_given_up(void)
+{
+    static double first[400];
+    pf_tracker *t = start(&(pf_tracker_config){.noise_q8 = 650, .min_eigen = 1});
+    uint32_t n, given_up = 0;
+    for (int k = 0; k < 8; k++) {
+        motion faded = still;
+        faded.gain = pow(0.78, k);
+        faded.bias = 110 * (1 - faded.gain);
+        render(frame[k % 2], &faded, 0, 0);
+        feed(t, frame[k % 2]);
+        const pf_track *track = pf_tracker_tracks(t, &n);
+        for (uint32_t i = 0; i < n; i++) {
+            const double now = (track[i].cov_xx_q20 + track[i].cov_yy_q20) / 1048576.0;
+            TEST_ASSERT_TRUE(track[i].id < 400);
+            if (track[i].status == PF_TRACK_NEW)
+                first[track[i].id] = now;
+            const bool is_worn = now > 0.22 * 0.22 && now > 8 * first[track[i].id];
+            if (track[i].status == PF_TRACK_TRACKED)
+                TEST_ASSERT_FALSE(is_worn);
+            if (track[i].status == PF_TRACK_LOST && is_worn) {
+                TEST_ASSERT_EQUAL_INT(PF_TRACK_DRIFT, track[i].reason);
+                given_up++;
+            }
+        }
+        TEST_ASSERT_TRUE(k > 3 || pf_tracker_last_stats(t)->lost == 0); /* a gain of 0.47 */
+    }
+    TEST_ASSERT_GREATER_THAN_UINT32(10, given_up);
+    TEST_ASSERT_GREATER_THAN_UINT32(10, pf_tracker_last_stats(t)->tracked);
+}
+
 /* Proves: with an image circle nothing begins in its outer eighth, where the lamp's mirror images are; but up to there.
  */
 static void test_nothing_begins_at_the_rim(void)
@@ -610,6 +643,7 @@ int main(void)
     RUN_TEST(test_covariances_are_positive_definite);
     RUN_TEST(test_tracks_that_run_together_are_thinned);
     RUN_TEST(test_faint_marks_make_no_tracks);
+    RUN_TEST(test_tracks_that_fade_are_given_up);
     RUN_TEST(test_nothing_begins_at_the_rim);
     RUN_TEST(test_frames_without_a_scene_give_nothing);
     RUN_TEST(test_covariance_predicts_the_scatter);

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xA8528CBAu
+#define GOLDEN 0x70F89F03u
 
 void setUp(void) {}
 void tearDown(void) {}

@@ -57,6 +57,16 @@ typedef struct pf_track {
     uint16_t quality; /* similarity with the previous frame's patch, Q0.15 ZNCC (32767 = identical); 0 when new */
 } pf_track;
 
+/* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
+typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
+
+/* The lens, as the tracker sees it: pf_track_lens. All must outlive the tracker. */
+typedef struct pf_track_lens {
+    pf_ray_q30 (*ray)(const void *rays, pf_point_q16 pixel); /* (0, 0, 0) where there is none; NULL: no lens is known */
+    pf_ray_project project;
+    const void *rays, *camera;
+} pf_track_lens;
+
 /* Zero means the default in brackets; width and height have none. Bounds are checked by pf_tracker_init. */
 typedef struct pf_tracker_config {
     uint32_t width, height;     /* frame size, 64..16384 */
@@ -77,6 +87,8 @@ typedef struct pf_tracker_config {
     const pf_image *mask;       /* of the frame's size, 0 = nothing may be tracked here, in blocks of 8 x 8: one such
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
+    pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
+                         * warp alone leaves 0.02 px a fifth of growth, the same way for all [none] */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
                  * in each, none in its inner eighth (no parallax there); needs a circle */
 } pf_tracker_config;
@@ -165,6 +177,9 @@ void pf_track_bearings(const pf_camera_rays *camera, const pf_track *tracks, uin
 /* Projects a ray by the camera in integers, a pf_camera_fixed; false beyond its domain. A pf_ray_project. */
 bool pf_track_project(const void *fixed, const pf_ray_q30 *ray, pf_point_q16 *at);
 
+/* The lens for pf_tracker_config: both are borrowed. */
+pf_track_lens pf_track_lens_of(const pf_camera_rays *rays, const pf_camera_fixed *fixed);
+
 /* --- Prediction ---------------------------------------------------------------------------------------------------
  * Where the tracks will be in the next frame, from the last motion, the encoder and the roll: rotation, then a drive
  * along a tube, each track with its own distance from the camera's path. For pf_tracker_expect. */
@@ -174,9 +189,6 @@ typedef struct pf_motion_hints { /* with a frame; a reading counts only if its h
     int32_t roll_urad; /* about the optical axis, 0 = image y axis down; rises as the picture turns from y to x */
     uint32_t frames;   /* since the frame before it: dropped ones + 1; 0 counts as 1 */
 } pf_motion_hints;
-
-/* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
-typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
 
 #define PF_FALL_UNKNOWN INT32_MIN
 

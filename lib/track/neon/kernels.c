@@ -149,6 +149,33 @@ void pf_neon_unpack(const uint8_t *pixels, const int16_t *mask, int32_t window, 
     }
 }
 
+void pf_neon_bend(const int32_t bow[6], int32_t window, int32_t groups, const pf_gradients *g)
+{
+    const int32_t half = window / 2;
+    const int16x8_t most = vdupq_n_s16(PIXEL_MID), least = vdupq_n_s16(-PIXEL_MID);
+    for (int32_t i = 0; i < groups; i++) {
+        const int16x8_t x = vaddq_s16(lanes(), vdupq_n_s16((int16_t)(8 * i - half)));
+        int16_t xx[2][8];
+        for (int32_t k = 0; k < 8; k++) {
+            const int32_t square = (8 * i + k - half) * (8 * i + k - half);
+            xx[0][k] = (int16_t)((bow[0] * square) >> 9);
+            xx[1][k] = (int16_t)((bow[3] * square) >> 9);
+        }
+        const int16x8_t ux = vld1q_s16(xx[0]), vx = vld1q_s16(xx[1]);
+        for (int32_t r = 0; r < window; r++) {
+            const int32_t k = r * PATCH_ROW + 8 * i, y = r - half;
+            const int16x8_t uy = vdupq_n_s16((int16_t)((bow[2] * y * y) >> 9)),
+                            vy = vdupq_n_s16((int16_t)((bow[5] * y * y) >> 9));
+            const int16x8_t uxy = vdupq_n_s16((int16_t)((bow[1] * y) >> 9)),
+                            vxy = vdupq_n_s16((int16_t)((bow[4] * y) >> 9));
+            const int16x8_t u = vmlaq_s16(vaddq_s16(ux, uy), uxy, x), v = vmlaq_s16(vaddq_s16(vx, vy), vxy, x);
+            const int16x8_t gx = vld1q_s16(g->gx + k), gy = vld1q_s16(g->gy + k);
+            const int16x8_t less = vaddq_s16(pf_mul_q15(vaddq_s16(gx, gx), u), pf_mul_q15(vaddq_s16(gy, gy), v));
+            vst1q_s16(g->t + k, vmaxq_s16(vminq_s16(vsubq_s16(vld1q_s16(g->t + k), less), most), least));
+        }
+    }
+}
+
 /* Whether every group of the window fits the tables of `warp_group` (16 columns, 4 rows) and these the image. */
 static int fits_tables(const pf_warp *w, int32_t window, int32_t groups)
 {
