@@ -119,8 +119,8 @@ def test_a_network_that_goes_away_and_a_host_that_is_killed_lose_nothing(crawl, 
 GPIO = {
     "gpio__lamp": "LAMP",
     "gpio__led": "LED",
-    "gpio__stop": "!ESTOP",
-    "gpio__limit_front": "FRONT",
+    "gpio__stop": "ESTOP",
+    "gpio__limit_front": "!FRONT",
     "gpio__encoder": "auto",
     "gpio__encoder_a": "ENC_A",
     "gpio__encoder_b": "ENC_B",
@@ -131,15 +131,15 @@ LINES = ("ENC_A", "ENC_B", "LAMP", "ESTOP", "FRONT", "LED")
 
 
 def make_lines(board) -> str:
-    """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed
-    switch to ground with the board's pull-up: open, or its wire broken, means stop."""
+    """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed switch
+    to ground: open, or its wire broken, it is high and means stop. The limit switch closes to ground."""
     chip = "/sys/kernel/config/gpio-sim/crawler"
     board.run("modprobe gpio-sim")
     names = "; ".join(f"mkdir {chip}/b/line{i}; echo {name} > {chip}/b/line{i}/name" for i, name in enumerate(LINES))
     board.run(f"mkdir {chip}; mkdir {chip}/b; echo {len(LINES)} > {chip}/b/num_lines; {names}; echo 1 > {chip}/live")
     name = board.run(f"echo $(cat {chip}/dev_name)/$(cat {chip}/b/chip_name)").strip()
     world = f"/sys/devices/platform/{name}"
-    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('ESTOP')}/pull")
+    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('FRONT')}/pull")
     return world
 
 
@@ -165,14 +165,14 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     encoder = f"--encoder {world}/sim_gpio0/pull {world}/sim_gpio1/pull /mnt/quarter.txt"
     process = survey.show(0, 45, RATE, "/dev/video0", encoder=encoder)
     survey.wait_until(frames(25), "25 frames")
-    pull("FRONT", "up")
+    pull("FRONT", "down")
     survey.wait_for("front limit switch pressed")
-    pull("ESTOP", "down")
+    pull("ESTOP", "up")
     start = time.monotonic()
     while level("LAMP") != "0":
         assert time.monotonic() - start < 5
     recovery = time.monotonic() - start
-    pull("ESTOP", "up")
+    pull("ESTOP", "down")
     board.wait(process)
     status = survey.board.status()
     assert status["gpio"]["stop"] and status["gpio"]["limit_front"], "latched, though the button is released"
@@ -205,8 +205,9 @@ FAULTS = (
 
 
 def plug_vivid(survey, first: int, count: int, rate: float) -> int:
-    """Plugs in a camera whose HDMI cable leads to what the world shows; the world's process. Its frames are 640 x 480; it
-    shrinks them for us. Its link appears when all is set, as udev's does."""
+    """Plugs in a camera whose HDMI cable leads to what the world shows; the world's process.
+
+    Its frames are 640 x 480; it shrinks them for us. Its link appears when all is set, as udev's does."""
     timings = "; ".join(f"v4l2-ctl -d{d} --set-dv-bt-timings=cvt,width=640,height=480,fps=60" for d in (0, 1))
     survey.board.run(f"{VIVID}; v4l2-ctl -d0 -c osd_text_mode=2; {timings}")
     world = survey.show(first, count, rate, "/dev/video1")
