@@ -77,7 +77,7 @@ class Result:
     duplicated: int = 0
     recovery_s: float | None = None
     boot_s: float | None = None
-    cpu: dict[str, float] = field(default_factory=dict)
+    stage_us: dict[str, float] = field(default_factory=dict)  # of the daemon, mean a frame, in the board's time
 
 
 class Crawl:
