@@ -4,6 +4,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <poll.h>
+#include <string.h>
 #include <sys/ioctl.h>
 #include <sys/mman.h>
 #include <time.h>
@@ -44,6 +45,19 @@ static void kernel_unmap(void *self, void *memory, size_t n)
     (void)munmap(memory, n);
 }
 
+static bool kernel_keep(void *self, void *memory, size_t n)
+{
+    (void)self;
+    void *copy = mmap(NULL, n, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (copy == MAP_FAILED)
+        return false;
+    memcpy(copy, memory, n);
+    if (mremap(copy, n, n, MREMAP_MAYMOVE | MREMAP_FIXED, memory) == memory)
+        return true;
+    (void)munmap(copy, n);
+    return false;
+}
+
 static int kernel_wait(void *self, int fd, uint32_t timeout_ms)
 {
     (void)self;
@@ -73,6 +87,7 @@ const pf_v4l2_io pf_v4l2_kernel = {.open = kernel_open,
                                    .ioctl = kernel_ioctl,
                                    .map = kernel_map,
                                    .unmap = kernel_unmap,
+                                   .keep = kernel_keep,
                                    .wait = kernel_wait,
                                    .now = kernel_now,
                                    .sleep = kernel_sleep};

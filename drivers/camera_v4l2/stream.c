@@ -102,10 +102,19 @@ void pf_v4l2_stream_end(pf_v4l2 *c)
         (void)c->io.ioctl(c->io.self, c->fd, VIDIOC_STREAMOFF, &c->type);
     c->is_streaming = false;
     c->live = NULL;
-    if (s != NULL) {
-        s->is_live = false;
-        drop_if_unused(c, s);
+    if (s == NULL)
+        return;
+    s->is_live = false;
+    for (uint32_t i = 0; i < s->n; i++) {
+        pf_v4l2_buffer *b = &s->buffer[i];
+        if (b->is_held) {
+            (void)c->io.keep(c->io.self, b->memory, b->size);
+        } else {
+            c->io.unmap(c->io.self, b->memory, b->size);
+            b->memory = NULL;
+        }
     }
+    drop_if_unused(c, s);
 }
 
 void pf_v4l2_stream_queue(pf_v4l2 *c)

@@ -18,6 +18,9 @@ typedef struct pf_v4l2_io {
     int (*ioctl)(void *self, int fd, unsigned long request, void *argument); /* not interrupted; -1 and errno */
     void *(*map)(void *self, int fd, size_t n, int64_t offset);              /* NULL and errno */
     void (*unmap)(void *self, void *memory, size_t n);
+    /* Puts memory of our own, with the same bytes, where a mapping was: as long as one is left the device counts as
+     * open, and a camera that is plugged in again gets another name. Readers of other threads notice nothing. */
+    bool (*keep)(void *self, void *memory, size_t n);
     int (*wait)(void *self, int fd, uint32_t timeout_ms); /* 1 a frame is there; 0 none; -1 the queue has failed */
     uint64_t (*now)(void *self);
     void (*sleep)(void *self, uint32_t ms);

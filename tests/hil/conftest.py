@@ -79,3 +79,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(
             f"{r.name:34}{r.frames_in:10}{r.keyframes_out:10}{r.lost:6}{r.duplicated:6}{recovery:>10}"
         )
+    boot = sorted(r.boot_s for r in RESULTS)[0]
+    stages = ", ".join(f"{name} {us / 1000:.1f}" for name, us in RESULTS[0].stage_us.items())
+    terminalreporter.write_line(f"quickest boot {boot:.1f} s; {RESULTS[0].name}, ms of the board's time: {stages}")

@@ -77,7 +77,7 @@ class Result:
     duplicated: int = 0
     recovery_s: float | None = None
     boot_s: float | None = None
-    cpu: dict[str, float] = field(default_factory=dict)
+    stage_us: dict[str, float] = field(default_factory=dict)  # of the daemon, mean a frame, in the board's time
 
 
 class Crawl:
@@ -224,8 +224,10 @@ class Crawl:
             daemon.kill()
         return Survey.open(folder / "replay.mcap")
 
-    def check(self, survey: Survey, result: Result) -> Result:
-        """Nothing lost, nothing twice, every frame whole; tracks and pictures as in the replay, bit for bit."""
+    def check(self, survey: Survey, result: Result, with_noise: bool = False) -> Result:
+        """Nothing lost, nothing twice, every frame whole; tracks and pictures as in the replay, bit for bit.
+
+        With `with_noise` the camera may have shown what nobody gave it; what came before that is compared."""
         assert survey.complete and not survey.lost, (survey.missing, survey.lost)
         assert [k.index for k in survey.keyframes] == list(range(len(survey.keyframes)))
         moments = Counter((k.boot, k.message.frame_sequence) for k in survey.keyframes)
@@ -234,13 +236,19 @@ class Crawl:
         boots = list(dict.fromkeys(s.time.boot_id for s in survey.starts))
         compared = 0
         for number, (path, rows) in enumerate(self.indices()):
-            strange = [row["sequence"] for row in rows if row["sha256"] not in self.recording.frames]
-            assert not strange, f"{path.name}: frames that nobody showed: {strange}"
             result.frames_in += len(rows)
+            strange = [i for i, row in enumerate(rows) if row["sha256"] not in self.recording.frames]
+            assert with_noise or not strange, f"{path.name}: frames that nobody showed: {strange[:20]}"
+            rows = rows[: strange[0]] if strange else rows
             if not rows:
                 continue
             boot = boots[int(path.stem.split("-")[1]) - 1]
-            got = {k.message.frame_sequence: k for k in survey.keyframes if k.boot == boot}
+            last = int(rows[-1]["sequence"])
+            got = {
+                k.message.frame_sequence: k
+                for k in survey.keyframes
+                if k.boot == boot and k.message.frame_sequence <= last
+            }
             expected = {k.message.frame_sequence: k for k in self.replay(rows, f"replay{number}").keyframes}
             # A restart without warning loses what had not reached the spool; what has must be as expected.
             ended = boot == survey.end.time.boot_id
@@ -251,7 +259,7 @@ class Crawl:
             for sequence, keyframe in got.items():
                 compare(keyframe, expected[sequence])
                 compared += 1
-        assert compared == len(survey.keyframes)
+        assert compared == len(survey.keyframes) or (with_noise and compared >= 5), compared
         assert result.duplicated == 0 and result.lost == 0, result
         return result
 

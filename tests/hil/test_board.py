@@ -34,9 +34,10 @@ def begin(crawl, **settings: str):
     return survey
 
 
-def end(survey, note, name: str, recovery_s: float | None = None) -> Result:
+def end(survey, note, name: str, recovery_s: float | None = None, with_noise: bool = False) -> Result:
+    row = Result(name, recovery_s=recovery_s, boot_s=survey.board.boot_s, stage_us=survey.board.status()["stage"])
     survey.stop_daemon()
-    result = survey.check(survey.finish(), Result(name, recovery_s=recovery_s, boot_s=survey.board.boot_s))
+    result = survey.check(survey.finish(), row, with_noise)
     note(result)
     return result
 
@@ -118,8 +119,8 @@ def test_a_network_that_goes_away_and_a_host_that_is_killed_lose_nothing(crawl, 
 GPIO = {
     "gpio__lamp": "LAMP",
     "gpio__led": "LED",
-    "gpio__stop": "!ESTOP",
-    "gpio__limit_front": "FRONT",
+    "gpio__stop": "ESTOP",
+    "gpio__limit_front": "!FRONT",
     "gpio__encoder": "auto",
     "gpio__encoder_a": "ENC_A",
     "gpio__encoder_b": "ENC_B",
@@ -130,15 +131,15 @@ LINES = ("ENC_A", "ENC_B", "LAMP", "ESTOP", "FRONT", "LED")
 
 
 def make_lines(board) -> str:
-    """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed
-    switch to ground with the board's pull-up: open, or its wire broken, means stop."""
+    """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed switch
+    to ground: open, or its wire broken, it is high and means stop. The limit switch closes to ground."""
     chip = "/sys/kernel/config/gpio-sim/crawler"
     board.run("modprobe gpio-sim")
     names = "; ".join(f"mkdir {chip}/b/line{i}; echo {name} > {chip}/b/line{i}/name" for i, name in enumerate(LINES))
     board.run(f"mkdir {chip}; mkdir {chip}/b; echo {len(LINES)} > {chip}/b/num_lines; {names}; echo 1 > {chip}/live")
     name = board.run(f"echo $(cat {chip}/dev_name)/$(cat {chip}/b/chip_name)").strip()
     world = f"/sys/devices/platform/{name}"
-    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('ESTOP')}/pull")
+    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('FRONT')}/pull")
     return world
 
 
@@ -164,14 +165,14 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     encoder = f"--encoder {world}/sim_gpio0/pull {world}/sim_gpio1/pull /mnt/quarter.txt"
     process = survey.show(0, 45, RATE, "/dev/video0", encoder=encoder)
     survey.wait_until(frames(25), "25 frames")
-    pull("FRONT", "up")
+    pull("FRONT", "down")
     survey.wait_for("front limit switch pressed")
-    pull("ESTOP", "down")
+    pull("ESTOP", "up")
     start = time.monotonic()
     while level("LAMP") != "0":
         assert time.monotonic() - start < 5
     recovery = time.monotonic() - start
-    pull("ESTOP", "up")
+    pull("ESTOP", "down")
     board.wait(process)
     status = survey.board.status()
     assert status["gpio"]["stop"] and status["gpio"]["limit_front"], "latched, though the button is released"
@@ -189,3 +190,53 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     assert "emergency_stop" not in received.keyframes[0].telemetry
     assert received.keyframes[0].telemetry["lamp"] == 1 and received.keyframes[-1].telemetry["lamp"] == 0
     assert result.keyframes_out > 10
+
+
+VIVID = "modprobe vivid n_devs=1 node_types=0x101 num_inputs=1 input_types=0x3 num_outputs=1 output_types=0x1"
+# A fatal error ends the output too, so that the camera sees noise from then on.
+FAULTS = (
+    "inject_v4l2_buf_flag_error",
+    "inject_vidioc_qbuf_error",
+    "percentage_of_dropped_buffers",
+    "inject_fatal_streaming_error",
+    "inject_vidioc_streamon_error inject_fatal_streaming_error",
+    "inject_vidioc_reqbufs_error inject_vidioc_streamon_error inject_fatal_streaming_error",
+)
+
+
+def plug_vivid(survey, first: int, count: int, rate: float) -> int:
+    """Plugs in a camera whose HDMI cable leads to what the world shows; the world's process.
+
+    Its frames are 640 x 480; it shrinks them for us. Its link appears when all is set, as udev's does."""
+    timings = "; ".join(f"v4l2-ctl -d{d} --set-dv-bt-timings=cvt,width=640,height=480,fps=60" for d in (0, 1))
+    survey.board.run(f"{VIVID}; v4l2-ctl -d0 -c osd_text_mode=2; {timings}")
+    world = survey.show(first, count, rate, "/dev/video1")
+    survey.board.run("sleep 1.5; v4l2-ctl -d0 -c loop_video=1; sleep 0.5; ln -s /dev/video0 /run/camera")
+    return world
+
+
+def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
+    camera = {"camera__device": "/run/camera", "camera__buffers": "6", "camera__exposure": "device"}
+    survey = crawl(**{**SERIAL, **SIZE, **camera}, tracker__reset_gap="100000", status__interval_ms="100")
+    board = survey.board
+    world = plug_vivid(survey, 0, 35, 1)
+    survey.start_receiver(usb(survey))
+    survey.start_daemon()
+    survey.wait_for("begins")
+    survey.wait_until(frames(10), "10 frames")
+    for fault in FAULTS:
+        before = board.status()["frames"]
+        board.run("; ".join(f"v4l2-ctl -d0 -c {name}=1" for name in fault.split()))
+        survey.wait_until(frames(before + 5), f"frames after {fault}", 20)
+    board.run("rm /run/camera; v4l2-ctl -d0 -c disconnect=1")
+    survey.wait_for("no camera")
+    board.run(f"kill {world}", check=False)
+    # The module can go only if nothing of the daemon's keeps the old camera open, held frames neither.
+    board.run("i=0; until rmmod vivid; do sleep 0.1; i=$((i+1)); [ $i -lt 50 ] || exit 1; done")
+    before = board.status()["frames"]
+    world = plug_vivid(survey, 35, 6, 1)
+    recovery = survey.wait_until(frames(before + 1), "frames again")
+    board.wait(world)
+    status = board.status()
+    assert status["camera"]["damaged"] >= 1 and status["camera"]["restarts"] >= 1 and status["camera"]["reopens"] >= 1
+    end(survey, note, "camera faults, unplugged", recovery, with_noise=True)

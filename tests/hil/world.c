@@ -24,7 +24,7 @@
 
 typedef struct world {
     FILE *y4m;
-    uint32_t width, height, fourcc, stride;
+    uint32_t width, height, fourcc, stride, scale;
     size_t size, at; /* of a shown frame; of the first frame in the file */
     uint8_t *grey;
     int fd;
@@ -78,17 +78,18 @@ static void read_frame(world *w, uint32_t i)
 static void fill(const world *w, uint8_t *to)
 {
     memset(to, 128, w->size);
-    for (uint32_t y = 0; y < w->height; y++) {
-        const uint8_t *from = w->grey + (size_t)y * w->width;
+    for (uint32_t y = 0; y < w->height * w->scale; y++) {
+        const uint8_t *from = w->grey + (size_t)(y / w->scale) * w->width;
         uint8_t *row = to + (size_t)y * w->stride;
-        for (uint32_t x = 0; x < w->width; x++) {
+        for (uint32_t x = 0; x < w->width * w->scale; x++) {
+            const uint8_t v = from[w->scale == 2 ? x / 4 * 2 + x % 2 : x];
             if (w->fourcc == V4L2_PIX_FMT_YUYV) {
-                row[2 * x] = from[x];
+                row[2 * x] = v;
             } else if (w->fourcc == V4L2_PIX_FMT_Y10) { /* the low two bits are what a tracker of bytes must not see */
-                row[2 * x] = (uint8_t)(from[x] << 2 | (x & 3));
-                row[2 * x + 1] = from[x] >> 6;
+                row[2 * x] = (uint8_t)(v << 2 | (x & 3));
+                row[2 * x + 1] = v >> 6;
             } else {
-                row[x] = from[x];
+                row[x] = v;
             }
         }
     }
@@ -101,21 +102,24 @@ static void open_video(world *w, const char *device, const char *format)
     w->fd = open(device, O_RDWR);
     if (w->fd < 0 || ioctl(w->fd, VIDIOC_G_FMT, &f) != 0)
         fail(device);
-    f.fmt.pix.width = w->width;
-    f.fmt.pix.height = w->height;
+    struct v4l2_capability cap;
+    if (ioctl(w->fd, VIDIOC_QUERYCAP, &cap) != 0)
+        fail("QUERYCAP");
+    /* vivid's HDMI is twice as large, and its capturing side shrinks what comes by leaving out pairs of pixels. */
+    w->has_buffers = strcmp((const char *)cap.driver, "vivid") == 0;
+    w->scale = w->has_buffers ? 2 : 1;
+    f.fmt.pix.width = w->width * w->scale;
+    f.fmt.pix.height = w->height * w->scale;
     f.fmt.pix.pixelformat = w->fourcc;
     f.fmt.pix.field = V4L2_FIELD_NONE;
     f.fmt.pix.bytesperline = f.fmt.pix.sizeimage = 0;
-    if (ioctl(w->fd, VIDIOC_S_FMT, &f) != 0 || f.fmt.pix.width != w->width || f.fmt.pix.pixelformat != w->fourcc) {
+    if (ioctl(w->fd, VIDIOC_S_FMT, &f) != 0 || f.fmt.pix.width != w->width * w->scale ||
+        f.fmt.pix.pixelformat != w->fourcc) {
         errno = EINVAL;
         fail("the format cannot be set");
     }
     w->stride = f.fmt.pix.bytesperline;
     w->size = f.fmt.pix.sizeimage;
-    struct v4l2_capability cap;
-    if (ioctl(w->fd, VIDIOC_QUERYCAP, &cap) != 0)
-        fail("QUERYCAP");
-    w->has_buffers = strcmp((const char *)cap.driver, "vivid") == 0;
     if (!w->has_buffers) {
         w->buffer[0] = malloc(w->size);
         return;

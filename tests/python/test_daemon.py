@@ -108,6 +108,47 @@ def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_p
     assert "absent.y4m" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [
+        (
+            ["camera.driver=v4l2", "camera.device=/dev/null", "camera.width=320", "camera.height=240"],
+            "/dev/null: not a v",
+        ),
+        (["camera.driver=v4l2", "camera.device=/dev/absent"], "/dev/absent: No such file"),
+        (["camera.driver=v4l2", "camera.format=RGB3"], "format RGB3 is not read"),
+        (["camera.width=320"], "camera.width and camera.height: both or neither"),
+        (["gpio.lamp=NO_SUCH_LINE"], "no line is named NO_SUCH_LINE"),
+        (["gpio.stop=gpiochip7:x"], "gpiochip7:x: must be a line's name, or chip:number"),
+        (["gpio.lamp=/sys/class/leds/absent"], "/sys/class/leds/absent/"),
+        (["gpio.encoder=lines"], "gpio.encoder: its lines are not named"),
+        (["gpio.encoder=/etc/hostname"], "/etc/hostname: not a counter's value"),
+        (["camera.index=/absent/folder"], "camera.index: /absent/folder/"),
+    ],
+)
+def test_a_device_that_is_not_there_is_named(crawler: Crawler, settings: list[str], what: str):
+    done = run("--config", crawler.config, *(word for s in settings for word in ("--set", s)))
+    assert done.returncode == 1
+    assert what in done.stderr, done.stderr
+
+
+def test_the_frame_index_replays_to_the_same_keyframes(tmp_path: Path, crawler: Crawler):
+    write_recording(tmp_path / "survey.y4m", 40, skip=(7, 8, 30))
+    (tmp_path / "index").mkdir()
+    store = Store(crawler.port)
+    crawler.start("--set", f"camera.index={tmp_path}/index")
+    assert receive_all(crawler, store) == 0
+    [index] = (tmp_path / "index").iterdir()
+    assert index.name == f"{store.starts[0].survey_id.hex()[:8]}-001.csv"
+    (tmp_path / "survey.csv").write_text(index.read_text())
+    again = Store(crawler.port)
+    crawler.start()
+    assert receive_all(crawler, again) == 0
+    assert [k.observations for k in again.keyframes] == [k.observations for k in store.keyframes]
+    assert [k.frame_sequence for k in again.keyframes] == [k.frame_sequence for k in store.keyframes]
+    assert [k.telemetry.roll_rad for k in again.keyframes] == [k.telemetry.roll_rad for k in store.keyframes]
+
+
 # ---- one survey
 
 

@@ -166,7 +166,8 @@ static void test_config_refuses_bad_values(void)
     check_refused("[survey]\nname = \xC3(", "not UTF-8");
     check_refused("[link]\nport = 1\n[link]\nport = 1", "f:4: link.port is set a second time; the first is in line 2");
     check_refused("[link]\nprot = 1", "unknown key prot in [link]; it has: transport device");
-    check_refused("[lnk]\nport = 1", "unknown section [lnk]; there are: survey camera tracker keyframe encoder gpio link");
+    check_refused("[lnk]\nport = 1",
+                  "unknown section [lnk]; there are: survey camera tracker keyframe encoder gpio link");
 }
 
 static void test_config_override_wins_and_settings_are_checked_together(void)

@@ -401,30 +401,33 @@ static void test_sha256_is_verified(void)
 
 /* ---- pace, and who holds what ---- */
 
-/* Proves: two frames can be held while both stay intact, a third is refused, and nothing comes before start. */
-static void test_two_frames_are_held(void)
+/* Proves: three frames can be held while all stay intact, a fourth is refused, and nothing comes before start. */
+static void test_three_frames_are_held(void)
 {
-    pf_frame a, b, c;
+    pf_frame a, b, c, d;
     pf_replay_config config = {
-        .path = write_y4m("b.y4m", "YUV4MPEG2 W6 H4 F10:1 Cmono", 4), .speed = PF_REPLAY_FAST, .loops = 1};
+        .path = write_y4m("b.y4m", "YUV4MPEG2 W6 H4 F10:1 Cmono", 5), .speed = PF_REPLAY_FAST, .loops = 1};
     TEST_ASSERT_EQUAL_INT(PF_OK, open_replay(&config));
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, camera.ops->next(camera.self, 0, &a));
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->start(camera.self));
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->next(camera.self, 0, &a));
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->next(camera.self, 0, &b));
+    TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->next(camera.self, 0, &d));
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, camera.ops->next(camera.self, 0, &c));
     check_pixels(&a, 0);
     check_pixels(&b, 1);
+    check_pixels(&d, 2);
     camera.ops->release(camera.self, &a);
+    camera.ops->release(camera.self, &d);
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->next(camera.self, 0, &c));
     check_pixels(&b, 1);
-    check_pixels(&c, 2);
+    check_pixels(&c, 3);
     /* stopped and started again, it goes on */
     camera.ops->release(camera.self, &b);
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->stop(camera.self));
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, camera.ops->next(camera.self, 0, &a));
     TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->start(camera.self));
-    expect_frame(3, 3, 300000000);
+    expect_frame(4, 4, 400000000);
 }
 
 static uint64_t now_ns(void)
@@ -524,7 +527,7 @@ static void test_gpio_none(void)
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_gpio_none_open(&gpio));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->set_lamp(gpio.self, 0.5));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->lamp(gpio.self, &level));
-    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->encoder(gpio.self, &count, &missed));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->encoder(gpio.self, 0, &count, &missed));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->stopped(gpio.self, &is_stopped));
     gpio.ops->close(gpio.self);
 }
@@ -542,7 +545,7 @@ int main(void)
     RUN_TEST(test_endless_loop);
     RUN_TEST(test_csv_must_match);
     RUN_TEST(test_sha256_is_verified);
-    RUN_TEST(test_two_frames_are_held);
+    RUN_TEST(test_three_frames_are_held);
     RUN_TEST(test_recorded_speed_skips_what_is_late);
     RUN_TEST(test_recorded_speed_keeps_the_newest);
     RUN_TEST(test_times_are_mapped_to_the_start);

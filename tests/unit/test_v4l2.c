@@ -26,7 +26,7 @@ static struct {
     uint32_t done[SLOTS], n_done, flags[SLOTS], numbers[SLOTS], damaged_next;
     uint64_t stamps[SLOTS];
     uint8_t memory[MAPS][BYTES]; /* a fresh one for each mapping: what is unmapped is never seen again */
-    bool is_mapped[MAPS];
+    bool is_mapped[MAPS], is_kept[MAPS];
     uint32_t n_maps, base;
     int calls, fail_at, fail_with; /* the call number that fails; 0 = none */
 } k;
@@ -63,6 +63,8 @@ static void stop(void)
 static void fake_close(void *self, int fd)
 {
     (void)self;
+    for (uint32_t i = 0; i < MAPS; i++)
+        TEST_ASSERT_FALSE_MESSAGE(k.is_mapped[i] && !k.is_kept[i], "closed, but a mapping keeps it open");
     TEST_ASSERT_EQUAL_INT(5, fd);
     k.is_open = false;
     stop();
@@ -198,6 +200,15 @@ static void fake_unmap(void *self, void *memory, size_t n)
     memset(memory, 0xDD, n);
 }
 
+static bool fake_keep(void *self, void *memory, size_t n)
+{
+    (void)self;
+    const size_t i = (size_t)((uint8_t *)memory - k.memory[0]) / BYTES;
+    TEST_ASSERT_TRUE(n == BYTES && i < MAPS && k.is_mapped[i]);
+    k.is_kept[i] = true;
+    return true;
+}
+
 /* Fills the queued buffers whose time has come. */
 static void run_camera(uint64_t until)
 {
@@ -254,6 +265,7 @@ static const pf_v4l2_io io = {.open = fake_open,
                               .ioctl = fake_ioctl,
                               .map = fake_map,
                               .unmap = fake_unmap,
+                              .keep = fake_keep,
                               .wait = fake_wait,
                               .now = fake_now,
                               .sleep = fake_sleep};
