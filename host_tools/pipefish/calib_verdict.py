@@ -8,6 +8,7 @@ from typing import Any
 SHARE = 0.005  # of the diameter: what profiler requirements of road agencies allow (MoDOT TM-84)
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _STUDENT = 2.776  # the same of a standard deviation from the five parts of a jackknife
+_UNSEEN = 0.001  # of the diameter: what all views share, as a pupil that moves otherwise than the model's (docs)
 _NARROW = math.radians(60)  # below, the wall is seen only far ahead
 _SEEN = 0.6  # of the cells of the picture
 _OVERFIT = 1.15  # held out against fitted
@@ -30,6 +31,7 @@ def verdict(
         bound = _TWO_SIDED * pipe["sigma_mm"]
         if math.isfinite(pipe.get("spread_mm", math.nan)):
             bound = max(bound, _STUDENT * pipe["spread_mm"])
+        bound = math.hypot(bound, _UNSEEN * pipe["dn_mm"])
         known = math.isfinite(bound)
         pipes.append(
             {

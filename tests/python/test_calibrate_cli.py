@@ -204,7 +204,9 @@ def test_the_verdict_follows_the_bounds_and_says_why():
     report = {"cameras": [camera], "views": views, "rms_px": 0.2}
     found = verdict(report, 0.3, math.radians(50))
     assert found["usable"] and (found["dn_from"], found["dn_to"]) == (300, 300)
-    assert found["systematic_mm"] == pytest.approx(2.776 * 0.4)  # the jackknife's, Student's t of four degrees
+    assert found["systematic_mm"] == pytest.approx(
+        math.hypot(2.776 * 0.4, 0.3)
+    )  # the jackknife's, Student's t of four degrees
     said = " ".join(found["cautions"])
     for words in (
         "fit worse",
