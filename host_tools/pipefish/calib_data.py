@@ -13,6 +13,8 @@ from .errors import ArgumentError, PipefishError
 
 Array = npt.NDArray[np.float64]
 
+_SMALLEST_M, _LARGEST_M = 1e-3, 50.0  # of what is seen of a board: beyond, the unit is not the metre
+
 
 class CalibrationError(PipefishError):
     """Views that no calibration can come from; the message says which and why."""
@@ -250,6 +252,11 @@ def check_views(views: Sequence[View], sizes: Sequence[tuple[int, int]]) -> None
             raise CalibrationError(
                 f"{label}: {outside.sum()} points lie outside the image of {width} x {height}: another camera's image, "
                 "or image_size is wrong"
+            )
+        extent = float(np.ptp(view.board_xyz, axis=0).max())
+        if not _SMALLEST_M <= extent <= _LARGEST_M:
+            raise CalibrationError(
+                f"{label}: its points of the board lie within {extent:.3g} m: coordinates must be metres"
             )
         if len({p.tobytes() for p in view.board_xyz}) < len(view.board_xyz):
             raise CalibrationError(f"{label}: a point of the board is given twice")

@@ -79,6 +79,8 @@ def load_target(path: Path) -> Target3D:
         if not len(points):
             raise FormatError(path, None, "no points: lines of six values")
         return Target3D(path.stem, points, 0.0, None)
+    if path.suffix.lower() == ".pdf":
+        raise FormatError(path, None, "is the sheet to print; the target is the .json that lies beside it")
     target = Target.load(path)
     return Target3D(path.stem, target.points(), target.radius_m if target.has_circles else 0.0, target)
 

@@ -136,8 +136,8 @@ def _verdict(v: dict[str, Any], name: str) -> str:
         f"<ul class='why'>{points(v['cautions'], 'caution')}{points(v['reasons'], 'plus')}</ul></section>"
         f"<section class='card'><h3>What the calibration alone puts a diameter off by</h3>{table}"
         "<p class='note'>Mean diameter from wall points seen near 30 and near 80 degrees off the axis, or as far as "
-        f"the target was seen; {100 * v['allowed_share']:g} % is allowed. Tracking and the crawler's motion come on "
-        "top.</p></section></div>"
+        f"the target was seen; {100 * v['allowed_share']:g} % is allowed. 0.1 % is in it for what no set of views "
+        "tells. Tracking and the crawler's motion come on top.</p></section></div>"
     )
 
 

@@ -15,6 +15,7 @@ from .camera import PARAMETERS, Camera
 from .errors import ProfileError
 
 DN = (100, 150, 200, 250, 300, 400, 500, 600, 800, 1000)  # millimetres: pipes that reports speak of
+JACKKNIFE = 5  # parts
 _AZIMUTHS = 24
 _NEAR, _FAR = math.radians(30), math.radians(80)  # a wall point is seen at both: the spec's pair
 
@@ -69,8 +70,7 @@ class Uncertainty:
         wall points seen at 30 and at 80 degrees (or as far as the camera was observed) along each azimuth."""
         assert self.camera is not None
         camera = self.camera
-        far = min(_FAR, (camera.theta_covered or camera.theta_max) * 0.98)
-        near = min(_NEAR, far * 0.4)
+        near, far = _angles_of_wall(camera)
         phi = 2 * math.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
         radius = dn_mm / 2000
         pixels, by_theta, reach = [], [], []
@@ -96,6 +96,31 @@ class Uncertainty:
             row.append(sign / math.sin(theta) ** 2 / base * to_theta.reshape(-1) / both.sum())
         weights = np.concatenate(row)
         return {"dn_mm": dn_mm, "sigma_mm": float(dn_mm * math.sqrt(max(weights @ joint @ weights, 0.0)))}
+
+
+def _angles_of_wall(camera: Camera) -> tuple[float, float]:
+    """Off the axis: where two points of the wall on one line along the pipe are seen."""
+    far = min(_FAR, (camera.theta_covered or camera.theta_max) * 0.98)
+    return min(_NEAR, far * 0.4), far
+
+
+def _diameter_by(other: Camera, camera: Camera, dn_mm: float) -> float:
+    """The mean diameter, millimetres, that `other` measures where `camera` sees a pipe of dn_mm; NaN out of sight."""
+    phi = 2 * math.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    slopes, starts, there = [], [], []
+    for theta in _angles_of_wall(camera):
+        wall = np.stack([np.cos(phi), np.sin(phi), np.full(len(phi), 1 / math.tan(theta))], axis=1) * dn_mm
+        pixels, seen = camera.project(wall / 2000)
+        seen &= camera.in_image(np.nan_to_num(pixels, nan=-1e9))
+        pixels = np.where(seen[:, None], pixels, 0.0)
+        rays, fine = other.unproject(pixels)
+        slopes.append(rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1]))
+        starts.append(other.origins(pixels)[:, 2])
+        there.append(wall[:, 2] / 2)
+        fine &= seen
+        slopes[-1] = np.where(fine, slopes[-1], np.nan)
+    radius = (there[0] - there[1] - 1e3 * (starts[0] - starts[1])) / (slopes[0] - slopes[1])
+    return float(2 * np.nanmean(radius)) if np.isfinite(radius).sum() >= 3 else math.nan
 
 
 def _cross(v: Array) -> Array:
@@ -299,6 +324,14 @@ def _bounded(fit: Fit, index: int) -> Any:
 
 def _variance(uncertainty: Uncertainty, profile: Any, pixels: Array, distance: Array, fit: Fit, index: int) -> float:
     """Variance of projections along an axis: the mean over both and over the pixels (N, 2), points at (N,) metres."""
+    uncertainty.camera = _camera_of(profile, fit, index)
+    if uncertainty.camera is None:
+        return math.nan
+    return float(np.nanmean(np.trace(uncertainty.covariances(pixels, distance), axis1=1, axis2=2) / 2))
+
+
+def _camera_of(profile: Any, fit: Fit, index: int) -> Camera | None:
+    """A fitted camera, as far out as it is proved one-to-one."""
     width, height = fit.data.size[index]
     keys = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1")
     arrays = ("asym_radial_theta", "asym_radial_phi", "asym_tangential_theta", "asym_tangential_phi", "cpoly")
@@ -306,13 +339,30 @@ def _variance(uncertainty: Uncertainty, profile: Any, pixels: Array, distance: A
     end = profile.theta_max
     for share in (1.0, 0.97, 0.94, 0.9, 0.8, 0.6):
         try:
-            uncertainty.camera = Camera(width=width, height=height, theta_max=end * share, **values)
-            break
+            return Camera(width=width, height=height, theta_max=end * share, **values)
         except ProfileError:  # not proved one-to-one
             continue
-    if uncertainty.camera is None:
-        return math.nan
-    return float(np.nanmean(np.trace(uncertainty.covariances(pixels, distance), axis1=1, axis2=2) / 2))
+    return None
+
+
+def diameter_spread(fit: Fit, cameras: list[Camera]) -> list[list[float]]:
+    """Standard deviations of pipes' mean diameters, millimetres, of each camera and each of DN, by how much they depend
+    on which views there are: the jackknife over five parts of the frames. It sees what the noise does not tell: a lens
+    or a target that is not what the model can be. [] for fewer than ten frames."""
+    frames = np.unique(fit.data.frame_of[fit.used_views()])
+    if len(frames) < 2 * JACKKNIFE:
+        return []
+    frame_of_point = fit.data.frame_of[fit.data.view_of]
+    found = np.full((len(cameras), len(DN), JACKKNIFE), np.nan)
+    for k in range(JACKKNIFE):
+        part = fit.copy()
+        part.used = fit.used & ~np.isin(frame_of_point, frames[k::JACKKNIFE])
+        part.fit(fit.model, iterations=40, tolerance=1e-8)
+        for c, camera in enumerate(cameras):
+            other = _camera_of(_bounded(part, c), part, c)
+            if other is not None:
+                found[c, :, k] = [_diameter_by(other, camera, dn) for dn in DN]
+    return (math.sqrt(JACKKNIFE - 1) * found.std(axis=2)).tolist()
 
 
 # ---------------------------------------------------------------------- the report
@@ -413,4 +463,7 @@ def describe(
     if table:
         for entry, halves in zip(report["cameras"], halves_difference(fit), strict=False):
             entry["halves"] = halves
+        for entry, spread in zip(report["cameras"], diameter_spread(fit, list(cameras.values())), strict=False):
+            for pipe, spread_mm in zip(entry["pipes"], spread, strict=True):
+                pipe["spread_mm"] = spread_mm
     return report

@@ -7,6 +7,8 @@ from typing import Any
 
 SHARE = 0.005  # of the diameter: what profiler requirements of road agencies allow (MoDOT TM-84)
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
+_STUDENT = 2.776  # the same of a standard deviation from the five parts of a jackknife
+_UNSEEN = 0.001  # of the diameter: what all views share, as a pupil that moves otherwise than the model's (docs)
 _NARROW = math.radians(60)  # below, the wall is seen only far ahead
 _SEEN = 0.6  # of the cells of the picture
 _OVERFIT = 1.15  # held out against fitted
@@ -24,10 +26,12 @@ def verdict(
     largest of these (95 %); pipes: one entry a diameter; reasons, cautions: sentences."""
     camera = report["cameras"][index]
     halves = camera.get("halves", {}).get("ratio")
-    model_error = max(1.0, halves) if halves and math.isfinite(halves) else 1.0
     pipes = []
     for pipe in camera["pipes"]:
-        bound = _TWO_SIDED * pipe["sigma_mm"] * model_error
+        bound = _TWO_SIDED * pipe["sigma_mm"]
+        if math.isfinite(pipe.get("spread_mm", math.nan)):
+            bound = max(bound, _STUDENT * pipe["spread_mm"])
+        bound = math.hypot(bound, _UNSEEN * pipe["dn_mm"])
         known = math.isfinite(bound)
         pipes.append(
             {
@@ -46,7 +50,6 @@ def verdict(
         "dn_to": good[-1]["dn_mm"] if good else None,
         "systematic_mm": max(p["systematic_mm"] for p in good) if good else None,
         "allowed_share": SHARE,
-        "model_error_factor": model_error,
         "pipes": pipes,
     }
     out["text"] = _text(out)
@@ -112,8 +115,7 @@ def _cautions(
         two = camera["halves"]
         said.append(
             f"calibrated from either half of the views the camera differs by {two['rms_px']:.2g} px, of which noise "
-            f"explains {two['expected_px']:.2g} px; the rest is in model, target or focus, and the bounds above hold "
-            f"it: they are {halves:.1f} times what noise alone gives"
+            f"explains {two['expected_px']:.2g} px; the rest is in lens, target or focus, and is in the bounds above"
         )
     if covered < _NARROW:
         said.append(

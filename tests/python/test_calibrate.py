@@ -265,6 +265,8 @@ def test_what_cannot_be_calibrated_is_refused_with_what_is_wrong() -> None:
     assert "too few" in refusal(views[:2])
     assert "outside the image" in refusal(views, size=(640, 400))
     assert "differ in board or camera" in refusal([*views, View(views[0].board_xyz, views[0].pixels, name="0")])
+    for unit in (1e3, 1e-9):
+        assert "must be metres" in refusal([View(v.board_xyz * unit, v.pixels) for v in views])
     random = np.random.default_rng(1)
     pose = poses[0]
     pixels, seen = LENS.project(board() @ pose[:, :3].T + pose[:, 3])

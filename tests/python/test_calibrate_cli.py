@@ -188,21 +188,34 @@ def test_two_cameras_of_a_rig_get_a_profile_each_and_their_place(tmp_path, targe
 
 
 def test_the_verdict_follows_the_bounds_and_says_why():
-    pipes = [{"dn_mm": 100, "sigma_mm": 0.5}, {"dn_mm": 300, "sigma_mm": 0.4}, {"dn_mm": 500, "sigma_mm": math.nan}]
+    pipes = [
+        {"dn_mm": 100, "sigma_mm": 0.5},
+        {"dn_mm": 300, "sigma_mm": 0.1, "spread_mm": 0.4},
+        {"dn_mm": 500, "sigma_mm": math.nan},
+    ]
     camera = {
         "camera": 0,
         "pipes": pipes,
         "coverage": {"share_covered": 0.4, "advice": "next view: there"},
         "uncertainty": {"distance_m": 1.0},
-        "halves": {"ratio": 1.5},
+        "halves": {"ratio": 2.0, "rms_px": 0.04, "expected_px": 0.02},
     }
     views = [{"used": True, "camera": 0, "points": 100}, {"used": False, "camera": 0, "points": 0}]
     report = {"cameras": [camera], "views": views, "rms_px": 0.2}
     found = verdict(report, 0.3, math.radians(50))
     assert found["usable"] and (found["dn_from"], found["dn_to"]) == (300, 300)
-    assert found["systematic_mm"] == pytest.approx(1.96 * 0.4 * 1.5)
+    assert found["systematic_mm"] == pytest.approx(
+        math.hypot(2.776 * 0.4, 0.3)
+    )  # the jackknife's, Student's t of four degrees
     said = " ".join(found["cautions"])
-    for words in ("fit worse", "50 degrees off the axis only", "only 40 % of the picture", "stood 1 m away", "1 of 2"):
+    for words in (
+        "fit worse",
+        "50 degrees off the axis only",
+        "only 40 % of the picture",
+        "stood 1 m away",
+        "1 of 2",
+        "0.04 px",
+    ):
         assert words in said
     camera["pipes"] = [{"dn_mm": 300, "sigma_mm": 2.0}]
     worse = verdict(report, 0.2, math.radians(90))
