@@ -28,11 +28,13 @@ BIN_LEAST = 100  # observations, for a bin to be judged
 SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
 DISAGREE_SIGMA = 3.0
-# A tracker's stated covariance is that of one step's noise. Its errors along a track are a walk: in a simulated
-# concrete pipe 0.07 px after five camera frames, 0.17 after twenty, 0.37 after thirty, with a share that all tracks
-# have in common. A common 0.03 px a keyframe is a drift of the diameter of 10 % in 6 m where the stated 0.05 px
-# outvotes the encoder. Scatter of the diameter along that pipe by what is added: 0.3 px 1.2 %, 0.5 px 0.7 %,
-# 0.8 px 0.4 %, 1.2 px 0.25 %; then the encoder's own noise in short stretches takes over.
+# A tracker's stated covariance is that of noise. Its errors grow along a track, in part alike for all: in a
+# simulated concrete pipe 0.06 px after five camera frames, 0.16 after twenty, 0.33 after thirty, and from 45 degrees
+# to 75 by 0.045 px inwards in the median (the shading of relief: docs/tracker.md). A common 0.03 px a keyframe is a
+# drift of the diameter of 10 % in 6 m where the stated 0.05 px outvotes the encoder. Scatter of the diameter along
+# that pipe by what is added: 0.25 px 0.66 %, 0.5 px 0.32 %, 1 px 0.16 %, 1.5 px 0.15 %, then ovality suffers; without
+# the common part 0.5 px 0.18 %, 1 px 0.11 %; of true places with noise of 0.05 px 0.1 px 0.49 %, 0.5 px 0.14 %, 1 px
+# 0.06 %: the encoder there is better than it says.
 TRACK_FLOOR_PX = 1.0
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
