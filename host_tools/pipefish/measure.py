@@ -32,9 +32,9 @@ DISAGREE_SIGMA = 3.0
 # simulated concrete pipe 0.06 px after five camera frames, 0.16 after twenty, 0.33 after thirty, and from 45 degrees
 # to 75 by 0.045 px inwards in the median (the shading of relief: docs/tracker.md). A common 0.03 px a keyframe is a
 # drift of the diameter of 10 % in 6 m where the stated 0.05 px outvotes the encoder. Scatter of the diameter along
-# that pipe by what is added: 0.25 px 0.66 %, 0.5 px 0.32 %, 1 px 0.16 %, 1.5 px 0.15 %, then ovality suffers; without
-# the common part 0.5 px 0.18 %, 1 px 0.11 %; of true places with noise of 0.05 px 0.1 px 0.49 %, 0.5 px 0.14 %, 1 px
-# 0.06 %: the encoder there is better than it says.
+# that pipe by what is added: 0.5 px 0.35 %, 1 px 0.17 % (0.70 and 0.30 % when templates did not bend with the wall);
+# without the common part 0.18 and 0.11 %; of true places with noise of 0.05 px 0.14 and 0.06 %, and 0.49 % with
+# 0.1 px: the encoder there is better than it says. Beyond 1 px ovality suffers.
 TRACK_FLOOR_PX = 1.0
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
