@@ -11,8 +11,9 @@
  * lost ones. */
 #define FAINT 12583
 
-/* Nor does one of whose window more than a fortieth is clipped: it stands at the edge of the glare, which goes with the
- * camera. On PVC two thirds of what was lost to the glare had begun there. */
+/* Nor, in a tube (with a lens), does one of whose window more than a fortieth is clipped: it stands at the edge of the
+ * glare, which goes with the camera. On PVC two thirds of what was lost to the glare had begun there. Elsewhere,
+ * clipped corners are as good as others. */
 #define GLARE 40u
 
 static bool weaker(const pf_corner *a, const pf_corner *b)
@@ -105,7 +106,8 @@ static int32_t bin_of(const pf_tracker *t, pf_point_q16 at)
 static bool has_room(const pf_tracker *t, pf_point_q16 at)
 {
     const uint32_t most = (3u * t->config.max_tracks + 2u * SECTORS * RINGS - 1u) / (2u * SECTORS * RINGS);
-    if (GLARE * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
+    const uint32_t part = t->config.lens.ray ? GLARE : CLIPPED;
+    if (part * pf_mask_clipped(t, &t->pyramid[t->now].level[0], at) > t->config.window * t->config.window)
         return false;
     if (!t->config.polar)
         return true;

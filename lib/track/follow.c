@@ -23,12 +23,12 @@
 #define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
 #define NEIGHBOURS   3
 /* Sums of both variances, px^2 Q20. Beyond 0.4 px a track is no longer known well enough that this is the point first
- * seen. Beyond 0.22 px it is lost where that is 8 times what it was at first sight: its marks have faded, been drawn
+ * seen. Beyond 0.25 px it is lost where that is 8 times what it was at first sight: its marks have faded, been drawn
  * out, or no longer explain what is seen; with relief in a light that moves errors are then several times what is
  * stated. The ratio tells wrong places from right ones better than the deviation itself: the strongest marks of brick,
  * and beads of water on clay, are relief. */
 #define VAGUE       167772u
-#define WORN        50332u
+#define WORN        65536u
 #define WORSE       8u
 #define CLIP_CHANGE 20u /* a twentieth of the window: with it the worst is at 5 sigma */
 

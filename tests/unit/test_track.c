@@ -444,12 +444,12 @@ static void test_faint_marks_make_no_tracks(void)
     TEST_ASSERT_GREATER_THAN_UINT32(8, n);
 }
 
-/* Proves: what fades is given up once it is known with 8 times the variance of its first sight and 0.22 px, and not
- * before; what is still known to 0.22 px is kept. */
+/* Proves: what fades is given up once it is known with 8 times the variance of its first sight and 0.25 px, and not
+ * before; what is still known to 0.25 px is kept. */
 static void test_tracks_that_fade_are_given_up(void)
 {
     static double first[400];
-    pf_tracker *t = start(&(pf_tracker_config){.noise_q8 = 650, .min_eigen = 1});
+    pf_tracker *t = start(&(pf_tracker_config){.noise_q8 = 3 << 8, .min_eigen = 1});
     uint32_t n, given_up = 0;
     for (int k = 0; k < 8; k++) {
         motion faded = still;
@@ -463,7 +463,7 @@ static void test_tracks_that_fade_are_given_up(void)
             TEST_ASSERT_TRUE(track[i].id < 400);
             if (track[i].status == PF_TRACK_NEW)
                 first[track[i].id] = now;
-            const bool is_worn = now > 0.22 * 0.22 && now > 8 * first[track[i].id];
+            const bool is_worn = now > 0.25 * 0.25 && now > 8 * first[track[i].id];
             if (track[i].status == PF_TRACK_TRACKED)
                 TEST_ASSERT_FALSE(is_worn);
             if (track[i].status == PF_TRACK_LOST && is_worn) {

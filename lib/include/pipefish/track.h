@@ -88,7 +88,8 @@ typedef struct pf_tracker_config {
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
     pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
-                         * warp alone leaves 0.02 px a fifth of growth, the same way for all [none] */
+                         * warp alone leaves 0.02 px a fifth of growth, the same way for all; and no track begins at
+                         * the edge of the glare [none] */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
                  * in each, none in its inner eighth (no parallax there); needs a circle */
 } pf_tracker_config;
