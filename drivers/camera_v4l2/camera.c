@@ -110,11 +110,12 @@ static pf_status convert(pf_v4l2 *c, const pf_v4l2_buffer *b, size_t n, pf_v4l2_
     return PF_OK;
 }
 
-/* Moment of the kernel's stamp that is the middle of the exposure, as far as the driver tells; 0 = it has none. */
+/* Moment of the kernel's stamp, of whatever clock (the numbering believes it only if it can be of ours), that is the
+ * middle of the exposure, as far as the driver tells; 0 = it has none. */
 static uint64_t stamp_of(const pf_v4l2 *c, const struct v4l2_buffer *b)
 {
     uint64_t half = 0, stamp = (uint64_t)b->timestamp.tv_sec * 1000000000u + (uint64_t)b->timestamp.tv_usec * 1000u;
-    if ((b->flags & V4L2_BUF_FLAG_TIMESTAMP_MASK) != V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC || b->timestamp.tv_sec < 0)
+    if (b->timestamp.tv_sec < 0)
         return 0;
     if (c->time_control.is_there && c->time_unit_us > 0)
         half = (uint64_t)((double)c->exposure.time_now * c->time_unit_us * 500);

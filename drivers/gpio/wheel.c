@@ -200,6 +200,7 @@ pf_status pf_wheel_open(pf_wheel *w, const pf_gpio_config *c, pf_failure *failur
     w->fd = -1;
     if (!is_set(c->encoder))
         return PF_OK;
+    pf_history_add(&w->history, 0, 0); /* of frames that were exposed before the first edge */
     name_it(w, c->encoder);
     if (strcmp(c->encoder, "auto") == 0)
         return open_auto(w, c, failure);

@@ -109,7 +109,7 @@ class Board:
         self.disk = folder / "disk.img"
         with self.disk.open("wb") as disk:
             disk.truncate(DISK_BYTES)
-        subprocess.run(["mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1", self.disk], check=True)
+        subprocess.run(["/sbin/mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1", self.disk], check=True)
         self.initramfs = folder / "initramfs"
         archive = ["cpio", "-o", "-H", "newc", "--quiet", "-R", "0:0"]
         init = subprocess.run(

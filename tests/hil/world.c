@@ -1,13 +1,15 @@
 /* The world of the emulated board: shows recorded frames to a V4L2 camera and turns its wheel encoder with them.
  *
- *   pipefish-world FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT [--encoder PULL_A PULL_B COUNTS.txt]
+ *   pipefish-world FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT [--encoder PULL_A PULL_B COUNTS.txt | --rotary COUNTS.txt]
  *
  * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
  * capturing side's differ). FORMAT: GREY, YUYV, NV12 or Y10. COUNTS.txt has the encoder's count at each frame, one a
- * line; PULL_A and PULL_B are gpio-sim's files. Frame i is shown when the encoder has reached its count.
+ * line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
+ * Frame i is shown when the encoder has reached its count.
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/uinput.h>
 #include <linux/videodev2.h>
 #include <stdbool.h>
 #include <stdint.h>
@@ -32,7 +34,7 @@ typedef struct world {
     uint8_t *buffer[BUFFERS];
     uint32_t filled;
     /* encoder */
-    int pull[2];
+    int pull[2], rotary; /* rotary: uinput, 0 = none */
     int64_t *counts, count;
     uint32_t n_counts;
 } world;
@@ -160,17 +162,30 @@ static void show(world *w)
     w->is_streaming = true;
 }
 
-static void open_encoder(world *w, char **argument)
+static void open_pulls(world *w, char **paths)
 {
-    FILE *in = fopen(argument[3], "r");
-    long long count;
     for (int i = 0; i < 2; i++) {
-        w->pull[i] = open(argument[1 + i], O_WRONLY);
+        w->pull[i] = open(paths[i], O_WRONLY);
         if (w->pull[i] < 0)
-            fail(argument[1 + i]);
+            fail(paths[i]);
     }
+}
+
+static void open_rotary(world *w)
+{
+    struct uinput_setup setup = {.name = "rotary@0"};
+    w->rotary = open("/dev/uinput", O_WRONLY);
+    if (w->rotary < 0 || ioctl(w->rotary, UI_SET_EVBIT, EV_REL) != 0 || ioctl(w->rotary, UI_SET_RELBIT, REL_X) != 0 ||
+        ioctl(w->rotary, UI_DEV_SETUP, &setup) != 0 || ioctl(w->rotary, UI_DEV_CREATE) != 0)
+        fail("/dev/uinput");
+}
+
+static void open_counts(world *w, const char *path)
+{
+    FILE *in = fopen(path, "r");
+    long long count;
     if (in == NULL)
-        fail(argument[3]);
+        fail(path);
     w->counts = calloc(100000, sizeof *w->counts);
     while (w->n_counts < 100000 && fscanf(in, "%lld", &count) == 1)
         w->counts[w->n_counts++] = count;
@@ -180,6 +195,13 @@ static void open_encoder(world *w, char **argument)
 /* One quarter of a period: A leads B when the wheel turns forwards. */
 static void turn(world *w, int way)
 {
+    if (w->rotary > 0) {
+        struct input_event e[2] = {{.type = EV_REL, .code = REL_X, .value = way}, {.type = EV_SYN, .code = SYN_REPORT}};
+        w->count += way;
+        if (write(w->rotary, e, sizeof e) != (ssize_t)sizeof e)
+            fail("rotary");
+        return;
+    }
     static const uint8_t phase[4] = {0, 1, 3, 2}; /* bit 0: A, bit 1: B */
     const uint8_t before = phase[w->count & 3];
     w->count += way;
@@ -217,12 +239,17 @@ int main(int argc, char **argv)
     open_video(&w, argv[2], argv[3]);
     const double period = 1 / atof(argv[4]);
     const uint32_t first = (uint32_t)atoi(argv[5]), count = (uint32_t)atoi(argv[6]);
-    if (argc == 11)
-        open_encoder(&w, argv + 7);
+    if (argc == 11) {
+        open_pulls(&w, argv + 8);
+        open_counts(&w, argv[10]);
+    } else if (argc == 9) {
+        open_rotary(&w);
+        open_counts(&w, argv[8]);
+    }
     if (w.n_counts > first) /* the wheel stands where the survey begins */
         w.count = first > 0 ? w.counts[first - 1] : w.counts[0];
-    const double begin =
-        now() + 1; /* the camera has a picture from now on; whoever waits for it gets the first frame */
+    /* The camera has a picture from now on, and the wheel is there: whoever waits for them gets the first frame. */
+    const double begin = now() + (w.rotary > 0 ? 5 : 1);
     for (uint32_t i = 0; i < count; i++) {
         const double due = begin + i * period;
         read_frame(&w, first + i);

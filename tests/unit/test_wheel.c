@@ -62,6 +62,7 @@ static void test_a_counter_is_followed_over_its_end_and_back(void)
     TEST_ASSERT_EQUAL_INT64(1010, count_after("1004\n"));
     TEST_ASSERT_EQUAL_INT64(-6, count_after("65524\n"));
     TEST_ASSERT_EQUAL_INT64(1010, pf_history_at(&wheel.history, 3999, 0));
+    TEST_ASSERT_EQUAL_INT64(0, pf_history_at(&wheel.history, 1, 99)); /* before the first reading */
 }
 
 static void test_a_counter_without_an_end_counts_all_64_bits(void)
