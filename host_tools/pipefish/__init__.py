@@ -42,6 +42,7 @@ _LAZY = {
     "DenseWall": "pipefish.dense",
     "WallModel": "pipefish.wallmodel",
     "dense_wall": "pipefish.dense",
+    "predicted_seeds": "pipefish.wallmodel",
     "calibrate": "pipefish.calibration",
     "find_image_circle": "pipefish.calib_circle",
     "Keyframe": "pipefish.survey",
