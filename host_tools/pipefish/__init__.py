@@ -49,6 +49,7 @@ _LAZY = {
     "DenseWall": "pipefish.dense",
     "WallModel": "pipefish.wallmodel",
     "dense_wall": "pipefish.dense",
+    "predicted_seeds": "pipefish.wallmodel",
     "calibrate": "pipefish.calibration",
     "self_calibrate": "pipefish.selfcal",
     "SelfCalibration": "pipefish.selfcal",

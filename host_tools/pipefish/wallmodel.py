@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipefish.camera import Camera
 from pipefish.cloudfile import read_columns
 from pipefish.errors import ArgumentError, FormatError
+from pipefish.matching import Seeds
 from pipefish.measured_files import RING
 
 Floats = NDArray[np.float64]
@@ -117,6 +119,38 @@ class WallModel:
         a, b = np.einsum("ni,ni->n", off, up), np.einsum("ni,ni->n", off, right)
         clock = np.arctan2(b, a) % (2 * np.pi)
         return s, clock, np.hypot(a, b) - self.radius(s, clock)
+
+
+def seen_on_wall(wall: WallModel, camera: Camera, pose: Floats, pixels: Any) -> Floats:
+    """(n,3) places of the wall that pixels (n,2) of a keyframe show; NaN where their rays do not meet it within its
+    length. pose: (3,4) cam_from_world."""
+    rays, ok = camera.unproject(pixels)
+    rotation = pose[:, :3]
+    start = (camera.origins(pixels) - pose[:, 3]) @ rotation
+    rays = np.where(ok[:, None], rays, [0.0, 0, 1]) @ rotation
+    far = np.full(len(rays), wall.mean_radius)
+    s = off = None
+    for _ in range(25):  # a ray meets the wall once from inside: Newton's steps, from within
+        point = start + far[:, None] * rays
+        s, clock, off = wall.locate(point, s)
+        _, _, up, right = wall.frames(s)
+        slope = np.einsum("ni,ni->n", rays, np.cos(clock)[:, None] * up + np.sin(clock)[:, None] * right)
+        far = np.clip(far - off / np.where(slope > 0.05, slope, 0.05), 0, 20 * wall.mean_radius)
+    good = ok & (np.abs(off) < 1e-4 * wall.mean_radius) & (s >= 0) & (s <= wall.length) & (far > 0)
+    return np.where(good[:, None], start + far[:, None] * rays, np.nan)
+
+
+def predicted_seeds(wall: WallModel, camera: Camera, pose1: Floats, pose2: Floats, pixels: Any) -> Seeds:
+    """Seeds for match_quasi_dense between two raw keyframes: pixels (n,2) of the first, where the wall takes them in
+    the second, and the affine map between the surroundings, by differences over a pixel; those that both see."""
+    pixels = np.ascontiguousarray(pixels, float).reshape(-1, 2)
+    offsets = ([0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5])
+    points = seen_on_wall(wall, camera, pose1, np.concatenate([pixels + np.array(d) for d in offsets]))
+    there, ok = camera.project(np.nan_to_num(points) @ pose2[:, :3].T + pose2[:, 3])
+    ok &= np.isfinite(points[:, 0]) & camera.in_image(there)
+    there, ok = there.reshape(5, -1, 2), ok.reshape(5, -1).all(axis=0)
+    affine = np.stack([there[1] - there[2], there[3] - there[4]], axis=2)
+    return Seeds(pixels[ok], there[0][ok], affine[ok])
 
 
 def read_walls(folder: Path) -> list[WallModel]:
