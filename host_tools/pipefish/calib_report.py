@@ -105,22 +105,25 @@ def _angles_of_wall(camera: Camera) -> tuple[float, float]:
 
 
 def _diameter_by(other: Camera, camera: Camera, dn_mm: float) -> float:
-    """The mean diameter, millimetres, that `other` measures where `camera` sees a pipe of dn_mm; NaN out of sight."""
+    """The mean diameter, millimetres, that `other` measures where `camera` sees a pipe of dn_mm; NaN out of sight. The
+    one is turned to the other first: where the axis points is in the poses, and asymmetry can turn it by a degree."""
     phi = 2 * math.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    slopes, starts, there = [], [], []
-    for theta in _angles_of_wall(camera):
-        wall = np.stack([np.cos(phi), np.sin(phi), np.full(len(phi), 1 / math.tan(theta))], axis=1) * dn_mm
-        pixels, seen = camera.project(wall / 2000)
-        seen &= camera.in_image(np.nan_to_num(pixels, nan=-1e9))
-        pixels = np.where(seen[:, None], pixels, 0.0)
-        rays, fine = other.unproject(pixels)
-        slopes.append(rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1]))
-        starts.append(other.origins(pixels)[:, 2])
-        there.append(wall[:, 2] / 2)
-        fine &= seen
-        slopes[-1] = np.where(fine, slopes[-1], np.nan)
-    radius = (there[0] - there[1] - 1e3 * (starts[0] - starts[1])) / (slopes[0] - slopes[1])
-    return float(2 * np.nanmean(radius)) if np.isfinite(radius).sum() >= 3 else math.nan
+    slope = 1 / np.tan(_angles_of_wall(camera))
+    wall = np.stack([np.stack([np.cos(phi), np.sin(phi), np.full(len(phi), s)], axis=1) for s in slope]) * dn_mm / 2000
+    pixels, seen = camera.project(wall.reshape(-1, 3))
+    seen &= camera.in_image(np.nan_to_num(pixels, nan=-1e9))
+    pixels = np.where(seen[:, None], pixels, 0.0)
+    ours, _ = camera.unproject(pixels)
+    theirs, fine = other.unproject(pixels)
+    use = (seen & fine).reshape(2, -1).all(axis=0)
+    if use.sum() < 3:
+        return math.nan
+    both = np.tile(use, 2)
+    u, _, vt = np.linalg.svd(ours[both].T @ theirs[both])
+    rays = (theirs @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T).reshape(2, -1, 3)[:, use]
+    near, far = rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
+    start = other.origins(pixels)[:, 2].reshape(2, -1)[:, use]
+    return 2000 * float(np.mean(((wall[0, use, 2] - wall[1, use, 2]) - (start[0] - start[1])) / (near - far)))
 
 
 def _cross(v: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -105,7 +105,7 @@ def detect_target(
     if (camera is None) != (pose is None):
         raise ArgumentError("camera, pose: give both or neither")
     if camera is None or pose is None:
-        return Detection(**_engine.find_target(picture, _board(target)))
+        return _in_picture(Detection(**_engine.find_target(picture, _board(target))), picture, target)
     given = np.ascontiguousarray(pose, dtype=np.float64)
     if given.shape != (3, 4) or not np.isfinite(given).all():
         raise ArgumentError(f"pose: expected finite numbers of shape (3, 4), got {given.shape}")
@@ -113,4 +113,23 @@ def detect_target(
         raise ArgumentError(
             f"image: {picture.shape[1]} x {picture.shape[0]} pixels, the camera has {camera.width} x {camera.height}"
         )
-    return Detection(**_engine.find_target_guided(picture, _board(target), camera._profile, given))
+    found = Detection(**_engine.find_target_guided(picture, _board(target), camera._profile, given))
+    return _in_picture(found, picture, target)
+
+
+def _in_picture(found: Detection, picture: npt.NDArray[np.uint8], target: Target) -> Detection:
+    """Without points that a fit at the picture's edge has put beyond it."""
+    height, width = picture.shape
+    inside = ((found.pixels >= -0.5) & (found.pixels <= [width - 0.5, height - 0.5])).all(axis=1)
+    if inside.all():
+        return found
+    count, whole = int(inside.sum()), len(target.points())
+    return replace(
+        found,
+        ids=found.ids[inside],
+        pixels=found.pixels[inside],
+        covariance=found.covariance[inside],
+        outlines=None if found.outlines is None else found.outlines[inside],
+        status="partial" if found.status == "ok" else found.status,
+        reason=found.reason or f"{count} of {whole} points",
+    )

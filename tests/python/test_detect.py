@@ -181,6 +181,19 @@ def test_nothing_is_found_in_noise_or_in_an_empty_picture() -> None:
             assert found.pixels.shape == (0, 2) and found.covariance.shape == (0, 2, 2)
 
 
+def test_a_fit_at_the_edge_puts_no_point_outside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One such point and a calibration would refuse all pictures as another camera's."""
+    seen = view(BOARD, "fisheye-185", FACING)
+    found = pf.detect_target(seen.image, BOARD)
+    pixels = found.pixels.copy()
+    pixels[3] = [-1.2, 50.0]
+    told = {k: getattr(found, k) for k in ("ids", "covariance", "status", "reason", "outlines")} | {"pixels": pixels}
+    monkeypatch.setattr("pipefish._engine.find_target", lambda *_: told)
+    kept = pf.detect_target(seen.image, BOARD)
+    assert len(kept.ids) == len(found.ids) - 1 == len(kept.pixels) == len(kept.covariance)
+    assert found.ids[3] not in kept.ids and kept.status == "partial" and kept.reason == "39 of 40 points"
+
+
 def test_wrong_arguments_are_refused_by_name() -> None:
     image = np.zeros((360, 480), np.uint8)
     with pytest.raises(pf.ArgumentError, match="camera, pose"):
