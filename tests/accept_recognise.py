@@ -111,7 +111,17 @@ def overlap(found: pf.Recognition, truth: np.ndarray | tuple[int, int, int, int]
     if isinstance(truth, np.ndarray):
         mask = found.mask(truth.shape)
         return float((mask & truth).sum() / (mask | truth).sum())
-    box = found.box() or (0, 0, 0, 0)
+    return boxes_overlap(found.box() or (0, 0, 0, 0), truth)
+
+
+def whole_overlap(found: pf.Recognition, truth: tuple[int, int, int, int], shape: tuple[int, int]) -> float:
+    """The same for the box around the model's outline carried into the scene, as far as it is in the picture."""
+    points = np.clip(np.concatenate(found.extent), 0, np.array(shape[::-1]) - 1)
+    return boxes_overlap((*points.min(axis=0), *points.max(axis=0)), truth)
+
+
+def boxes_overlap(box: tuple[float, ...], truth: tuple[float, ...]) -> float:
+    """Intersection over union of boxes: least x and y, largest x and y."""
     wide, high = min(box[2], truth[2]) - max(box[0], truth[0]), min(box[3], truth[3]) - max(box[1], truth[1])
     both = max(0.0, wide) * max(0.0, high)
     return both / ((box[2] - box[0]) * (box[3] - box[1]) + (truth[2] - truth[0]) * (truth[3] - truth[1]) - both)
@@ -150,6 +160,10 @@ def measure(data: Set, pictures: Path | None) -> list[dict]:
         own = [s for s, (r, _) in zip(shares, right, strict=True) if r.object == name]
         if own:
             print(f"  {name:24} overlap mean {np.mean(own):.2f}, least {np.min(own):.2f}", file=sys.stderr)
+        if own and data.name == "real":
+            shape = data.scenes[0].shape
+            whole = [whole_overlap(r, truth, shape) for r, truth in right if r.object == name]
+            print(f"  {'':24} of the whole, mean {np.mean(whole):.2f}, least {np.min(whole):.2f}", file=sys.stderr)
     if pictures:
         pictures.mkdir(parents=True, exist_ok=True)
         shown = ("grouped quasi-dense matches", "quasi-dense matches, ungrouped", "seeds", *theirs)
