@@ -143,7 +143,9 @@ def self_calibrate(
     threads       do not change the result [all cores]
 
     The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central
-    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status. Raises ArgumentError.
+    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status.
+
+    Raises ArgumentError.
     """
     width, height = (int(n) for n in image_size)
     if not (16 <= width <= 16384 and 16 <= height <= 16384):
