@@ -43,7 +43,7 @@ REASONS = {
     "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
     "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",
     "axial": "the camera moved along its optical axis without panning or tilting: any lens explains that",
-    "weak": "the matches leave the lens too uncertain",
+    "weak": "the matches leave the lens too uncertain: few, noisy, or of a scene that is nearly flat",
 }
 
 
