@@ -172,7 +172,7 @@ def boards() -> list[Row]:
     stereo, stereo_size = jy_stereo(DATA / "calibration", 1)
     cases = []
     for name, views, of in (("ov_plane", board, size), ("jy_stereo", stereo, stereo_size)):
-        for a, b in zip(views, views[1:], strict=False):
+        for a, b in itertools.pairwise(views):
             first = {tuple(np.round(p, 6)): k for k, p in enumerate(a.board_xyz)}
             common = [(first[key], k) for k, p in enumerate(b.board_xyz) if (key := tuple(np.round(p, 6))) in first]
             one, two = np.array(common, int).reshape(-1, 2).T

@@ -83,8 +83,8 @@ def add_selfcal(commands: Any) -> None:
         "selfcal",
         run_selfcal,
         "Calibrate a camera from two or more views of an unknown scene: no target, nothing known of the lens. The "
-        "scene must have depth and the camera must have moved and panned or tilted; what the views cannot tell is refused, "
-        "with what is missing. The profile is marked as self-calibrated and carries its uncertainty.",
+        "scene must have depth and the camera must have moved and panned or tilted; what the views cannot tell is "
+        "refused, with what is missing. The profile is marked as self-calibrated and carries its uncertainty.",
         "pipefish selfcal a.jpg b.jpg c.jpg -o camera.json\n"
         "  pipefish selfcal matches.npz --size 1280x960 -o camera.json",
     )

@@ -43,7 +43,7 @@ REASONS = {
     "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
     "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",
     "axial": "the camera moved along its optical axis without panning or tilting: any lens explains that",
-    "weak": "the matches leave the lens too uncertain",
+    "weak": "the matches leave the lens too uncertain: few, noisy, or of a scene that is nearly flat",
 }
 
 
@@ -143,7 +143,9 @@ def self_calibrate(
     threads       do not change the result [all cores]
 
     The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central
-    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status. Raises ArgumentError.
+    mirror, fields to 240 degrees. What the matches cannot tell is no error: see SelfCalibration.status.
+
+    Raises ArgumentError.
     """
     width, height = (int(n) for n in image_size)
     if not (16 <= width <= 16384 and 16 <= height <= 16384):

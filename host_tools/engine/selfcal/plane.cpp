@@ -17,8 +17,7 @@ namespace
 
 using Matrix3 = Eigen::Matrix3d;
 using Vector9 = Eigen::Matrix<double, 9, 1>;
-constexpr double SCALE_ROW = 1.0; // holds the length of the homography at 1
-constexpr double NEAR_PX = 12.0;  // median transfer error: beyond, no lens makes a plane of it
+constexpr double NEAR_PX = 12.0; // median transfer error: beyond, no lens makes a plane of it
 
 double norm_of(const Vec<double> &v)
 {
@@ -127,7 +126,7 @@ public:
         if (!valid_) {
             return std::numeric_limits<double>::infinity();
         }
-        double sum = std::pow((h_.squaredNorm() - 1.0) / SCALE_ROW, 2);
+        double sum = std::pow((h_.squaredNorm() - 1.0), 2);
         const LensVector away = prior();
         sum += with_lens_ ? away.squaredNorm() : 0.0;
         for (const int i : matches()) {
@@ -162,8 +161,8 @@ public:
             sink.add(2, r.data(), loss_, nullptr, {}, {}, j.data());
         }
         Eigen::RowVectorXd row = Eigen::RowVectorXd::Zero(columns);
-        row.tail<9>() = 2.0 / SCALE_ROW * h_.transpose();
-        double r = (h_.squaredNorm() - 1.0) / SCALE_ROW;
+        row.tail<9>() = 2.0 * h_.transpose();
+        double r = (h_.squaredNorm() - 1.0);
         sink.add(1, &r, optim::RobustLoss{}, nullptr, {}, {}, row.data());
         if (with_lens_) {
             const LensVector away = prior(), spread = at_.prior_sigma();
@@ -268,27 +267,65 @@ private:
 
 } // namespace
 
+namespace
+{
+
+constexpr double MOST_NOISE = 1.3; // of the noise stated
+
+// GRIC in the four coordinates of a pair: an epipolar geometry has manifolds of dimension 3, a plane of 2. The noise is
+// that of the plane's fit where it is up to MOST_NOISE of that of the epipolar one: of a plane's matches an epipolar
+// geometry with a strange lens keeps those that suit it.
+bool plane_is_cheaper(const Adjustment &lens, size_t pair, const std::vector<double> &epipolar)
+{
+    Problem problem(lens, pair);
+    problem.fit(std::max(1.0, problem.typical()), false);
+    if (problem.typical() * lens.sigma > NEAR_PX) {
+        return false;
+    }
+    for (const double scale : {8.0, 2.0, 2.0}) {
+        problem.fit(scale, true);
+    }
+    constexpr double MEDIAN = 1.1774; // of the length of two normal numbers
+    const double noise = std::pow(std::clamp(problem.typical() / MEDIAN, 1.0, MOST_NOISE), 2);
+    const double n = static_cast<double>(epipolar.size());
+    double sum = 3.0 * n * std::log(4.0) + 5.0 * std::log(4.0 * n);
+    for (const double squared : epipolar) {
+        sum += std::min(squared / noise, 2.0);
+    }
+    return problem.truncated(4.0 * noise) / noise + 2.0 * n * std::log(4.0) + 8.0 * std::log(4.0 * n) < sum;
+}
+
+} // namespace
+
 bool is_plane(const Adjustment &at, size_t pair)
 {
     const std::vector<int> &match = at.match[pair];
     if (match.size() < 12) {
         return false;
     }
-    Problem problem(at, pair);
-    problem.fit(std::max(1.0, problem.typical()), false);
-    if (problem.typical() * at.sigma > NEAR_PX) {
-        return false;
-    }
-    for (const double scale : {8.0, 2.0, 2.0}) {
-        problem.fit(scale, true);
-    }
-    // GRIC in the four coordinates of a pair: an epipolar geometry has manifolds of dimension 3, a plane of 2.
-    const double n = static_cast<double>(match.size());
-    double epipolar = 3.0 * n * std::log(4.0) + 5.0 * std::log(4.0 * n);
+    std::vector<double> epipolar;
+    double reach = 0.0;
     for (const int i : match) {
-        epipolar += std::min(std::pow(at.error(pair, static_cast<size_t>(i)) / at.sigma, 2), 2.0);
+        const size_t k = static_cast<size_t>(i);
+        epipolar.push_back(std::pow(at.error(pair, k) / at.sigma, 2));
+        reach = std::max({reach, ((*at.pairs)[pair].one(k) - at.prior.centre).norm(),
+                          ((*at.pairs)[pair].two(k) - at.prior.centre).norm()});
     }
-    return problem.truncated(4.0) + 2.0 * n * std::log(4.0) + 8.0 * std::log(4.0 * n) < epipolar;
+    if (plane_is_cheaper(at, pair, epipolar)) {
+        return true;
+    }
+    // From ordinary lenses too: on a plane the lens found may be one from which no way leads to the plane's.
+    for (const auto &[rim, q] : {std::pair(0.6, 1.0), std::pair(1.0, 0.25), std::pair(1.6, 0.0), std::pair(1.8, 0.3)}) {
+        Adjustment other = at;
+        other.family = LensFamily(1.1 * rim, at.prior.bend);
+        other.lens = at.prior_mean();
+        other.lens[kShape] = q;
+        other.lens[kLogF] = std::log(reach / nominal_radius(q, rim));
+        if (plane_is_cheaper(other, pair, epipolar)) {
+            return true;
+        }
+    }
+    return false;
 }
 
 } // namespace pipefish::selfcal

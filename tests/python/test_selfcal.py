@@ -1,0 +1,174 @@
+"""Self-calibration from views of an unknown scene: right where it answers, and refused where nothing can be known.
+
+The long statistics are tests/accept_selfcal.py; here a few set-ups of each kind. Does not prove: real lenses that are
+not radially symmetric.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipefish as pf
+from pipefish import _engine
+from pipefish.cli import main
+from pipefish.health import BUDGET, _chi2_tail
+from pipefish.selfcal import self_calibrate
+from selfcal_drives import health_of
+from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup
+
+SIZE = (1280, 960)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_pairs_find_the_lens(kind):
+    """Within three of its own sigmas and half a degree, at 0.5 px and with wrong matches, for every kind of lens."""
+    setup = make_setup(2, kind, pairs=2, noise=0.5, outliers=0.3)
+    found = self_calibrate(setup.pairs, SIZE)
+    assert found.status == "ok", found.reason
+    error = bearing_error(found.camera, setup.lens, found.radius)
+    assert error < 3 * found.bearing_sigma
+    assert math.degrees(error) < 0.5
+    assert found.sigma == pytest.approx(0.5, rel=0.15)
+    for pair, right in zip(found.pairs, setup.right, strict=True):
+        assert (pair.inlier & right).sum() > 0.95 * right.sum()
+        assert (pair.inlier & ~right).sum() < 0.05 * right.sum()
+
+
+def test_poses_are_those_of_the_pairs():
+    setup = make_setup(2, "fisheye", pairs=1, noise=0.2, outliers=0.2)
+    found = self_calibrate(setup.pairs, SIZE)
+    true = setup.poses[0]
+    turn = found.pairs[0].pose[:, :3] @ true[:, :3].T
+    assert math.degrees(math.acos(min(1, (np.trace(turn) - 1) / 2))) < 0.5
+    assert found.pairs[0].pose[:, 3] @ true[:, 3] / np.linalg.norm(true[:, 3]) > 0.999
+
+
+@pytest.mark.parametrize("case", DEGENERATE)
+def test_what_cannot_be_seen_is_refused_with_its_reason(case):
+    for seed, kind in enumerate(("perspective", "fisheye")):
+        setup = make_setup(10_100 + seed, kind, case)
+        found = self_calibrate(setup.pairs, SIZE)
+        assert found.status == case
+        assert found.camera is None
+        if case in ("no_rotation", "axial"):
+            assert "Pan or tilt by at least" in found.reason
+
+
+def test_a_turning_and_a_standing_camera_are_named():
+    setup = make_setup(3, "wide", noise=0.3, outliers=0.0)
+    rays = setup.lens.rays(setup.pairs[0][0])
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    turn = np.array([[0.940, 0, 0.342], [0, 1, 0], [-0.342, 0, 0.940]])
+    one, in_one = setup.lens.project(rays)
+    two, in_two = setup.lens.project(rays @ turn.T)
+    keep = in_one & in_two
+    noise = np.random.default_rng(1).normal(0, 0.3, (2, keep.sum(), 2))
+    found = self_calibrate([(one[keep] + noise[0], two[keep] + noise[1])], SIZE)
+    assert found.status in ("turning", "planar")  # a rotation is a homography of rays too
+    assert found.camera is None
+    still = self_calibrate([(one[keep], one[keep] + 0.5 * noise[0])], SIZE)
+    assert still.status == "standing"
+
+
+def test_the_signed_error_is_oliensis_square(tmp_path):
+    """The engine's E against a brute force over planes, with its stable form near zero."""
+    random = np.random.default_rng(4)
+    for _ in range(20):
+        f, g, t = (v / np.linalg.norm(v) for v in random.normal(size=(3, 3)))
+        e = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+        basis = np.linalg.svd(t[None])[2][1:]
+        angle = np.linspace(0, np.pi, 200001)
+        n = np.cos(angle)[:, None] * basis[0] + np.sin(angle)[:, None] * basis[1]
+        brute = ((n @ f) ** 2 + (n @ g) ** 2).min()
+        assert _engine.ray_angles_squared(e, f[None], g[None]) == pytest.approx(brute, rel=1e-6, abs=1e-9)
+
+
+def test_threads_and_runs_give_the_same_bits():
+    setup = make_setup(5, "wide")
+    a, b = (self_calibrate(setup.pairs, SIZE, threads=n).camera for n in (1, 2))
+    assert (a.f_u, a.c_u, a.k2, a.k5) == (b.f_u, b.c_u, b.k2, b.k5)
+
+
+def test_profile_says_how_it_came_about_and_loads(tmp_path):
+    setup = make_setup(6, "fisheye", noise=0.3)
+    found = self_calibrate(setup.pairs, SIZE)
+    found.camera.save(tmp_path / "camera.json")
+    back = pf.Camera.load(tmp_path / "camera.json")
+    assert back.source == "selfcal"
+    assert back.provenance.tool == "pipefish selfcal"
+    assert back.covariance_parameters[:3] == ("f_u", "f_v", "c_u")
+    assert np.linalg.eigvalsh(back.covariance).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("pairs", "size", "message"),
+    [
+        ([], SIZE, "pairs: none"),
+        ([(np.zeros((3, 2)), np.zeros((4, 2)))], SIZE, "3 pixels in one view, 4 in the other"),
+        ([(np.full((3, 2), np.nan), np.zeros((3, 2)))], SIZE, "not finite"),
+        ([(np.full((3, 2), 5000.0), np.zeros((3, 2)))], SIZE, "outside the picture"),
+        ([(np.zeros((3, 2)), np.zeros((3, 2)))], (2, 2), "image_size"),
+    ],
+)
+def test_wrong_arguments_are_named(pairs, size, message):
+    with pytest.raises(pf.ArgumentError, match=message):
+        self_calibrate(pairs, size)
+
+
+def test_few_matches_are_no_error():
+    assert self_calibrate([(np.ones((5, 2)), np.ones((5, 2)))], SIZE).status == "no_matches"
+
+
+def test_command_reads_matches_and_refuses_in_one_line(tmp_path, capsys):
+    good, bad = make_setup(7, "wide", noise=0.3), make_setup(10_100, "fisheye", "axial")
+    np.savez(tmp_path / "good.npz", xy1=good.pairs[0][0], xy2=good.pairs[0][1])
+    np.savetxt(tmp_path / "bad.csv", np.hstack(bad.pairs[0]), delimiter=",", header="x1,y1,x2,y2", comments="")
+    out = tmp_path / "camera.json"
+    assert main(["selfcal", str(tmp_path / "good.npz"), "--size", "1280x960", "-o", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["status"] == "ok"
+    assert document["starts"]["agreeing"] >= 1
+    assert pf.Camera.load(out).f_u == pytest.approx(good.lens.f, rel=0.03)
+    assert main(["selfcal", str(tmp_path / "bad.csv"), "--size", "1280x960", "-o", str(tmp_path / "no.json")]) == 1
+    assert "along its optical axis" in capsys.readouterr().err
+    assert not (tmp_path / "no.json").exists()
+    assert main(["selfcal", str(tmp_path / "good.npz"), "-o", str(out)]) == 1
+    assert "--size" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [b"", b"x1,y1\n1,2\n", b"1,2,3\n", b"\xff\xfe"])
+def test_bad_files_are_named(tmp_path: Path, capsys, content):
+    file = tmp_path / "matches.csv"
+    file.write_bytes(content)
+    assert main(["selfcal", str(file), "--size", "640x480", "-o", str(tmp_path / "o.json")]) == 1
+    assert "matches.csv" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------- health
+
+
+@pytest.mark.parametrize("case", ["bend", "radius"])
+def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
+    assert health_of(1, case, "", density=400.0)["verdict"] == "profile still valid"
+    for change, name, size in (("scale", "angle scale", -1.0), ("centre", "centre u", -3.0)):
+        found = health_of(1, case, change, density=400.0)
+        assert found["verdict"] == "drifted, recalibrate"
+        value, sigma = found["changes"][name]
+        assert abs(value - size) < 4 * sigma
+
+
+def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius():
+    for change in ("", "alpha"):
+        found = health_of(2, "straight", change, density=400.0)
+        assert found["verdict"] == "cannot tell"
+        assert found["alpha_sigma"] > 2 * BUDGET
+
+
+def test_chi2_tail_against_tables():
+    for value, degrees, tail in ((3.841, 1, 0.05), (5.991, 2, 0.05), (7.815, 3, 0.05), (13.277, 4, 0.01)):
+        assert _chi2_tail(value, degrees) == pytest.approx(tail, rel=2e-3)
