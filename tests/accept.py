@@ -85,6 +85,15 @@ def check_calib() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_recon() -> list[dict]:
+    """Reconstruction and tube against theory, and in rendered pipes; resumes by itself."""
+    done = run(sys.executable, "tests/accept_recon.py")
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_recon.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -160,6 +169,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "track": check_track,
     "pipes": check_pipes,
     "calib": check_calib,
+    "recon": check_recon,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
