@@ -75,17 +75,12 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
     assign(reference);
     const double rho = 0.5 * diameter_;
     const auto stiff = [&](double share) { return 1.0 / (share * share * rho * rho); };
-    has_local_roughness_ = options.smooth_only;
     stiffness_ = options.smooth_only ? std::array{stiff(0.05), stiff(0.01), stiff(0.005), stiff(0.005)}
                                      : std::array{stiff(0.03), stiff(0.01), stiff(0.01), stiff(0.005)};
     converged_ = solve(4, false);
     find_gaps();
-    if (options.smooth_only) {
-        measure_correlation();
-    }
-    // Roughness is the same all along until the shape had its chance: what is not yet followed would pass as rough.
+    measure_correlation();
     converged_ = solve(options.smooth_only ? 3 : options.rounds, !options.smooth_only);
-    has_local_roughness_ = true;
     if (!options.smooth_only) {
         // Twice: what the first harmonics leave may want more.
         for (int pass = 0; pass < 2; pass++) {
@@ -320,7 +315,7 @@ void Surface::measure_roughness()
     const int used = covariance_.empty() ? 0 : static_cast<int>(freedom_ * 3.0 / static_cast<double>(control_.size()));
     const double overall = roughness(all_r, all_noise, static_cast<int>(covariance_.empty() ? 0.0 : freedom_));
     for (size_t c = 0; c < control_.size(); c++) {
-        tau_[c] = has_local_roughness_ && r[c].size() >= ENOUGH ? roughness(r[c], noise[c], used) : overall;
+        tau_[c] = r[c].size() >= ENOUGH ? roughness(r[c], noise[c], used) : overall;
     }
 }
 

@@ -125,7 +125,6 @@ private:
     std::vector<double> u_, distance_, noise_, weight_, robust_;
     std::vector<char> used_;  // a point: takes part in the fit
     std::vector<double> tau_; // a control
-    bool has_local_roughness_ = false;
     std::vector<OnSurface> placed_;
     std::vector<std::pair<double, int>> by_s_; // inliers by chainage
     double correlation_ = 1.0;
