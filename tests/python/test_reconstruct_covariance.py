@@ -82,24 +82,6 @@ def test_wrong_observations_are_told_from_right_ones() -> None:
     assert rec.variance_factor[0] == pytest.approx(1, abs=0.03)
 
 
-def test_matches_that_slid_along_the_epipolar_curve_are_removed() -> None:
-    """Such an error agrees with every pair of views; three views tell. A fifth slid by 5 to 25 px to or from the axis,
-    along which the camera drives."""
-    drive, random = tube_drive(43, 1.0, density=3000.0, wobble=0.3), np.random.default_rng(0)
-    t = drive.tracks
-    slid = random.uniform(size=len(t.frame)) < 0.2
-    out = t.pixels - np.array([drive.camera.c_u, drive.camera.c_v])
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
-    distance = random.uniform(5, 25, len(t.frame)) * random.choice([-1, 1], len(t.frame))
-    drive.tracks = pf.Tracks(t.frame, t.track, t.pixels + (slid * distance)[:, None] * out)
-    rec = pf.reconstruct(drive.tracks, drive.camera)
-    assert rec.status == "ok"
-    size = residuals(drive, rec)
-    left = slid & (size <= 3.5)  # NaN: the point was given up, and with it its observations
-    assert left.sum() < 0.05 * slid.sum()
-    assert rec.variance_factor[0] == pytest.approx(1, abs=0.05)
-
-
 @pytest.mark.parametrize("limits", [(15, 88), (15, 100)], ids=["180 degrees", "200 degrees"])
 def test_two_views_with_two_fifths_wrong_are_solved(limits: tuple[float, float]) -> None:
     for seed in range(100):
