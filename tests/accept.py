@@ -107,6 +107,15 @@ def check_selfcal() -> list[dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def check_recon() -> list[dict]:
+    """Reconstruction and tube against theory, and in rendered pipes; resumes by itself."""
+    done = run(sys.executable, "tests/accept_recon.py")
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"accept_recon.py failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def check_link_seeds() -> list[dict]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -184,6 +193,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "calib": check_calib,
     "recognise": check_recognise,
     "selfcal": check_selfcal,
+    "recon": check_recon,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,

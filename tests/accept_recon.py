@@ -55,8 +55,9 @@ REFERENCE = {
 
 def row(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> dict[str, Any]:
     """One row of the table: holds between low and high."""
-    bound = f"{low} to {high}" if math.isfinite(low) and math.isfinite(high) else f"<= {high}"
-    bound = f">= {low}" if math.isinf(high) else bound
+    bound = f"{low} to {high}" if math.isfinite(low) else f"<= {high}"
+    if math.isinf(high):
+        bound = f">= {low}" if math.isfinite(low) else "no bound"
     return {
         "name": f"recon.{name}",
         "value": round(float(value), 6),
@@ -153,7 +154,7 @@ def section_rows(found: np.ndarray, true: np.ndarray, spread: np.ndarray) -> tup
     # The wall is an ellipse with its long axis upright: its normal leans from the radius by the ovality times a sine.
     lean = phi - OVALITY * np.sin(2 * phi)
     normal = np.column_stack([np.cos(lean), np.sin(lean), np.zeros(len(phi))])
-    # A motion of the whole section is none of its shape: three shifts, three turns. The turn about the pipe is also what
+    # A motion of the whole section is none of its shape: three shifts, three turns; that about the pipe is also what
     # would turn the ellipse.
     arm = np.cross((true - true.mean(0)) / DIAMETER, normal)
     columns = np.column_stack([np.ones(len(phi)), np.cos(2 * phi), normal[:, :2], arm])
@@ -238,7 +239,7 @@ def tube_figures(seed: int) -> dict[str, Any]:
     drive = tube_drive(seed, LENGTH)
     quality = pf.Encoder(scale_sigma=1e-5)
     rec = pf.reconstruct(drive.tracks, drive.camera, readings(drive, seed), encoder=quality)
-    tube = pf.fit_tube(rec.points, rec.covariance, rec.centres, nominal=DIAMETER)
+    tube = pf.fit_tube(rec.points, rec.own_covariance, rec.centres, nominal=DIAMETER)
     stations = {name: np.array(values) for name, values in tube.stations.items()}
     a, b = DIAMETER / 2 * (1 - OVALITY / 2), DIAMETER / 2 * (1 + OVALITY / 2)
     h = ((a - b) / (a + b)) ** 2

@@ -398,7 +398,10 @@ def _scale(m: Measurement, diameter: float | None, tell: Tell) -> None:
     for segment in range(len(m.structure.sigma)):
         inside = m.structure.point_segment == segment
         tube = fit_tube(
-            m.structure.points[inside], m.structure.covariance[inside], _segment_path(m, segment), up=_up(m.structure)
+            m.structure.points[inside],
+            m.structure.own_covariance[inside],
+            _segment_path(m, segment),
+            up=_up(m.structure),
         )
         size = tube.summary["d_mean"] if tube.status == "ok" else None
         factors.append((diameter or 1.0) / size if size else 1.0)
@@ -411,6 +414,7 @@ def rescaled(structure: Reconstruction, factors: list[float]) -> Reconstruction:
     """The structure with each segment scaled about its first centre and put where the one before ended."""
     poses, points = structure.poses.copy(), structure.points.copy()
     covariance, pose_covariance = structure.covariance.copy(), structure.pose_covariance.copy()
+    own = structure.own_covariance.copy()
     systematic = None if structure.systematic is None else structure.systematic.copy()
     pose_systematic = None if structure.pose_systematic is None else structure.pose_systematic.copy()
     centres, end = structure.centres, None
@@ -422,6 +426,7 @@ def rescaled(structure: Reconstruction, factors: list[float]) -> Reconstruction:
         poses[of_frame, :, 3] = -np.einsum("nij,nj->ni", poses[of_frame, :, :3], moved)
         points[of_point] = place + factor * (points[of_point] - start)
         covariance[of_point] *= factor**2
+        own[of_point] *= factor**2
         stretch = np.diag([1.0] * 3 + [factor] * 3)
         pose_covariance[of_frame] = stretch @ pose_covariance[of_frame] @ stretch
         if systematic is not None and pose_systematic is not None:
@@ -433,6 +438,7 @@ def rescaled(structure: Reconstruction, factors: list[float]) -> Reconstruction:
         poses=poses,
         points=points,
         covariance=covariance,
+        own_covariance=own,
         pose_covariance=pose_covariance,
         systematic=systematic,
         pose_systematic=pose_systematic,
@@ -447,7 +453,7 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
         inside, here = structure.point_segment == segment, np.flatnonzero(structure.segment == segment)
         tube = fit_tube(
             structure.points[inside],
-            structure.covariance[inside],
+            structure.own_covariance[inside],
             _segment_path(m, segment),
             nominal=m.nominal if m.scale.unit == "metre" else None,
             up=_up(structure),

@@ -5,6 +5,7 @@ Works on rays, so views of 180 degrees and beyond are ordinary. docs/reconstruct
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 from collections.abc import Sequence
@@ -71,6 +72,8 @@ class Reconstruction:
     points           (N,3), track (N,) int64 the track of each, point_segment (N,)
     covariance       (N,3,3) of the points and pose_covariance (K,6,6) of the poses (rotation on the left, then centre),
                      random part, in the gauge of `gauge`; first frame of each segment: 0
+    own_covariance   (N,3,3) random part of the points, the poses held: what neighbours do not have in common. What fits
+                     a shape to the points wants this one: the other grows with the distance from the first frame
     systematic       (N,3,3), pose_systematic (K,6,6): what the camera's own uncertainty adds; None where the profile
                      has no covariance
     unit             "metre", or "arbitrary" where there is no source of scale
@@ -117,6 +120,7 @@ class Reconstruction:
     camera_parameters: tuple[str, ...]
     cost: float
     sag: list[float] = field(default_factory=list)
+    own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
@@ -268,7 +272,44 @@ def reconstruct(
         None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
         float(sag_sigma),
     )
-    return _result(found, names, frames, step, encoder, camera)
+    out = _result(found, names, frames, step, encoder, camera)
+    out.own_covariance = _own_covariance(out, tracks, camera, sigma)
+    return out
+
+
+def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: float) -> Floats:
+    """(N,3,3) of the points with the poses held. Observations beyond 3.5 sigma do not count."""
+    if not len(rec.points):
+        return np.zeros((0, 3, 3))
+    if rec.unit != "metre":
+        camera = dataclasses.replace(camera, pupil_e1=0.0)  # a length, and lengths are not known
+    place = np.minimum(np.searchsorted(rec.frames, tracks.frame), len(rec.frames) - 1)
+    here = rec.frames[place] == tracks.frame
+    # Points are in the order of segment and track; a track may have one in each of several segments.
+    most = int(max(rec.track.max(), tracks.track.max())) + 1
+    keys, wanted = rec.point_segment * most + rec.track, rec.segment[place] * most + tracks.track
+    number = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    here &= keys[number] == wanted
+    item = np.flatnonzero(here)
+    number, place = number[item], place[item]
+    turn = rec.poses[place, :, :3]
+    seen = np.einsum("nij,nj->ni", turn, rec.points[number]) + rec.poses[place, :, 3]
+    pixels, ok, slope = camera.project_jacobian(seen)[:3]
+    spread = np.broadcast_to(sigma**2 * np.eye(2), (len(item), 2, 2))
+    if tracks.covariance is not None:
+        spread = tracks.covariance[item]
+    weight = np.linalg.inv(spread)
+    off = tracks.pixels[item] - pixels
+    factor = np.array(rec.variance_factor)[rec.segment[place]]
+    ok = ok & (np.einsum("ni,nij,nj->n", off, weight, off) < 3.5**2 * np.maximum(factor, 0.25))
+    by_point = slope[ok] @ turn[ok]
+    information = np.zeros((len(rec.points), 3, 3))
+    np.add.at(information, number[ok], by_point.transpose(0, 2, 1) @ weight[ok] @ by_point / factor[ok, None, None])
+    # A point that keeps too few observations keeps the whole covariance.
+    sound = np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.einsum("nii->n", information)
+    own = rec.covariance.copy()
+    own[sound] = np.linalg.inv(information[sound])
+    return own
 
 
 def _wheel_sigma(segment: dict[str, Any] | None) -> float | None:

@@ -372,9 +372,15 @@ Leaf make_leaf(const TrackTable &table, const pf_camera &camera, int first, int 
     adjust(leaf.map, table, camera, settings);
     leaf.sigma = robust_sigma(leaf.map, table, camera);
     clean(leaf.map, table, camera, 3.5 * std::max(leaf.sigma, 0.5), 3, limits);
+    // Of the tracks that agree in first and last frame: how many of all do is a matter of wrong matches, not of the
+    // leaf.
     int seen_by_all = 0, measured = 0;
     std::vector<double> angles;
-    for (const int t : track) {
+    for (size_t i = 0; i < track.size(); i++) {
+        const int t = track[i];
+        if (!pair.inlier[i]) {
+            continue;
+        }
         const std::vector<View> views = views_of(leaf.map, table, t);
         if (static_cast<int>(views.size()) == count) {
             seen_by_all++;

@@ -24,7 +24,7 @@ const char *trouble_name(Trouble trouble);
 struct Limits {
     double chi2 = 9.21;           // of a view's whitened error, 2 degrees of freedom: 99 %
     int leaf_points = 25;         // points with at least three views that a leaf must have
-    double leaf_share = 0.5;      // of the tracks seen in all its frames
+    double leaf_share = 0.5;      // of the tracks seen in all its frames that agree in the first and the last
     double leaf_parallax = 0.035; // radians, median
     int wanted_common = 80;   // tracks common to first and last frame of a leaf: more frames while there are as many
     int longest_leaf = 6;     // frames

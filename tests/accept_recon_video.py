@@ -1,0 +1,159 @@
+"""Rendered pipes through pipefishd, the emulated cable and `measure`: what comes out, beside the truth.
+
+The camera is calibrated first, from a board's corners as the scene's own lens images them: what the simulator writes
+as its profile is a central fit at one distance. The pictures stay in build/accept/recon/ (1 GB for 10 m) and are drawn
+again only if the scene or what the simulator draws has changed: first and last frame are compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accept_recon import FOLDER
+
+import pipefish as pf
+from pipefish.demo import Recording, find_programs, survey_over_the_line
+from pipefish.errors import PipefishError
+from pipefish.measure import Measurement, measure, not_measured
+from pipefish.measuretruth import against_truth
+from pipefish.simulate import Scene, simulate
+from pipefish.survey import Survey
+from tube_tracks import rotation
+
+LEFT, UP_RIGHT = -math.pi / 2, 0.6
+SCENES: dict[str, dict[str, Any]] = {
+    "concrete": {
+        "diameter": 0.3,
+        "pieces": [{"length": 11.2}],
+        "ovals": [{"start": 4.0, "end": 8.0, "ramp": 0.6, "ovality": 0.03, "clock": UP_RIGHT}],
+        "texture": {"seed": 43},
+        "sensor": {"seed": 43, "exposure_s": 0.0015},
+        "motion": {"seed": 43, "frames": 1000},
+        "telemetry": {"seed": 43},
+    },
+    "brick": {
+        "diameter": 0.4,
+        "pieces": [{"length": 2.4}, {"angle": math.radians(25), "radius": 1.2, "clock": LEFT}, {"length": 3.6}],
+        "joints": [{"s": 1.6, "gap": 0.012, "step_down": 0.010, "step_right": 0.006}],
+        "deposits": [{"s": 4.6, "length": 0.5, "extent": 1.4, "height": 0.025, "roughness": 0.001}],
+        "texture": {"seed": 41, "material": "brick", "joint_spacing": 0},
+        "sensor": {"seed": 41, "exposure_s": 0.002},
+        "motion": {"seed": 41, "frames": 560},
+        "telemetry": {"seed": 41},
+    },
+    "pvc": {
+        "diameter": 0.3,
+        "pieces": [{"length": 4.2}],
+        "texture": {"seed": 47, "material": "pvc"},
+        "sensor": {"seed": 47, "exposure_s": 0.002},
+        "motion": {"seed": 47, "frames": 300},
+        "telemetry": {"seed": 47},
+    },
+}
+
+Limits = tuple[str, float, float, float]  # name, value, low, high
+
+
+def calibrated(scene: Scene, views: int = 80, noise: float = 0.05) -> pf.Camera:
+    """The scene's camera as a calibration finds it: a board of 70 corners, 25 mm apart, at 0.1 to 0.7 m all over the
+    field, corners with `noise` px."""
+    spec, pose, random = scene.spec["lens"], scene.pose(0), np.random.default_rng(5)
+    x, y = np.meshgrid(np.arange(10) - 4.5, np.arange(7) - 3.0)
+    board = 0.025 * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    seen = []
+    for number in range(views):
+        distance = random.choice([0.12, 0.2, 0.35, 0.6]) * random.uniform(0.8, 1.2)
+        theta, phi = 1.5 * math.sqrt(random.uniform(0, 1)), random.uniform(0, 2 * math.pi)
+        ahead = np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+        across = np.cross([0.0, 1.0, 0.1], ahead)
+        across /= np.linalg.norm(across)
+        turn = np.stack([across, np.cross(ahead, across), ahead], 1) @ rotation(random.normal(0, 0.35, 3))
+        placed = board @ turn.T + distance * ahead
+        pixels, ok = scene.project(0, (placed - pose[:, 3]) @ pose[:, :3])
+        ok &= (pixels >= 0).all(1) & (pixels <= [spec["width"] - 1, spec["height"] - 1]).all(1)
+        if ok.sum() >= 20:
+            noisy = pixels[ok] + random.normal(0, noise, (int(ok.sum()), 2))
+            seen.append(pf.View(board[ok], noisy, board=0, camera=0, name=str(number)))
+    return pf.calibrate(seen, image_size=(spec["width"], spec["height"]), model="auto", board="flat").camera
+
+
+def recorded(name: str) -> Recording:
+    """The scene's recording, drawn if need be."""
+    scene = Scene(SCENES[name])
+    ends = [hashlib.sha256(scene.render(frame).tobytes()).hexdigest() for frame in (0, scene.frames - 1)]
+    stem, stamp = FOLDER / name / "drive", FOLDER / name / "stamp.json"
+    wanted = {"scene": scene.spec, "ends": ends}
+    if not stamp.exists() or json.loads(stamp.read_text()) != json.loads(json.dumps(wanted)):
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        stamp.unlink(missing_ok=True)
+        simulate(SCENES[name], stem, quiet=True)
+        stamp.write_text(json.dumps(wanted))
+    return Recording.at(stem)
+
+
+def size_error(found: float, true: float) -> float:
+    """Of a size that may be off by 20 % or 2 mm, whichever is more: 1 at that limit."""
+    return abs(found - true) / max(0.2 * true, 0.002)
+
+
+def findings(measured: Measurement, scene: Scene) -> list[Limits]:
+    """What was found where the scene has a bend, a joint, a deposit; what was found beside them."""
+    events = [e for stretch in measured.measured for e in stretch.tube.events]
+    rows: list[Limits] = []
+    wanted = {"bend": 0, "joint": len(scene.spec["joints"]), "deposit": len(scene.spec["deposits"])}
+    wanted["bend"] = sum(bool(p["angle"]) for p in scene.spec["pieces"])
+    for kind, count in wanted.items():
+        rows.append((f"{kind}s_found", sum(e["kind"] == kind for e in events), count, count))
+    rows.append(("other_findings", sum(e["kind"] not in wanted for e in events), -math.inf, 0))
+    for kind, sizes, truth in (
+        ("joint", "step", [math.hypot(j["step_down"], j["step_right"]) for j in scene.spec["joints"]]),
+        ("deposit", "height", [d["height"] for d in scene.spec["deposits"]]),
+    ):
+        found = [e[sizes] for e in events if e["kind"] == kind]
+        if truth and len(found) == len(truth):
+            worst = max(size_error(f, t) for f, t in zip(found, truth, strict=True))
+            rows.append((f"{kind}_{sizes}_off", worst, -math.inf, 1.0))
+    return rows
+
+
+def video_figures(name: str) -> list[Limits]:
+    """Name, value and limits of what came out of one scene."""
+    recording = recorded(name)
+    scene = Scene.from_truth(recording.truth)
+    profile = recording.profile.with_name("calibrated.json")
+    calibrated(scene).save(profile)
+    recording.profile = profile
+    survey = survey_over_the_line(find_programs(None), recording, FOLDER / name / "run", True)
+    try:
+        measured = measure(Survey.open(Path(survey["file"])))
+    except PipefishError as error:
+        return [(f"failed: {error}", 1, -math.inf, 0)]
+    truth = against_truth(measured, scene)
+    if truth is None:
+        return [("stations_measured", 0, 1, math.inf)]
+    if name == "pvc":  # hardly a corner: what is measured must hold its intervals, what is not must be said
+        gaps = not_measured(measured)
+        silent = truth["stations"] - truth["stations_measured"] if not gaps else 0
+        return [
+            ("stations_measured", truth["stations_measured"], 1, math.inf),
+            ("diameter_rms_pct", truth["diameter_rms_pct"], -math.inf, math.inf),
+            ("diameter_held", truth["diameter_covered"], 0.9, math.inf),
+            ("stations_missing_in_silence", silent, -math.inf, 0),
+            ("findings", sum(len(s.tube.events) for s in measured.measured), -math.inf, 0),
+        ]
+    rows: list[Limits] = [
+        ("diameter_rms_pct", truth["diameter_rms_pct"], -math.inf, 0.5),
+        ("diameter_scatter_pct", truth["diameter_scatter_pct"], -math.inf, math.inf),
+        ("encoder_pct", truth["encoder_pct"], -math.inf, math.inf),
+        ("diameter_held", truth["diameter_covered"], 0.9, math.inf),
+        ("ovality_rms_points", truth["ovality_rms_points"], -math.inf, 0.3),
+        ("share_measured", truth["stations_measured"] / truth["stations"], 0.95, math.inf),
+    ]
+    if truth["bend_degrees"] is not None:
+        rows.append(("bend_degrees", truth["bend_degrees"], -math.inf, 0.5))
+    return rows + findings(measured, scene)
