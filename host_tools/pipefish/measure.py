@@ -487,7 +487,7 @@ def _sigmas(m: Measurement) -> None:
     camera nor wheel. Random: what the encoder's noise, the poses and the points leave open, the wheel's scale taken
     out; systematic: that scale and the camera."""
     found = {s.segment: diameter_sigma(m.structure, s.segment, s.tube) for s in m.measured}
-    ratios = []
+    cameras: dict[int, np.ndarray] = {}  # of each stretch, relative, at the stations
     for stretch in m.measured:
         exact, factor, stations = found[stretch.segment], m.factors[stretch.segment], stretch.tube.stations
         stretch.d_mean_sigma = stretch.tube.summary["d_mean_sigma"]
@@ -495,8 +495,7 @@ def _sigmas(m: Measurement) -> None:
             continue
         d = stations["d_mean"]
         if exact.camera is not None:
-            camera = factor * np.interp(stations["s"], exact.s, exact.camera) / d
-            ratios.append(camera[np.isfinite(camera)])
+            cameras[stretch.segment] = factor * np.interp(stations["s"], exact.s, exact.camera) / d
         if m.scale.source != "encoder":  # the scale is given: of the wander along the path the tube's sigma tells
             continue
         wheel = m.scale.sigma
@@ -512,11 +511,12 @@ def _sigmas(m: Measurement) -> None:
         mean = stretch.tube.summary["d_mean"]
         rest = math.sqrt(max(0.0, exact.mean_random**2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
-    m.camera_sigma = float(np.median(np.concatenate(ratios))) if ratios else None
+    m.camera_sigma = float(np.nanmedian(np.concatenate(list(cameras.values())))) if cameras else None
     for stretch in m.measured:
         stations = stretch.tube.stations
         for name in [n for n in stations if n.endswith("_systematic")]:
-            stations[name] = m.systematic * stations[name.removesuffix("_systematic")]
+            shared = np.hypot(m.scale.sigma, cameras.get(stretch.segment, 0.0))
+            stations[name] = shared * stations[name.removesuffix("_systematic")]
 
 
 def mean_diameter(m: Measurement) -> tuple[float, float]:

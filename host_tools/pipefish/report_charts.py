@@ -269,7 +269,8 @@ class Charts:
         return {
             "id": "tube",
             "title": "The pipe in 3-D",
-            "text": "Drag to turn, wheel or two fingers to come nearer; the points are switched on in the legend. Colour: the wall's radius against "
+            "text": "Drag to turn, wheel or two fingers to come nearer; the points are switched on in the legend. "
+            "Colour: the wall's radius against "
             f"{'nominal' if self.summary['nominal'] and self.unit == 'metre' else 'the mean'}.",
             "data": data,
             "layout": {

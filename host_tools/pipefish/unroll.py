@@ -16,7 +16,7 @@ from pipefish.errors import ArgumentError, PipefishError
 from pipefish.wall import Piece, Wall
 
 REACH = 1.1  # diameters from the eye up to which a keyframe shows the wall: one along the pipe
-NODE = 1 / 80  # diameters from node to node: between them pixels are interpolated, to 0.05 px
+NODE = 1 / 50  # diameters from node to node: between them pixels are interpolated, f / 8000 px off at most
 MOST_STEP = 16  # cells from node to node
 STRIP = 512  # cells of the pipe's length that are drawn at a time
 SAMPLE_EVERY, SAMPLES_AROUND, SAMPLE_SIDE = 0.1, 12, 0.02  # of balancing: diameters, places, diameters

@@ -13,10 +13,10 @@ namespace pipefish::unroll
 namespace
 {
 
-constexpr double RIM = 24.0;      // pixels over which a picture fades out towards its rim
-constexpr double LEAST_COS = 0.1; // of incidence: flatter looks show nothing
-constexpr double FADE_COS = 0.15; // and fade out over this
-constexpr double FADE_REACH = 0.1;
+constexpr double RIM = 24.0;           // pixels over which a picture fades out towards its rim
+constexpr double LEAST_COS = 0.1;      // of incidence: flatter looks show nothing
+constexpr double FADE_COS = 0.15;      // and fade out over this
+constexpr double FADE_REACH = 0.1;     // share of the reach over which a look fades out
 constexpr int CLIPPED = 250, DARK = 3; // greys beyond which nothing is known of the wall
 constexpr int SAMPLES = 4;             // most, a cell and direction
 constexpr double CLIPPED_WEIGHT = 0.003;
@@ -228,8 +228,9 @@ Look look(const pf_camera &camera, const Pose &pose, const Spot &spot, double re
     const double half = 0.5 * out.j.squaredNorm(), det = out.j.determinant();
     const double root = std::sqrt(std::max(0.0, half * half - det * det));
     out.coarse = std::sqrt(half + root);
-    out.fine =
-        std::abs(det) / out.coarse * std::min(1.0, margin / RIM) * std::min(1.0, (facing - LEAST_COS) / FADE_COS);
+    out.fine = std::abs(det) / out.coarse * std::min(1.0, margin / RIM) *
+               std::min(1.0, (facing - LEAST_COS) / FADE_COS) *
+               std::min(1.0, (reach - distance) / (FADE_REACH * reach));
     out.fall_off = std::log(facing) - 2.0 * std::log(distance);
     out.seen = out.fine > 0.0;
     return out;
