@@ -34,6 +34,10 @@ DRIFT = {
     "centre v": 15.0,
 }
 UNITS = {"angle scale": "%", "alpha": "%", "bend": "", "centre u": "px", "centre v": "px"}
+# A drive that never turns its axis by this much within TURN_KEYFRAMES, about as far as a point is seen, is taken for
+# straight: what the adjustment would read from smaller turns is mostly its own noise, which adds up with the length.
+TURN_LEAST = math.radians(2.0)
+TURN_KEYFRAMES = 10
 SEEN = 4.0  # information over that of the drift's prior, from which on a combination counts as observed
 
 VERDICTS = {
@@ -193,6 +197,12 @@ def check_profile(
     )
     if found.camera_change is None:
         return _nothing(budget, f"nothing was measured: {found.reason}")
+    if diameter is None and _largest_turn(found) < TURN_LEAST:
+        return _nothing(
+            budget,
+            "the camera never panned, tilted or went round a bend; a known diameter beside the encoder "
+            "would show a drift",
+        )
     border = found.parts[0][1].border[-8:, -8:]
     # In units of the drift's sigmas; what of a change is no drift belongs to the profile's own covariance.
     scaled = directions * drift
@@ -205,6 +215,17 @@ def check_profile(
     if diameter is not None and found.unit == "metre":
         value, spread, evidence = _with_diameter(found, camera, diameter, diameter_sigma, value, spread, slope)
     return _judge(camera, value, spread, before, own_part, slope, drift, budget, evidence)
+
+
+def _largest_turn(found: Any) -> float:
+    """Largest angle of the optical axis between keyframes of a stretch up to TURN_KEYFRAMES apart, radians."""
+    most = 0.0
+    for number in np.unique(found.segment):
+        axes = found.poses[found.segment == number, 2, :3]
+        for apart in range(1, min(TURN_KEYFRAMES, len(axes) - 1) + 1):
+            cosines = np.einsum("ni,ni->n", axes[apart:], axes[:-apart])
+            most = max(most, float(np.arccos(np.clip(cosines, -1, 1)).max()))
+    return most
 
 
 def _nothing(budget: float, why: str) -> ProfileCheck:

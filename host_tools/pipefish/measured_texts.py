@@ -54,7 +54,7 @@ def size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
         yield e["detail"]
         return
     if e["kind"] == "bend":
-        yield f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.1f}°"
+        yield f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
         if e.get("radius"):
             yield f"radius {length_text(e['radius'], unit, metres=True)}"
         yield f"from {length_text(e['start'], unit, metres=True)} to {length_text(e['end'], unit, metres=True)}"

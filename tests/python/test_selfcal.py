@@ -169,6 +169,11 @@ def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius():
         assert found["alpha_sigma"] > 2 * BUDGET
 
 
+def test_turns_that_noise_feigns_in_a_straight_drive_count_for_nothing():
+    """They would leave sigma(alpha) at a few per cent, less with the length: so little was not seen."""
+    assert health_of(3, "straight", "alpha", density=400.0)["alpha_sigma"] == math.inf
+
+
 def test_chi2_tail_against_tables():
     for value, degrees, tail in ((3.841, 1, 0.05), (5.991, 2, 0.05), (7.815, 3, 0.05), (13.277, 4, 0.01)):
         assert _chi2_tail(value, degrees) == pytest.approx(tail, rel=2e-3)
