@@ -12,22 +12,25 @@ from pipefish.errors import ArgumentError, PipefishError
 
 def run_dense(args: argparse.Namespace) -> Result:
     """Measures the wall of a reconstructed survey densely."""
-    from pipefish.dense import dense_wall
-    from pipefish.dense_files import read_survey_of, write_dense
+    from pipefish.dense import DenseWall, dense_wall
+    from pipefish.dense_files import Strip, strips_of, write_dense
     from pipefish.measured_texts import length_text
     from pipefish.progress import Progress
+    from pipefish.wall import read_wall
 
-    measured = read_survey_of(Path(args.measured), Path(args.survey) if args.survey else None)
-    maps = []
+    measured = read_wall(Path(args.measured), Path(args.survey) if args.survey else None)
+    strips = strips_of(measured.pieces)
+    maps: list[DenseWall] = []
+    mapped: list[Strip] = []
     problem: ArgumentError | None = None
-    with Progress("dense", 100 * len(measured.walls), args.json) as bar:
-        for n, wall in enumerate(list(measured.walls)):
+    with Progress("dense", 100 * len(strips), args.json) as bar:
+        for n, strip in enumerate(strips):
             try:
                 found = dense_wall(
                     measured.picture,
                     measured.camera,
                     measured.poses,
-                    wall,
+                    strip.wall,
                     cell=args.cell / 1000 if args.cell else None,
                     scale=args.scale,
                     threads=args.threads,
@@ -36,12 +39,11 @@ def run_dense(args: argparse.Namespace) -> Result:
             except ArgumentError as error:
                 problem = error
                 continue
-            maps.append((n, found))
+            maps.append(found)
+            mapped.append(strip)
         if not maps:
             raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
-        for values in (measured.walls, measured.origins, measured.signs):
-            values[:] = [values[n] for n, _ in maps]
-        document, files = write_dense(Path(args.output), [found for _, found in maps], measured)
+        document, files = write_dense(Path(args.output), maps, mapped, measured.unit)
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
     rows: list[tuple[str, object]] = [

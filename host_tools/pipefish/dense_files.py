@@ -1,5 +1,4 @@
-"""What `pipefish dense` reads, a folder of `pipefish reconstruct` with its survey, and what it writes: the map of the
-wall as tables, arrays, a picture and a point cloud."""
+"""What `pipefish dense` writes: the map of the wall as tables, arrays, a picture and a point cloud."""
 
 from __future__ import annotations
 
@@ -14,83 +13,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipefish.camera import Camera
 from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.dense import DenseWall
-from pipefish.errors import FormatError
 from pipefish.files import write_atomically
 from pipefish.measured_files import plain
-from pipefish.measured_texts import clock_text, column, read_measured
-from pipefish.survey import Survey
-from pipefish.wallmodel import Floats, WallModel, read_walls
+from pipefish.measured_texts import clock_text
+from pipefish.wall import Piece
+from pipefish.wallmodel import Floats, WallModel
 
 FORMAT, VERSION = "pipefish-dense", 1
 MAP_WIDTH = 3000  # pixels at most; cells are drawn up to 3 x 3
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """A measured survey: its camera, keyframes with poses (n,3,4) and pictures, the pieces of its tube, each with the
-    chainage at its start and the way it grows along s."""
+class Strip:
+    """A piece of a measured wall: its chainage where s begins, and the way it grows along s."""
 
-    document: dict[str, Any]
-    survey: Survey
-    camera: Camera
-    keyframes: list[int]
-    poses: Floats
-    walls: list[WallModel]
-    origins: list[float]
-    signs: list[int]
-
-    def picture(self, k: int) -> NDArray[np.uint8]:
-        """Of the k-th pose."""
-        return np.asarray(self.survey.keyframes[self._places[self.keyframes[k]]].image)
-
-    @property
-    def _places(self) -> dict[int, int]:
-        return {frame.index: place for place, frame in enumerate(self.survey.keyframes)}
+    wall: WallModel
+    origin: float
+    sign: int
 
 
-def read_survey_of(folder: Path, survey: Path | None) -> Measured:
-    """The folder's tables and the survey it was made of, at `survey` or where it was. Raises FormatError, OSError."""
-    document = read_measured(folder)
-    path = folder / "reconstruction.json"
-    try:
-        poses, camera = document["poses"], Camera.from_document(document["camera"]["profile"], path)
-        rotations = _rotations(np.array(poses["quaternion"], float).reshape(-1, 4))
-        matrices = np.concatenate([rotations, np.array(poses["translation"], float).reshape(-1, 3, 1)], axis=2)
-        index = [int(k) for k in poses["keyframe"]]
-        place = np.column_stack([column(document, name) for name in ("x", "y", "z")])
-        tangent = np.column_stack([column(document, name) for name in ("tx", "ty", "tz")])
-        chainage, stretch = column(document, "chainage"), np.array(document["stations"]["stretch"])
-        signs = {t["stretch"]: int(t["chainage_sign"]) for t in document["tubes"]}
-        source = document["survey"]["file"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(path, None, f"not whole: {error!r:.80}") from None
-    opened = Survey.open(survey or source)
-    lacking = sorted(set(index) - {k.index for k in opened.keyframes})
-    if opened.survey_id != document["survey"]["survey_id"] or lacking:
-        raise FormatError(opened.path, None, f"is not the survey that {folder} was made of")
-    walls = read_walls(folder)
-    origins, ways = [], []
-    for wall in walls:
-        start = wall.frames([0.0])[0][0]
-        k = int(np.linalg.norm(place - start, axis=1).argmin())
-        ways.append(signs[int(stretch[k])])
-        origins.append(float(chainage[k] + ways[-1] * ((start - place[k]) @ tangent[k])))
-    return Measured(document, opened, camera, index, matrices, walls, origins, ways)
-
-
-def _rotations(q: Floats) -> Floats:
-    """(n,4) unit quaternions (w, x, y, z) -> (n,3,3)."""
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+def strips_of(pieces: list[Piece]) -> list[Strip]:
+    """The pieces with s as WallModel counts it: along the tube, whichever way the chainage goes."""
+    return [Strip(WallModel(p.rings[:: p.sign]), p.start if p.sign > 0 else p.end, p.sign) for p in pieces]
 
 
 def _table(first: str, along: Floats, clock: Floats, values: Floats) -> bytes:
@@ -179,14 +126,14 @@ def cloud(found: DenseWall, unit: str) -> bytes:
     return ply_bytes(columns, None, (f"unit: {unit}", f"full colour at {span:.6g} off the fitted tube"))
 
 
-def document_of(maps: list[DenseWall], measured: Measured) -> dict[str, Any]:
+def document_of(maps: list[DenseWall], strips: list[Strip], unit: str) -> dict[str, Any]:
     """The document of dense.json."""
     regions = []
-    for n, (found, origin, sign) in enumerate(zip(maps, measured.origins, measured.signs, strict=True)):
+    for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
         for r in found.regions:
             place = {
                 "piece": n,
-                "chainage": origin + sign * r["s"],
+                "chainage": strip.origin + strip.sign * r["s"],
                 "kind": "inwards" if r["height"] < 0 else "outwards",
             }
             regions.append(place | r | {"clock_text": clock_text(r["clock"])})
@@ -196,7 +143,7 @@ def document_of(maps: list[DenseWall], measured: Measured) -> dict[str, Any]:
         {
             "format": FORMAT,
             "version": VERSION,
-            "unit": measured.document["summary"]["unit"],
+            "unit": unit,
             "cells": sum(f.deviation.size for f in maps),
             "measured": len(values),
             "coverage": float(np.mean([f.coverage for f in maps])) if maps else 0.0,
@@ -209,17 +156,18 @@ def document_of(maps: list[DenseWall], measured: Measured) -> dict[str, Any]:
     )
 
 
-def write_dense(folder: Path, maps: list[DenseWall], measured: Measured) -> tuple[dict[str, Any], list[str]]:
+def write_dense(
+    folder: Path, maps: list[DenseWall], strips: list[Strip], unit: str
+) -> tuple[dict[str, Any], list[str]]:
     """Writes dense.json, and of each piece dense.npz, deviation.csv, sigma.csv, dense.png, dense.ply (from the second
     piece on with its number). Returns the document and the paths. Raises OSError."""
     from PIL import Image
 
-    unit = measured.document["summary"]["unit"]
     factor, length = (1000.0, "mm") if unit == "metre" else (1.0, "diameters")
     contents: dict[str, bytes] = {}
-    for n, (found, origin, sign) in enumerate(zip(maps, measured.origins, measured.signs, strict=True)):
+    for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
         end = "" if n == 0 else f"-{n + 1}"
-        chainage = origin + sign * found.s
+        chainage = strip.origin + strip.sign * found.s
         packed, picture = io.BytesIO(), io.BytesIO()
         arrays = {"deviation": found.deviation, "sigma": found.sigma, "pairs": found.pairs}
         np.savez_compressed(
@@ -238,7 +186,7 @@ def write_dense(folder: Path, maps: list[DenseWall], measured: Measured) -> tupl
         contents[f"sigma{end}.csv"] = _table(corner, chainage, found.clock, factor * found.sigma)
         contents[f"dense{end}.png"] = picture.getvalue()
         contents[f"dense{end}.ply"] = cloud(found, unit)
-    document = document_of(maps, measured)
+    document = document_of(maps, strips, unit)
     document["files"] = [*contents, "dense.json"]
     contents["dense.json"] = json.dumps(document).encode()  # last: what is there is whole
     folder.mkdir(parents=True, exist_ok=True)

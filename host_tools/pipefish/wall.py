@@ -145,7 +145,16 @@ def read_wall(folder: Path, survey: Path | None = None) -> Wall:
 
     Raises PipefishError, OSError."""
     document = read_measured(folder)
-    pieces = pieces_of(read_columns(folder / "tube.ply"), document, folder / "tube.ply")
+    try:
+        pieces = pieces_of(read_columns(folder / "tube.ply"), document, folder / "tube.ply")
+        return wall_of(document, pieces, _survey_of(folder, document, survey))
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, PipefishError):
+            raise
+        raise FormatError(folder / "reconstruction.json", None, f"not whole: {error!r:.80}") from None
+
+
+def _survey_of(folder: Path, document: dict[str, Any], survey: Path | None) -> Survey:
     path = survey or Path(document["survey"]["file"])
     if not path.exists() and survey is None and (folder.parent / path.name).exists():
         path = folder.parent / path.name  # the two were moved together
@@ -154,7 +163,7 @@ def read_wall(folder: Path, survey: Path | None = None) -> Wall:
     opened = Survey.open(path)
     if opened.survey_id != document["survey"]["survey_id"]:
         raise PipefishError(f"{path}: is not the survey that was measured ({document['survey']['survey_id']})")
-    return wall_of(document, pieces, opened)
+    return opened
 
 
 def measured_wall(m: Measurement, document: dict[str, Any]) -> Wall:

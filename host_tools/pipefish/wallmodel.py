@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipefish.camera import Camera
-from pipefish.cloudfile import read_columns
-from pipefish.errors import ArgumentError, FormatError
+from pipefish.errors import ArgumentError
 from pipefish.matching import Seeds
-from pipefish.measured_files import RING
 
 Floats = NDArray[np.float64]
 
@@ -151,15 +148,3 @@ def predicted_seeds(wall: WallModel, camera: Camera, pose1: Floats, pose2: Float
     there, ok = there.reshape(5, -1, 2), ok.reshape(5, -1).all(axis=0)
     affine = np.stack([there[1] - there[2], there[3] - there[4]], axis=2)
     return Seeds(pixels[ok], there[0][ok], affine[ok])
-
-
-def read_walls(folder: Path) -> list[WallModel]:
-    """The pieces of tube.ply of a measured folder, in order. Raises FormatError, OSError."""
-    path = folder / "tube.ply"
-    columns = read_columns(path)
-    count = len(columns["x"])
-    if "piece" not in columns or count == 0 or count % RING:
-        raise FormatError(path, "vertex", f"not rings of {RING} with their piece")
-    rings = np.column_stack([columns[k] for k in "xyz"]).astype(float).reshape(-1, RING, 3)
-    piece = columns["piece"].reshape(-1, RING)[:, 0]
-    return [WallModel(rings[piece == k]) for k in np.unique(piece) if (piece == k).sum() >= 2]

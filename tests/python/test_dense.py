@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_columns
 from pipefish.dense import DenseWall, find_regions
+from pipefish.dense_files import strips_of
 from pipefish.measured_files import RING
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
-from pipefish.wallmodel import predicted_seeds, read_walls
+from pipefish.wall import pieces_of
+from pipefish.wallmodel import predicted_seeds
 from synthetic import BOOT, SURVEY, as_object, write_survey
 
 Floats = NDArray[np.float64]
@@ -238,6 +241,14 @@ def test_predicted_seeds_are_exact_on_the_wall_that_they_assume() -> None:
 # ---- the command
 
 
+def wall_columns(points: NDArray[np.float64], chainage: Any) -> dict[str, NDArray[Any]]:
+    """tube.ply of one piece: rings (n RING, 3) at these chainages (n,)."""
+    columns = dict(zip("xyz", points.reshape(-1, 3).T.astype(np.float32), strict=True))
+    nothing = np.zeros(len(columns["x"]), np.int32)
+    columns |= {"deviation": nothing.astype(np.float32), "piece": nothing, "stretch": nothing}
+    return columns | {"chainage": np.repeat(np.asarray(chainage, float), RING)}
+
+
 def measured_folder(folder: Path, pictures: list[NDArray[np.uint8]]) -> Path:
     """What `pipefish reconstruct` leaves, as far as `dense` reads it, and the survey, with every second cell's work."""
     begin = pb.SurveyStart(survey_id=SURVEY, name="made-up", software="test", width=SIZE, height=SIZE)
@@ -253,22 +264,21 @@ def measured_folder(folder: Path, pictures: list[NDArray[np.uint8]]) -> Path:
     finish = pb.SurveyEnd(survey_id=SURVEY, keyframes=len(pictures), frames=len(pictures), boots=1, reason="done")
     write_survey(folder / "survey.mcap", objects=[*objects, as_object(OBJECT_END, finish)])
     points = rings()
-    columns = dict(zip("xyz", points.reshape(-1, 3).T.astype(np.float32), strict=True))
-    columns["piece"] = np.zeros(len(columns["x"]), np.int32)
-    (folder / "tube.ply").write_bytes(ply_bytes(columns))
+    (folder / "tube.ply").write_bytes(ply_bytes(wall_columns(points, 4.9 + points[:, 0, 2])))
     from pipefish.simulate import quaternion
 
     z = [0.1, 0.4, 0.7]
     document = {
         "format": "pipefish-reconstruction",
         "version": 1,
-        "summary": {"unit": "metre"},
+        "summary": {"unit": "metre", "d_mean": 2 * R},
         "survey": {"file": str(folder / "survey.mcap"), "survey_id": SURVEY.hex()},
         "camera": {"profile": json.loads(CAMERA.to_json())},
         "poses": {
             "keyframe": list(range(FRAMES)),
             "quaternion": [quaternion(p[:, :3]).tolist() for p in POSES],
             "translation": POSES[:, :, 3].tolist(),
+            "stretch": [0] * FRAMES,
         },
         "stations": {
             "stretch": [0, 0, 0],
@@ -333,10 +343,16 @@ def test_another_survey_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "is not the survey that" in capsys.readouterr().err
 
 
-def test_pieces_of_a_tube_stay_apart(tmp_path: Path) -> None:
+def test_pieces_of_a_tube_stay_apart_and_their_chainage_runs_either_way(tmp_path: Path) -> None:
     both = np.concatenate([rings(end=0.4), rings(1.01 * R, start=0.45)])
-    columns = dict(zip("xyz", both.reshape(-1, 3).T.astype(np.float32), strict=True))
-    columns["piece"] = np.repeat([0] * len(rings(end=0.4)) + [1] * len(rings(start=0.45)), RING).astype(np.int32)
-    (tmp_path / "tube.ply").write_bytes(ply_bytes(columns))
-    walls = read_walls(tmp_path)
-    assert len(walls) == 2 and abs(walls[1].mean_radius / walls[0].mean_radius - 1.01) < 1e-4
+    first, s = len(rings(end=0.4)), both[:, 0, 2]
+    for sign in (1, -1):
+        columns = wall_columns(both, 7.0 + sign * s)
+        columns["piece"] = np.repeat([0, 1], [first * RING, (len(both) - first) * RING]).astype(np.int32)
+        document = {"tubes": [{"stretch": 0, "chainage_sign": sign}]}
+        strips = strips_of(pieces_of(columns, document, tmp_path))
+        strips.sort(key=lambda strip: strip.sign * strip.origin)
+        assert len(strips) == 2 and abs(strips[1].wall.mean_radius / strips[0].wall.mean_radius - 1.01) < 1e-4
+        for strip in strips:  # the wall's own s and the chainage tell the same places
+            z = strip.wall.points([0.05], [1.0])[0][2]
+            assert abs(strip.origin + strip.sign * 0.05 - (7.0 + sign * z)) < 1e-3
