@@ -290,7 +290,9 @@ def _judge(
             "A bend, panning and tilting, or a known diameter beside the encoder would show it."
         )
         if moved:
-            text += f" What can be seen has changed, though: {what}; recalibrate."
+            text += f" What can be seen does not fit the profile, though: {what}. Recalibrate where limits are tight"
+            pupil = ", with the pupil shift: a profile without one does that too." if camera.pupil_e1 == 0 else "."
+            text += pupil
     elif moved:
         verdict = VERDICTS["drifted"]
         text = f"The profile has drifted: {what}; {open_text}. Recalibrate the camera."
