@@ -19,7 +19,8 @@ from accept_recon import FOLDER
 import pipefish as pf
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.errors import PipefishError
-from pipefish.measure import Measurement, measure, not_measured
+from pipefish.measure import Measurement, measure
+from pipefish.measured_remarks import not_measured
 from pipefish.measuretruth import against_truth
 from pipefish.simulate import Scene, simulate
 from pipefish.survey import Survey
