@@ -54,66 +54,52 @@ def check_link_goodput() -> list[dict]:
     ]
 
 
+def rows_of(script: str, *arguments: object, python: object = sys.executable, **environment: str) -> list[dict]:
+    """The rows that a script of long tests prints; it resumes by itself."""
+    done = run(python, f"tests/{script}", *arguments, **environment)
+    print(done.stderr, file=sys.stderr)
+    if done.returncode != 0:
+        raise SystemExit(f"{script} failed: {done.stderr.strip()}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def peers_path() -> str:
+    """OpenCV for this environment's Python."""
+    peers = next((BUILD / "venv-peers/lib").glob("python3*/site-packages"), None)
+    if peers is None:
+        raise SystemExit("build/venv-peers is missing: `make accept` installs it")
+    return str(peers)
+
+
 def check_track() -> list[dict]:
     """The tracker's accuracy on closed-form images; the benchmark's OpenCV beside it if `make bench` got one."""
     peers = BUILD / "venv-peers/bin/python"
-    done = run(peers if peers.exists() else sys.executable, "tests/accept_track.py")
-    if done.returncode != 0:
-        raise SystemExit(f"accept_track.py failed: {done.stderr.strip()}")
-    print(done.stderr, file=sys.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+    return rows_of("accept_track.py", python=peers if peers.exists() else sys.executable)
 
 
 def check_pipes() -> list[dict]:
     """The whole chain in 24 simulated pipes: material, diameter, speed; the truth and OpenCV beside it."""
-    peers = next((BUILD / "venv-peers/lib").glob("python3*/site-packages"), None)  # OpenCV beside this environment
-    if peers is None:
-        raise SystemExit("build/venv-peers is missing: `make accept` installs it")
-    done = run(sys.executable, "tests/accept_pipes.py", PYTHONPATH=str(peers))
-    print(done.stderr, file=sys.stderr)
-    if done.returncode != 0:
-        raise SystemExit(f"accept_pipes.py failed: {done.stderr.strip()}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return rows_of("accept_pipes.py", PYTHONPATH=peers_path())
 
 
 def check_recognise() -> list[dict]:
     """Objects in simulated and in real scenes, beside OpenCV's SIFT."""
-    peers = next((BUILD / "venv-peers/lib").glob("python3*/site-packages"), None)  # OpenCV beside this environment
-    if peers is None:
-        raise SystemExit("build/venv-peers is missing: `make accept` installs it")
-    command = (sys.executable, "tests/accept_recognise.py", "--pictures", BUILD / "accept/recognise")
-    done = run(*command, PYTHONPATH=str(peers))
-    print(done.stderr, file=sys.stderr)
-    if done.returncode != 0:
-        raise SystemExit(f"accept_recognise.py failed: {done.stderr.strip()}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return rows_of("accept_recognise.py", "--pictures", BUILD / "accept/recognise", PYTHONPATH=peers_path())
 
 
 def check_calib() -> list[dict]:
-    """Calibration over random set-ups, against theory, and on real data where they are; resumes by itself."""
-    done = run(sys.executable, "tests/accept_calib.py")
-    print(done.stderr, file=sys.stderr)
-    if done.returncode != 0:
-        raise SystemExit(f"accept_calib.py failed: {done.stderr.strip()}")
-    return json.loads(done.stdout.splitlines()[-1])
+    """Calibration over random set-ups, against theory, and on real data where they are."""
+    return rows_of("accept_calib.py")
 
 
 def check_selfcal() -> list[dict]:
-    """Self-calibration and the profile's health check over random set-ups and on real data; resumes by itself."""
-    done = run(sys.executable, "tests/accept_selfcal.py")
-    print(done.stderr, file=sys.stderr)
-    if done.returncode != 0:
-        raise SystemExit(f"accept_selfcal.py failed: {done.stderr.strip()}")
-    return json.loads(done.stdout.splitlines()[-1])
+    """Self-calibration and the profile's health check over random set-ups and on real data."""
+    return rows_of("accept_selfcal.py")
 
 
 def check_recon() -> list[dict]:
-    """Reconstruction and tube against theory, and in rendered pipes; resumes by itself."""
-    done = run(sys.executable, "tests/accept_recon.py")
-    print(done.stderr, file=sys.stderr)
-    if done.returncode != 0:
-        raise SystemExit(f"accept_recon.py failed: {done.stderr.strip()}")
-    return json.loads(done.stdout.splitlines()[-1])
+    """Reconstruction and tube against theory, and in rendered pipes."""
+    return rows_of("accept_recon.py")
 
 
 def check_link_seeds() -> list[dict]:
