@@ -96,6 +96,7 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
         sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
         views = views_of(given, sightings)
         refuse_too_few(given, sightings)
+        refuse_wrong_size(given, sightings)
         if len(given.cameras) == 1:
             options["image_circle"] = circle_around(brightest[0], views)
         for turn in range(_ROUNDS):
@@ -184,6 +185,24 @@ def refuse_too_few(given: Given, sightings: Sequence[Sighting]) -> None:
             f"15{why}{most}"
             f"{ask}"
         )
+
+
+def refuse_wrong_size(given: Given, sightings: Sequence[Sighting]) -> None:
+    """Raises CalibrationError where most pictures show all of a target but one outer row, and none shows half of that:
+    the target has a row less than was said, and what was found of it is no target. It would look calibrated."""
+    for board, target in enumerate(given.targets):
+        xy = np.round(target.points[:, :2], 9)
+        mine = [set(s.ids.tolist()) for s in sightings if s.board == board and s.usable]
+        for axis, what in ((1, "row"), (0, "column")):
+            for end in (xy[:, axis].min(), xy[:, axis].max()):
+                line = set(np.flatnonzero(xy[:, axis] == end).tolist())
+                rest = set(range(len(xy))) - line
+                whole = sum(rest <= seen for seen in mine)
+                if len(mine) >= 3 and 2 * whole >= len(mine) and all(2 * len(seen & line) < len(line) for seen in mine):
+                    raise CalibrationError(
+                        f"the target has a {what} of points less than --target says: {whole} of {len(mine)} pictures "
+                        f"show all of it but an outer {what}, and none shows half of that"
+                    )
 
 
 def look_again(

@@ -31,6 +31,8 @@ def verdict(
         bound = _TWO_SIDED * pipe["sigma_mm"]
         if math.isfinite(pipe.get("spread_mm", math.nan)):
             bound = max(bound, _STUDENT * pipe["spread_mm"])
+        else:  # too few views for parts, or parts that saw too little: what the halves tell
+            bound *= max(1.0, halves or 1.0)
         bound = math.hypot(bound, _UNSEEN * pipe["dn_mm"])
         known = math.isfinite(bound)
         pipes.append(

@@ -10,6 +10,7 @@ import pytest
 
 from calib_data_sets import jy_stereo, ov_plane, pictures
 from pipefish.calibration import calibrate
+from pipefish.cli import main
 
 
 def test_the_same_minimum_as_opencv(real_data: Callable[[str], Path]) -> None:
@@ -77,3 +78,15 @@ def test_pictures_of_a_stereo_pair(real_data: Callable[[str], Path]) -> None:
     result = calibrate(left + right, size, "p9", "shape")
     assert result.rms < 0.29384  # what is left of the data's own corners, one camera alone
     assert 0.095 < np.linalg.norm(result.camera_poses[1][:, 3]) < 0.105
+
+
+def test_a_board_with_a_row_less_than_was_said_is_refused(
+    real_data: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Stray corners beyond its edge were once taken for that row in half of the pictures, and the lens was "usable"."""
+    target, out = tmp_path / "board.pdf", tmp_path / "camera.json"
+    pictures = str(real_data("calibration/camodocal"))
+    grid = ["--grid", "10x8", "--spacing", "60", "--paper", "700x600"]
+    assert main(["target", "checkerboard", *grid, "-o", str(target)]) == 0
+    assert main(["calibrate", pictures, "--target", str(target.with_suffix(".json")), "-o", str(out)]) == 1
+    assert "a row of points less" in capsys.readouterr().err and not out.exists()
