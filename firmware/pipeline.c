@@ -60,17 +60,18 @@ size_t pf_pipeline_object_max(const pf_daemon *d)
 static bool open_shots(pf_pipeline *p, char *error, size_t n)
 {
     const pf_camera_info *info = p->daemon->camera.ops->info(p->daemon->camera.self);
+    const bool is_copied = p->is_stretched || !p->daemon->config.camera.zero_copy;
     for (uint32_t i = 0; i < SHOTS; i++) {
-        if (p->is_stretched || !p->daemon->config.camera.zero_copy) {
-            p->shot[i].pixels = malloc((size_t)info->width * info->height);
-            if (p->shot[i].pixels == NULL)
-                break;
+        pf_shot *shot = &p->shot[i];
+        if (is_copied)
+            shot->pixels = malloc((size_t)info->width * info->height);
+        shot->tracks = calloc(2 * (size_t)p->daemon->config.tracker.max_tracks, sizeof *shot->tracks);
+        if (shot->tracks == NULL || (is_copied && shot->pixels == NULL)) {
+            (void)snprintf(error, n, "no memory for frames");
+            return false;
         }
-        p->shot[i].tracks = calloc(2 * (size_t)p->daemon->config.tracker.max_tracks, sizeof *p->shot[i].tracks);
     }
-    if (p->shot[SHOTS - 1].tracks == NULL)
-        (void)snprintf(error, n, "no memory for frames");
-    return p->shot[SHOTS - 1].tracks != NULL;
+    return true;
 }
 
 /* A camera of limited range would never be dark, nor saturated, to any of the tracker's limits. */

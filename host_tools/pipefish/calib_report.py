@@ -362,6 +362,8 @@ def diameter_spread(fit: Fit, cameras: list[Camera]) -> list[list[float]]:
         part.used = fit.used & ~np.isin(frame_of_point, frames[k::JACKKNIFE])
         part.fit(fit.model, iterations=40, tolerance=1e-8)
         for c, camera in enumerate(cameras):
+            if not (part.used & (fit.data.camera_of[fit.data.view_of] == c)).any():
+                continue  # all its views are in this part: what it depends on is not known
             other = _camera_of(_bounded(part, c), part, c)
             if other is not None:
                 found[c, :, k] = [_diameter_by(other, camera, dn) for dn in DN]

@@ -102,7 +102,8 @@ class Stills(ObjectHandlers):
 
     def on_up(self, event: Any) -> None:
         # What was asked may be lost with the session; a still that was under way goes on.
-        self._asked, self._accepted = None, self._offered and not event.peer_restarted
+        self._offered = self._offered and not event.peer_restarted
+        self._asked, self._accepted = None, self._offered
         self._state = ""
 
     def on_offer(self, name: bytes, kind: int, size: int) -> int | None:
@@ -129,7 +130,7 @@ class Stills(ObjectHandlers):
     def take(self) -> Still:
         """The camera's next frame. Raises SurveyOver, NoDevice, PipefishError with the device's words."""
         self._still, self._asked, self._accepted, self._offered = None, None, False, False
-        ask_at = 0.0
+        ask_at = accepted_at = 0.0
         silence = self._timeout_s
         while self._still is None:
             self.client.run(lambda: self.client.up, silence)
@@ -137,8 +138,17 @@ class Stills(ObjectHandlers):
             if not self._accepted and self._asked is None and now >= ask_at:
                 with contextlib.suppress(NoDevice):  # gone this moment: asked again when it is back
                     self._asked = self.client.ask(get_still=pb.Nothing())
-            if self._is_accepted() is False:
+            answer = self._is_accepted()
+            if answer is False:
                 self._asked, ask_at = None, now + _ASK_AGAIN_S
+            elif answer is True:
+                accepted_at = now
+            waits = self._accepted and not self._offered and self.client.up
+            if waits and self._timeout_s and now - accepted_at > self._timeout_s:
+                raise NoDevice(
+                    f"the device said that a still comes, and none came for {self._timeout_s:g} s: no camera, or "
+                    "frames too large to be sent; its log says"
+                )
             over = self._state not in ("", "surveying") and now - self._over_since > _OVER_S
             if over and not self._offered:
                 raise SurveyOver("the device's survey is over: its camera gives no more frames")

@@ -27,7 +27,7 @@ class Device(threading.Thread):
     corrupt_every  one byte in so many is flipped on its way to the host
     survey_id      what Info and Status tell; b"" tells nothing
     state          what Status tells
-    stills         RawFrame messages, sent one for each get_still; then the survey is over
+    stills         RawFrame messages, one for each get_still (b"": promised, never sent); then the survey is over
     most           so many objects are given to the link, over all connections; may be raised at any time
     """
 
@@ -148,7 +148,8 @@ class Device(threading.Thread):
                 reply.error = "still: one is under way: try again"
             case "get_still" if self.stills:
                 data = self.stills.pop(0)
-                self.spool[hashlib.sha256(data).digest()] = (5, data)
+                if data:  # else it comes to nothing
+                    self.spool[hashlib.sha256(data).digest()] = (5, data)
             case "get_still":
                 reply.error = "still: the survey is over, the camera gives no frames"
             case _:

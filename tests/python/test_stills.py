@@ -17,9 +17,10 @@ from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import load_views
+from pipefish.client import NoDevice
 from pipefish.errors import PipefishError
 from pipefish.stills import StillFolder, Stills, SurveyOver, still_of
-from pipefish.transport import TcpTransport
+from pipefish.transport import TcpTransport, open_transport
 from synthetic import SURVEY, keyframe, start
 
 
@@ -142,3 +143,12 @@ def test_a_still_survives_a_line_that_breaks_and_what_the_device_has_spooled_sta
         assert device.connections > 1
     np.testing.assert_array_equal(still.image, image)
     assert len([kind for kind, _ in device.spool.values() if kind != 5]) == len(objects) and not device.refused
+
+
+def test_a_still_that_was_promised_and_never_comes_is_not_waited_for_for_ever():
+    with (
+        Device([], SURVEY, state="surveying", stills=[b""]) as device,
+        Stills(open_transport(device.address), timeout_s=1.0) as stills,
+        pytest.raises(NoDevice, match="none came"),
+    ):
+        stills.take()
