@@ -1,6 +1,7 @@
 // Self-calibration for Python; pipefish/selfcal.py checks the arguments and judges the result.
 #include "selfcal/search.hpp"
 
+#include "arrays.hpp"
 #include "pipefish/profile.h"
 #include "selfcal/residual.hpp"
 
@@ -20,25 +21,6 @@ namespace
 {
 
 using Pixels = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-
-template <typename T, typename In> nb::object to_numpy(const In *data, std::initializer_list<size_t> shape)
-{
-    size_t n = 1;
-    for (const size_t s : shape) {
-        n *= s;
-    }
-    auto kept = std::make_unique<T[]>(std::max<size_t>(n, 1));
-    std::copy(data, data + n, kept.get());
-    T *raw = kept.get();
-    const nb::capsule owner(kept.release(), [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T>(raw, shape, owner));
-}
-
-template <typename Derived> nb::object matrix_to_numpy(const Eigen::MatrixBase<Derived> &m)
-{
-    const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> rows = m;
-    return to_numpy<double>(rows.data(), {static_cast<size_t>(rows.rows()), static_cast<size_t>(rows.cols())});
-}
 
 const char *status_name(selfcal::PairStatus status)
 {

@@ -1,4 +1,5 @@
 // Two views and whole reconstructions for Python; pipefish.twoview.py and pipefish/structure.py check the arguments.
+#include "arrays.hpp"
 #include "geometry/minimal.hpp"
 #include "geometry/two_view.hpp"
 #include "pipefish/profile.h"
@@ -34,25 +35,6 @@ using Square = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::de
 using Jacobians = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Covariances = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
-
-template <typename T, typename In> nb::object to_numpy(const In *data, std::initializer_list<size_t> shape)
-{
-    size_t n = 1;
-    for (const size_t s : shape) {
-        n *= s;
-    }
-    auto kept = std::make_unique<T[]>(n);
-    std::copy(data, data + n, kept.get());
-    T *raw = kept.get();
-    const nb::capsule owner(kept.release(), [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T>(raw, shape, owner));
-}
-
-template <typename Derived> nb::object matrix_to_numpy(const Eigen::MatrixBase<Derived> &m)
-{
-    const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> rows = m;
-    return to_numpy<double>(rows.data(), {static_cast<size_t>(rows.rows()), static_cast<size_t>(rows.cols())});
-}
 
 const char *status_name(geometry::TwoViewStatus status)
 {
