@@ -13,6 +13,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from accept_rows import Row, at_least, at_most, exactly
+
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
 
@@ -24,27 +26,7 @@ def run(*command: str | Path, **env: str) -> subprocess.CompletedProcess:
     )
 
 
-def figure(name: str, value: float, bound: str, holds: bool) -> dict:
-    """One row of the table."""
-    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
-
-
-def at_least(name: str, value: float, bound: float) -> dict:
-    """A row that holds from `bound` upwards."""
-    return figure(name, value, f">= {bound}", value >= bound)
-
-
-def at_most(name: str, value: float, bound: float) -> dict:
-    """A row that holds up to `bound`."""
-    return figure(name, value, f"<= {bound}", value <= bound)
-
-
-def exactly(name: str, value: float, bound: float) -> dict:
-    """A row that holds at `bound` only."""
-    return figure(name, value, f"= {bound}", value == bound)
-
-
-def check_link_goodput() -> list[dict]:
+def check_link_goodput() -> list[Row]:
     """Payload delivered against what the emulated 3 Mbaud line carries, virtual time."""
     done = run(BUILD / "release/tests/bench/bench_link")
     values = {f["name"]: f["value"] for f in map(json.loads, done.stdout.splitlines())}
@@ -54,7 +36,7 @@ def check_link_goodput() -> list[dict]:
     ]
 
 
-def rows_of(script: str, *arguments: object, python: object = sys.executable, **environment: str) -> list[dict]:
+def rows_of(script: str, *arguments: object, python: object = sys.executable, **environment: str) -> list[Row]:
     """The rows that a script of long tests prints; it resumes by itself."""
     done = run(python, f"tests/{script}", *arguments, **environment)
     print(done.stderr, file=sys.stderr)
@@ -71,45 +53,45 @@ def peers_path() -> str:
     return str(peers)
 
 
-def check_track() -> list[dict]:
+def check_track() -> list[Row]:
     """The tracker's accuracy on closed-form images; the benchmark's OpenCV beside it if `make bench` got one."""
     peers = BUILD / "venv-peers/bin/python"
     return rows_of("accept_track.py", python=peers if peers.exists() else sys.executable)
 
 
-def check_pipes() -> list[dict]:
+def check_pipes() -> list[Row]:
     """The whole chain in 24 simulated pipes: material, diameter, speed; the truth and OpenCV beside it."""
     return rows_of("accept_pipes.py", PYTHONPATH=peers_path())
 
 
-def check_recognise() -> list[dict]:
+def check_recognise() -> list[Row]:
     """Objects in simulated and in real scenes, beside OpenCV's SIFT."""
     return rows_of("accept_recognise.py", "--pictures", BUILD / "accept/recognise", PYTHONPATH=peers_path())
 
 
-def check_calib() -> list[dict]:
+def check_calib() -> list[Row]:
     """Calibration over random set-ups, against theory, and on real data where they are."""
     return rows_of("accept_calib.py")
 
 
-def check_selfcal() -> list[dict]:
+def check_selfcal() -> list[Row]:
     """Self-calibration and the profile's health check over random set-ups and on real data."""
     return rows_of("accept_selfcal.py")
 
 
-def check_recon() -> list[dict]:
+def check_recon() -> list[Row]:
     """Reconstruction and tube against theory, and in rendered pipes."""
     return rows_of("accept_recon.py")
 
 
-def check_link_seeds() -> list[dict]:
+def check_link_seeds() -> list[Row]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
     failures = sum(run(program, PIPEFISH_TEST_SEED=str(1000 * (i + 1))).returncode != 0 for i in range(20))
     return [exactly("link.seeds_failed_of_20", failures, 0)]
 
 
-def check_profile_store() -> list[dict]:
+def check_profile_store() -> list[Row]:
     """The profile store under every pair of power cuts, and a million times with flipped bits."""
     done = run(BUILD / "debug/tests/unit/test_profile_store", PIPEFISH_TEST_LONG="1")
     cuts, seconds = re.search(r"^power cuts: (\d+) in ([\d.]+) s", done.stdout, re.MULTILINE).groups()
@@ -122,7 +104,7 @@ def check_profile_store() -> list[dict]:
     ]
 
 
-def check_daemon_kills() -> list[dict]:
+def check_daemon_kills() -> list[Row]:
     """kill -9 at 10 times as many moments: nothing acknowledged is lost, nothing arrives twice."""
     command = (sys.executable, "-m", "pytest", "-q", "tests/python/test_daemon_spool.py", "-k", "kill")
     failures = sum(run(*command, PIPEFISH_TEST_SEED=str(i + 1)).returncode != 0 for i in range(10))
@@ -132,7 +114,7 @@ def check_daemon_kills() -> list[dict]:
 GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "5fc711b5"
 
 
-def check_golden_replay() -> list[dict]:
+def check_golden_replay() -> list[Row]:
     """The hash of a long replay through the tracker, on x86 and (emulated) on aarch64."""
     rows = []
     for target, folder, emulator in (
@@ -145,7 +127,7 @@ def check_golden_replay() -> list[dict]:
     return rows
 
 
-def check_fuzz() -> list[dict]:
+def check_fuzz() -> list[Row]:
     """Every fuzz target for two million inputs."""
     folder = BUILD / "clang/tests/fuzz"
     targets = [t for t in sorted(folder.glob("fuzz_*")) if t.is_file() and os.access(t, os.X_OK)]
@@ -158,7 +140,7 @@ def check_fuzz() -> list[dict]:
     return rows
 
 
-def check_demo() -> list[dict]:
+def check_demo() -> list[Row]:
     """The demo survey, whole."""
     done = run(sys.executable, "-m", "pipefish", "demo", "--out", "build/demo")
     if done.returncode != 0:
@@ -172,7 +154,7 @@ def check_demo() -> list[dict]:
     ]
 
 
-CHECKS: dict[str, Callable[[], list[dict]]] = {
+CHECKS: dict[str, Callable[[], list[Row]]] = {
     "link_goodput": check_link_goodput,
     "track": check_track,
     "pipes": check_pipes,
@@ -200,7 +182,7 @@ def main() -> int:
     kept = BUILD / "accept"
     kept.mkdir(parents=True, exist_ok=True)
 
-    rows: list[dict] = []
+    rows: list[Row] = []
     for name, check in CHECKS.items():
         file = kept / f"{commit}-{name}.json"
         if file.exists() and not args.fresh and not dirty:

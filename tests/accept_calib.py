@@ -3,16 +3,15 @@
     python tests/accept_calib.py [--setups 1000] [--runs 300]
 
 prints a table, then one JSON list of {name, value, bound, holds}. Results of set-ups and runs are kept in
-build/accept_calib/, one line each, and are not measured again: delete the folder to start anew. Real data: in
+build/accept_calib/, one line each, and taken from there while product and script are the same. Real data: in
 PIPEFISH_DATA or ../shared/data.
 """
 
 import argparse
-import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,37 +19,14 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "python"))
 
+from accept_rows import Row, at_most, figure, kept_series, print_rows  # noqa: E402
+
 from calib_data_sets import PICTURES, jy_stereo, ov_plane, pictures  # noqa: E402
 from calib_scenes import Lens, bearing_error, random_lens, views_of  # noqa: E402
 from pipefish.calibration import CalibrationError, calibrate  # noqa: E402
 
 Array = np.ndarray
 KEEP = ROOT / "build" / "accept_calib"
-Row = dict
-
-
-def figure(name: str, value: float, bound: str, holds: bool) -> Row:
-    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
-
-
-def at_most(name: str, value: float, bound: float) -> Row:
-    return figure(name, value, f"<= {bound}", value <= bound)
-
-
-def kept(name: str, count: int, measure: Callable[[int], Row]) -> list[Row]:
-    """measure(0..count-1), each from the file where an earlier run left it."""
-    KEEP.mkdir(parents=True, exist_ok=True)
-    path = KEEP / f"{name}.jsonl"
-    rows = {r["seed"]: r for r in map(json.loads, path.read_text().splitlines())} if path.exists() else {}
-    with path.open("a") as out:
-        for seed in range(count):
-            if seed not in rows:
-                rows[seed] = {"seed": seed, **measure(seed)}
-                out.write(json.dumps(rows[seed]) + "\n")
-                out.flush()
-            if sys.stderr.isatty():
-                print(f"\r{name} {seed + 1}/{count}", end="", file=sys.stderr)
-    return [rows[s] for s in range(count)]
 
 
 # ---------------------------------------------------------------------- random set-ups
@@ -80,7 +56,7 @@ def setup(seed: int) -> Row:
 
 
 def setups(count: int) -> Iterator[Row]:
-    rows = kept("setups", count, setup)
+    rows = kept_series(KEEP, "setups", count, setup)
     outcome = {o: sum(r["outcome"] == o for r in rows) for o in ("right", "refused", "wrong")}
     yield figure("calib.setups_right_share", outcome["right"] / count, ">= 0.995", outcome["right"] >= 0.995 * count)
     yield figure("calib.setups_silently_wrong", outcome["wrong"], "= 0", outcome["wrong"] == 0)
@@ -145,7 +121,7 @@ def run(seed: int) -> Row:
 
 
 def monte_carlo(count: int) -> Iterator[Row]:
-    rows = kept("runs", count, run)
+    rows = kept_series(KEEP, "runs", count, run)
     share = float(np.mean([r["inside"] for r in rows]))
     yield figure("calib.intervals_95", share, "0.93 .. 0.97", 0.93 <= share <= 0.97)
     sums = {k: np.mean([r[k] for r in rows]) for k in ("measurement", "residual", "estimation")}
@@ -214,12 +190,7 @@ def main() -> int:
     data = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data") / "calibration"
     if data.exists():
         rows += real(data)
-    for row in rows:
-        print(
-            f"{row['name']:45} {row['value']:12.6g}  {row['bound']:14} {'holds' if row['holds'] else 'FAILS'}",
-            file=sys.stderr,
-        )
-    print(json.dumps(rows))
+    print_rows(rows)
     return 0
 
 

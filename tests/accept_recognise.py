@@ -12,7 +12,6 @@ prints tables, then one JSON list of {name, value, bound, holds}; FOLDER gets RO
 """
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from accept_rows import Row, figure, print_rows
 from PIL import Image
 
 import pipefish as pf
@@ -175,8 +175,8 @@ def measure(data: Set, pictures: Path | None) -> list[dict]:
     rival = max(c.auc for name, c in curves.items() if name in theirs)
     auc = curves["grouped quasi-dense matches"].auc
 
-    def row(name: str, value: float, bound: str, holds: bool) -> dict:
-        return {"name": f"recognise.{data.name}_{name}", "value": float(value), "bound": bound, "holds": bool(holds)}
+    def row(name: str, value: float, bound: str, holds: bool) -> Row:
+        return figure(f"recognise.{data.name}_{name}", float(value), bound, holds)
 
     mean = float(shares.mean()) if len(shares) else 0.0
     rows = [row("auc", auc, "> SIFT", auc > rival), row("auc_sift", rival, "(the rival)", True)]
@@ -196,7 +196,7 @@ def main() -> None:
         rows += measure(real(), args.pictures)
     else:
         print(f"no {DATA}: the real set is left out", file=sys.stderr)
-    print(json.dumps(rows))
+    print_rows(rows)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ two_view    400 pairs of views in a tube, errors beside the bound of Cramer and 
 long        time and memory of 300 m against 30 m
 video       three pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
 
-Each piece's figures are kept in build/accept/recon/NAME.json and taken from there while the package and its engine are
+Each piece's figures are kept in build/accept/recon/NAME.jsonl and taken from there while the package and its engine are
 the same: what was interrupted goes on where it stopped.
 
     python tests/accept_recon.py                  prints one JSON list of {name, value, bound, holds}
@@ -18,25 +18,23 @@ the same: what was interrupted goes on where it stopped.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import math
 import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import pipefish as pf
-from pipefish import _engine
-from pipefish.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests/python"))
+from accept_rows import kept, print_rows  # noqa: E402
+
 from tube_tracks import Drive, fisheye, pair_bound, tube_drive, tube_pair  # noqa: E402
 
 FOLDER = ROOT / "build/accept/recon"
@@ -64,28 +62,6 @@ def row(name: str, value: float, low: float = -math.inf, high: float = math.inf)
         "bound": bound,
         "holds": bool(low <= value <= high),
     }
-
-
-def state() -> str:
-    """What the figures depend on."""
-    digest = hashlib.sha256(Path(_engine.__file__).read_bytes())
-    for path in sorted([*(ROOT / "host_tools/pipefish").glob("*.py"), *Path(__file__).parent.glob("accept_recon*.py")]):
-        digest.update(path.read_bytes())
-    digest.update((ROOT / "tests/python/tube_tracks.py").read_bytes())
-    return digest.hexdigest()
-
-
-def kept(name: str, work: Callable[[], Any]) -> Any:
-    """The result of `work`, from its file where that is of the same state."""
-    file, key = FOLDER / f"{name}.json", state()
-    stored = json.loads(file.read_text()) if file.exists() else {}
-    if stored.get("state") != key:
-        started = time.monotonic()
-        stored = {"state": key, "result": work()}
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(stored).encode())
-        print(f"  {name}: {time.monotonic() - started:.0f} s", file=sys.stderr)
-    return stored["result"]
 
 
 def reference_medians(views: int, seed: int) -> list[float]:
@@ -121,7 +97,9 @@ def check_table() -> list[dict[str, Any]]:
     """Within 15 % of the reference, which is given to two digits: half a unit of the last one is added."""
     rows = []
     for views, reference in REFERENCE.items():
-        found = kept(f"table-{views}", lambda n=views: np.mean([reference_medians(n, s) for s in range(5)], 0).tolist())
+        found = kept(
+            FOLDER, f"table-{views}", lambda n=views: np.mean([reference_medians(n, s) for s in range(5)], 0).tolist()
+        )
         for name, value, expected in zip(("radial", "tangential", "axial", "camera"), found, reference, strict=True):
             low, high = round(0.85 * (expected - 0.005), 4), round(1.15 * (expected + 0.005), 4)
             rows.append(row(f"table.{views}.{name}_mm", value, low, high))
@@ -214,7 +192,9 @@ def check_drives() -> list[dict[str, Any]]:
     """Errors over posterior, and how often 95 % intervals hold the truth."""
     rows = []
     for name, with_encoder in (("encoder", True), ("free", False)):
-        every = [kept(f"drives-{name}-{s}", lambda s=s, e=with_encoder: drive_figures(s, e)) for s in range(SEEDS)]
+        every = [
+            kept(FOLDER, f"drives-{name}-{s}", lambda s=s, e=with_encoder: drive_figures(s, e)) for s in range(SEEDS)
+        ]
         rows.append(row(f"{name}.failed", sum(d["status"] != "ok" for d in every), high=0))
         for quantity in ("diameter", "ovality", "length", "drift"):
             error, sigma = np.concatenate([np.array(d[quantity]) for d in every]).T
@@ -259,7 +239,7 @@ def tube_figures(seed: int) -> dict[str, Any]:
 
 def check_tubes() -> list[dict[str, Any]]:
     """The fitted tube's stations."""
-    every = [kept(f"tubes-{s}", lambda s=s: tube_figures(s)) for s in range(SEEDS)]
+    every = [kept(FOLDER, f"tubes-{s}", lambda s=s: tube_figures(s)) for s in range(SEEDS)]
     diameter, sigma, ovality, held = (
         np.concatenate([d[name] for d in every]) for name in ("diameter", "sigma", "ovality", "held")
     )
@@ -297,7 +277,7 @@ def check_two_view() -> list[dict[str, Any]]:
     rows = []
     for name, motion in (("forward", (0.003, 0.002, 0.05)), ("sideways", (0.03, 0.0, 0.002))):
         for high in (88, 103):
-            found = kept(f"two_view-{name}-{high}", lambda m=motion, h=high: two_view_figures(m, (15, h)))
+            found = kept(FOLDER, f"two_view-{name}-{high}", lambda m=motion, h=high: two_view_figures(m, (15, h)))
             for quantity, value in zip(("rotation", "direction"), found[:2], strict=True):
                 rows.append(row(f"two_view.{name}_{high}.{quantity}_over_bound", value, high=1.1))
             rows.append(row(f"two_view.{name}_{high}.failed", found[2], high=0.01))
@@ -322,7 +302,7 @@ def check_long() -> list[dict[str, Any]]:
         command = [sys.executable, __file__, "--long", str(length)]
         return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
-    short, long = (kept(f"long-{n}", lambda n=n: measured(float(n))) for n in (30, 300))
+    short, long = (kept(FOLDER, f"long-{n}", lambda n=n: measured(float(n))) for n in (30, 300))
     per_frame = (long["seconds"] / long["frames"]) / (short["seconds"] / short["frames"])
     return [
         row("long.failed", 2 - short["ok"] - long["ok"], high=0),
@@ -340,7 +320,7 @@ def check_video() -> list[dict[str, Any]]:
     for name in SCENES:
         rows += [
             row(f"video.{name}.{key}", *limits)
-            for key, *limits in kept(f"video-{name}", lambda n=name: video_figures(n))
+            for key, *limits in kept(FOLDER, f"video-{name}", lambda n=name: video_figures(n))
         ]
     return rows
 
@@ -365,7 +345,7 @@ def main() -> int:
         print(json.dumps(long_figures(arguments.long)))
         return 0
     rows = [r for name, check in CHECKS.items() if arguments.word in name for r in check()]
-    print(json.dumps(rows))
+    print_rows(rows)
     return 0
 
 

@@ -3,13 +3,12 @@
     python tests/accept_selfcal.py [--only general,half,degenerate,real,health] [--setups 500]
 
 prints a table, then one JSON list of {name, value, bound, holds}. Results of set-ups are kept in build/accept_selfcal/,
-one line each, and are not measured again: delete the folder to start anew. Real data: in PIPEFISH_DATA or
+one line each, and taken from there while product and script are the same. Real data: in PIPEFISH_DATA or
 ../shared/data.
 """
 
 import argparse
 import itertools
-import json
 import math
 import os
 import sys
@@ -22,6 +21,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "python"))
 
+from accept_rows import Row, at_least, at_most, figure, kept_series, print_rows  # noqa: E402
+
+from calib_data_sets import jy_stereo, ov_plane  # noqa: E402
 from pipefish.camera import Camera  # noqa: E402
 from pipefish.matching import find_seeds  # noqa: E402
 from pipefish.matching_files import read_grey  # noqa: E402
@@ -31,33 +33,6 @@ from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup  # noqa:
 
 KEEP = ROOT / "build" / "accept_selfcal"
 DATA = Path(os.environ.get("PIPEFISH_DATA", ROOT.parent / "shared" / "data"))
-Row = dict
-
-
-def figure(name: str, value: float, bound: str, holds: bool) -> Row:
-    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
-
-
-def at_least(name: str, value: float, bound: float) -> Row:
-    return figure(name, value, f">= {bound}", value >= bound)
-
-
-def at_most(name: str, value: float, bound: float) -> Row:
-    return figure(name, value, f"<= {bound}", value <= bound)
-
-
-def kept(name: str, count: int, measure: Callable[[int], Row]) -> list[Row]:
-    """measure(0..count-1), each from the file where an earlier run left it."""
-    KEEP.mkdir(parents=True, exist_ok=True)
-    path = KEEP / f"{name}.jsonl"
-    rows = {r["seed"]: r for r in map(json.loads, path.read_text().splitlines())} if path.exists() else {}
-    with path.open("a") as out:
-        for seed in range(count):
-            if seed not in rows:
-                rows[seed] = {"seed": seed, **measure(seed)}
-                out.write(json.dumps(rows[seed]) + "\n")
-                out.flush()
-    return [rows[s] for s in range(count)]
 
 
 def general(seed: int, noise: float | None = None) -> Row:
@@ -88,14 +63,14 @@ def degenerate(seed: int) -> Row:
 
 
 def check_general(count: int) -> Iterator[Row]:
-    rows = kept("general", count, general)
+    rows = kept_series(KEEP, "general", count, general)
     good = [r for r in rows if r["status"] == "ok"]
     yield at_least("selfcal.within_3_sigma", sum(r["sigmas"] < 3 for r in good) / len(rows), 0.95)
     yield at_most("selfcal.one_pair_seconds", max(r["seconds"] for r in rows if r["pairs"] == 1), 3.0)
 
 
 def check_half(count: int) -> Iterator[Row]:
-    rows = kept("half", count, lambda seed: general(seed, noise=0.5))
+    rows = kept_series(KEEP, "half", count, lambda seed: general(seed, noise=0.5))
     for kind in KINDS:
         of = [r for r in rows if r["kind"] == kind]
         share = sum(r.get("error_deg", 180.0) < 0.5 for r in of) / len(of)
@@ -108,7 +83,7 @@ def check_half(count: int) -> Iterator[Row]:
 
 
 def check_degenerate(count: int) -> Iterator[Row]:
-    rows = kept("degenerate", count, degenerate)
+    rows = kept_series(KEEP, "degenerate", count, degenerate)
     yield figure(
         "selfcal.degenerate_misjudged",
         sum(r["status"] != r["case"] for r in rows),
@@ -160,14 +135,12 @@ def fountain() -> list[Row]:
             }
         return row
 
-    return kept("fountain", len(groups), one)
+    return kept_series(KEEP, "fountain", len(groups), one)
 
 
 def boards() -> list[Row]:
     """Corners of one plane board in two of its views; and the pictures' own matches, with the room behind the board by
     a camera that stands."""
-    from calib_data_sets import jy_stereo, ov_plane
-
     board, size = ov_plane(DATA / "calibration", "train")
     stereo, stereo_size = jy_stereo(DATA / "calibration", 1)
     cases = []
@@ -183,7 +156,7 @@ def boards() -> list[Row]:
         found = self_calibrate([pair], of, threads=1)
         return {"name": name, "status": found.status, "matches": len(pair[0])}
 
-    rows = kept("boards", len(cases), one_case)
+    rows = kept_series(KEEP, "boards", len(cases), one_case)
     files = sorted((DATA / "calibration/jy_stereo/left").glob("*.jpg"))[:5]
     if len(files) == 5:
 
@@ -193,7 +166,7 @@ def boards() -> list[Row]:
             found = self_calibrate([(seeds.xy1, seeds.xy2)], one.shape[::-1], threads=1)
             return {"name": "static", "status": found.status, "matches": len(seeds)}
 
-        rows += kept("static", 4, standing)
+        rows += kept_series(KEEP, "static", 4, standing)
     return rows
 
 
@@ -221,16 +194,17 @@ def check_real() -> Iterator[Row]:
 def check_health(count: int) -> Iterator[Row]:
     for case in ("bend", "radius"):
         for change in ("scale", "centre"):
-            rows = kept(f"health_{case}_{change}", count, lambda s, c=case, x=change: health_of(s, c, x))
+            rows = kept_series(KEEP, f"health_{case}_{change}", count, lambda s, c=case, x=change: health_of(s, c, x))
             share = sum(r["verdict"].startswith("drifted") for r in rows) / len(rows)
             yield at_least(f"health.{case}_{change}_detected", share, 0.95)
-        rows = kept(f"health_{case}_none", count, lambda s, c=case: health_of(s, c, ""))
+        rows = kept_series(KEEP, f"health_{case}_none", count, lambda s, c=case: health_of(s, c, ""))
         yield at_most(
             f"health.{case}_false_alarms", sum(r["verdict"].startswith("drifted") for r in rows) / len(rows), 0.02
         )
         valid = sum(r["verdict"].endswith("valid") for r in rows) / len(rows)
         print(f"  health, {case}: {100 * valid:.0f} % of the intact called valid", file=sys.stderr)
-    rows = kept("health_straight", count, lambda s: health_of(s, "straight", ("", "scale", "alpha")[s % 3]))
+    changes = ("", "scale", "alpha")
+    rows = kept_series(KEEP, "health_straight", count, lambda s: health_of(s, "straight", changes[s % 3]))
     certain = sum(r["verdict"] != "cannot tell" for r in rows)
     yield figure("health.straight_not_cannot_tell", certain, "= 0", certain == 0)
 
@@ -251,9 +225,7 @@ def main() -> int:
         "health": lambda: check_health(args.health),
     }
     rows = [row for name in args.only.split(",") for row in checks[name]()]
-    for row in rows:
-        print(f"  {'holds' if row['holds'] else 'FAILS'}  {row['name']:36} {row['value']:10.4g}  {row['bound']}")
-    print(json.dumps(rows))
+    print_rows(rows)
     return 0
 
 

@@ -1,5 +1,6 @@
 // Calibration for Python: _engine.Bundle is one adjustment with its data; pipefish/calibration.py decides what is free,
 // what is rejected and in which order. Poses are (3, 4) arrays [R | t].
+#include "bind/arrays.hpp"
 #include "calib/bundle.hpp"
 #include "calib/centroid.hpp"
 #include "calib/start.hpp"
@@ -30,33 +31,12 @@ template <size_t Columns> using Rows = nb::ndarray<const double, nb::shape<-1, C
 using Column = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<nb::numpy, double>;
 
-Numbers numbers(std::unique_ptr<double[]> data, std::initializer_list<size_t> shape)
-{
-    double *raw = data.get();
-    nb::capsule owner(data.release(), [](void *p) noexcept { delete[] static_cast<double *>(p); });
-    return Numbers(raw, shape, owner);
-}
-
-template <class Matrix> void put(double *out, const Matrix &m)
-{
-    Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>>(out, m.rows(), m.cols()) = m;
-}
-
-template <class Matrix> Numbers matrix(const Matrix &m)
-{
-    const size_t rows = static_cast<size_t>(m.rows()), columns = static_cast<size_t>(m.cols());
-    std::unique_ptr<double[]> out(new double[rows * columns + 1]);
-    put(out.get(), m);
-    return numbers(std::move(out), {rows, columns});
-}
-
-Numbers from_pose(const Pose &pose)
+Array<double> from_pose(const Pose &pose)
 {
     Eigen::Matrix<double, 3, 4> m;
     m << pose.rotation, pose.translation;
-    return matrix(m);
+    return matrix_to_numpy(m);
 }
 
 Pose to_pose(const Matrix34 &given)
@@ -134,7 +114,7 @@ nb::tuple predict(Bundle &bundle)
             }
         }
     }
-    return nb::make_tuple(numbers(std::move(pixels), {count, 2}), numbers(std::move(points), {count, 3}));
+    return nb::make_tuple(to_numpy(std::move(pixels), {count, 2}), to_numpy(std::move(points), {count, 3}));
 }
 
 nb::tuple adjust(Bundle &bundle, int max_iterations, double cost_tolerance)
@@ -163,7 +143,7 @@ nb::object uncertainty(Bundle &bundle)
     } catch (const std::domain_error &error) {
         throw nb::value_error(error.what());
     }
-    return nb::cast(matrix(border));
+    return nb::cast(matrix_to_numpy(border));
 }
 
 nb::object view_pose_of(const Bundle &bundle, size_t index)
@@ -259,7 +239,7 @@ void bind_calib(nb::module_ &m)
                  for (Eigen::Index k = 0; k < out.rows(); k++)
                      out.row(k) =
                          b.boards.at(i).shape.at(Eigen::Map<const Eigen::Vector3d>(drawn.data() + 3 * k), nullptr);
-                 return matrix(out);
+                 return matrix_to_numpy(out);
              })
         .def("free_camera",
              [](Bundle &b, size_t i, const std::vector<uint32_t> &params, bool pose) {
@@ -291,7 +271,7 @@ void bind_calib(nb::module_ &m)
         .def("parameter_slope",
              [](Bundle &b, int i) {
                  b.arrange();
-                 return matrix(b.parameter_slope(i));
+                 return matrix_to_numpy(b.parameter_slope(i));
              })
         .def("view_pose", &view_pose_of, nb::arg("view"), "Board to camera (3, 4) by rays alone, or None.")
         .def("sweep", &sweep_of, nb::arg("camera"), nb::arg("width"), nb::arg("height"), nb::arg("c_u"), nb::arg("c_v"),

@@ -1,5 +1,6 @@
 // The camera model and its profile for Python: _engine.Profile is pf_profile itself, so other rooms' bindings take a
 // camera as `const pf_profile &`. pipefish/camera.py is the class that people use; it checks types and names keys.
+#include "bind/arrays.hpp"
 #include "pipefish/profile_integers.h"
 
 #include <nanobind/nanobind.h>
@@ -28,21 +29,12 @@ namespace
 {
 
 template <size_t Columns> using Rows = nb::ndarray<const double, nb::shape<-1, Columns>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<nb::numpy, double>;
-using Mask = nb::ndarray<nb::numpy, bool>;
-
-template <typename T> nb::ndarray<nb::numpy, T> to_numpy(std::unique_ptr<T[]> data, std::initializer_list<size_t> shape)
-{
-    T *raw = data.get();
-    nb::capsule owner(data.release(), [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(raw, shape, owner);
-}
 
 // The batches write 0 or 1 into bytes: as many bools.
 static_assert(sizeof(bool) == 1);
 
 template <size_t In, size_t Out, typename Batch>
-std::pair<Numbers, Mask> run_batch(const pf_profile &profile, const Rows<In> &in, Batch batch)
+std::pair<Array<double>, Array<bool>> run_batch(const pf_profile &profile, const Rows<In> &in, Batch batch)
 {
     size_t n = in.shape(0);
     std::unique_ptr<double[]> out(new double[n * Out]);
@@ -51,10 +43,10 @@ std::pair<Numbers, Mask> run_batch(const pf_profile &profile, const Rows<In> &in
         nb::gil_scoped_release release;
         batch(&profile.camera, n, in.data(), out.get(), reinterpret_cast<uint8_t *>(ok.get()));
     }
-    return {to_numpy<double>(std::move(out), {n, Out}), to_numpy<bool>(std::move(ok), {n})};
+    return {to_numpy(std::move(out), {n, Out}), to_numpy(std::move(ok), {n})};
 }
 
-nb::ndarray<nb::numpy, double> origins(const pf_profile &profile, const Rows<2> &uv)
+Array<double> origins(const pf_profile &profile, const Rows<2> &uv)
 {
     size_t n = uv.shape(0);
     std::unique_ptr<double[]> rays(new double[n * 3]), out(new double[n * 3]);
@@ -63,16 +55,16 @@ nb::ndarray<nb::numpy, double> origins(const pf_profile &profile, const Rows<2> 
         nb::gil_scoped_release release;
         pf_camera_unproject_n(&profile.camera, n, uv.data(), rays.get(), out.get(), ok.get());
     }
-    return to_numpy<double>(std::move(out), {n, 3});
+    return to_numpy(std::move(out), {n, 3});
 }
 
-Mask in_image(const pf_profile &profile, const Rows<2> &uv)
+Array<bool> in_image(const pf_profile &profile, const Rows<2> &uv)
 {
     size_t n = uv.shape(0);
     std::unique_ptr<bool[]> inside(new bool[n]);
     for (size_t i = 0; i < n; i++)
         inside[i] = pf_camera_in_image(&profile.camera, uv.data() + 2 * i);
-    return to_numpy<bool>(std::move(inside), {n});
+    return to_numpy(std::move(inside), {n});
 }
 
 nb::tuple project_jacobian(const pf_profile &profile, const Rows<3> &xyz)
@@ -94,9 +86,8 @@ nb::tuple project_jacobian(const pf_profile &profile, const Rows<3> &xyz)
             }
         }
     }
-    return nb::make_tuple(to_numpy<double>(std::move(uv), {n, 2}), to_numpy<bool>(std::move(ok), {n}),
-                          to_numpy<double>(std::move(d_xyz), {n, 2, 3}),
-                          to_numpy<double>(std::move(d_param), {n, 2, params}));
+    return nb::make_tuple(to_numpy(std::move(uv), {n, 2}), to_numpy(std::move(ok), {n}),
+                          to_numpy(std::move(d_xyz), {n, 2, 3}), to_numpy(std::move(d_param), {n, 2, params}));
 }
 
 // pf_profile's texts end at a zero, so a zero inside would cut them silently.

@@ -1,4 +1,5 @@
 // The target detector for Python: _engine.Board, _engine.find_target. pipefish/detect.py is what people use.
+#include "bind/arrays.hpp"
 #include "detect/candidates.hpp"
 #include "detect/disc.hpp"
 #include "detect/find.hpp"
@@ -38,43 +39,31 @@ Kind kind_of(const std::string &name)
     throw nb::value_error("kind: unknown");
 }
 
-template <typename T, size_t Dimensions>
-nb::ndarray<nb::numpy, T> array(const std::array<size_t, Dimensions> &shape, T **data)
-{
-    size_t count = 1;
-    for (const size_t s : shape)
-        count *= s;
-    *data = new T[std::max<size_t>(count, 1)];
-    nb::capsule owner(*data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(*data, Dimensions, shape.data(), owner);
-}
-
 nb::dict to_python(const Detection &d)
 {
     const char *names[] = {"ok", "partial", "ambiguous", "none"};
     nb::dict out;
     const size_t n = d.ids.size();
-    int64_t *ids = nullptr;
-    double *pixels = nullptr, *covariance = nullptr, *outlines = nullptr;
-    out["ids"] = array<int64_t, 1>({n}, &ids);
-    out["pixels"] = array<double, 2>({n, 2}, &pixels);
-    out["covariance"] = array<double, 3>({n, 2, 2}, &covariance);
+    std::vector<int64_t> ids(d.ids.begin(), d.ids.end());
+    std::vector<double> pixels(2 * n), covariance(4 * n);
     for (size_t k = 0; k < n; k++) {
-        ids[k] = d.ids[k];
         for (int a = 0; a < 2; a++) {
             pixels[2 * k + size_t(a)] = d.pixels[k][a];
             for (int b = 0; b < 2; b++)
                 covariance[4 * k + size_t(2 * a + b)] = d.covariance[k](a, b);
         }
     }
+    out["ids"] = to_numpy(std::move(ids), {n});
+    out["pixels"] = to_numpy(std::move(pixels), {n, 2});
+    out["covariance"] = to_numpy(std::move(covariance), {n, 2, 2});
     if (!d.outlines.empty()) {
         constexpr size_t most = kOutlinePoints;
-        out["outlines"] = array<double, 3>({n, most, 2}, &outlines);
-        std::fill_n(outlines, n * most * 2, std::numeric_limits<double>::quiet_NaN());
+        std::vector<double> outlines(n * most * 2, std::numeric_limits<double>::quiet_NaN());
         for (size_t k = 0; k < n; k++)
             for (size_t p = 0; p < std::min(d.outlines[k].size(), most); p++)
                 for (int a = 0; a < 2; a++)
                     outlines[(k * most + p) * 2 + size_t(a)] = d.outlines[k][p][a];
+        out["outlines"] = to_numpy(std::move(outlines), {n, most, 2});
     } else {
         out["outlines"] = nb::none();
     }

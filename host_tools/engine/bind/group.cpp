@@ -1,5 +1,6 @@
 // Grouping and recognition for Python: _engine.group_matches, _engine.group_outlines, _engine.Prepared,
 // _engine.recognise. pipefish/grouping.py and recognition.py are what people use.
+#include "bind/arrays.hpp"
 #include "group/recognise.hpp"
 
 #include <nanobind/nanobind.h>
@@ -26,13 +27,6 @@ using Values = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::
 using Labels = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Triples = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
-template <typename T> nb::ndarray<nb::numpy, T> array(std::initializer_list<size_t> shape, std::unique_ptr<T[]> data)
-{
-    T *raw = data.release();
-    nb::capsule owner(raw, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(raw, shape.size(), shape.begin(), owner);
-}
-
 std::vector<match::Match> matches_of(const Rows2 &xy1, const Rows2 &xy2, const Maps &affine, const Values &zncc)
 {
     const size_t n = xy1.shape(0);
@@ -54,28 +48,25 @@ std::vector<match::Match> matches_of(const Rows2 &xy1, const Rows2 &xy2, const M
 nb::tuple to_python(const Groups &g)
 {
     const size_t n = g.label.size(), t = g.triangles.size();
-    auto label = std::make_unique<int64_t[]>(std::max<size_t>(1, n));
-    auto corners = std::make_unique<int64_t[]>(std::max<size_t>(1, 3 * t));
-    auto group = std::make_unique<int64_t[]>(std::max<size_t>(1, t));
-    std::copy(g.label.begin(), g.label.end(), label.get());
+    std::vector<int64_t> label(g.label.begin(), g.label.end()), corners(3 * t), group(t);
     for (size_t k = 0; k < t; k++) {
-        std::copy_n(g.triangles[k].vertex.begin(), 3, corners.get() + 3 * k);
+        std::copy_n(g.triangles[k].vertex.begin(), 3, &corners[3 * k]);
         group[k] = g.triangles[k].group;
     }
-    return nb::make_tuple(array<int64_t>({n}, std::move(label)), array<int64_t>({t, 3}, std::move(corners)),
-                          array<int64_t>({t}, std::move(group)));
+    return nb::make_tuple(to_numpy(std::move(label), {n}), to_numpy(std::move(corners), {t, 3}),
+                          to_numpy(std::move(group), {t}));
 }
 
 template <typename Point> nb::list to_python(const std::vector<std::vector<Point>> &lines)
 {
     nb::list out;
     for (const auto &line : lines) {
-        auto rows = std::make_unique<double[]>(2 * line.size());
+        std::vector<double> rows(2 * line.size());
         for (size_t k = 0; k < line.size(); k++) {
             rows[2 * k] = static_cast<double>(line[k].x);
             rows[2 * k + 1] = static_cast<double>(line[k].y);
         }
-        out.append(array<double>({line.size(), 2}, std::move(rows)));
+        out.append(to_numpy(std::move(rows), {line.size(), 2}));
     }
     return out;
 }
@@ -155,7 +146,7 @@ void bind_group(nb::module_ &m)
             const size_t h = static_cast<size_t>(height), w = static_cast<size_t>(width);
             auto pixels = std::make_unique<uint8_t[]>(h * w);
             std::copy_n(mask.data, h * w, pixels.get());
-            return nb::make_tuple(array<uint8_t>({h, w}, std::move(pixels)), to_python(outlines(mask)));
+            return nb::make_tuple(to_numpy(std::move(pixels), {h, w}), to_python(outlines(mask)));
         },
         "Positions (K,2) in an image, triangles, their groups, which group, height, width, reach -> mask (H,W) of 0 "
         "and "

@@ -1,4 +1,5 @@
 // Quasi-dense matching for Python: _engine.find_seeds, _engine.grow_matches. pipefish/matching.py is what people use.
+#include "bind/arrays.hpp"
 #include "match/seeds.hpp"
 #include "pipefish/profile.h"
 
@@ -29,32 +30,24 @@ Image view(const Picture &image)
     return Image(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)), const_cast<float *>(image.data()));
 }
 
-template <typename T> nb::ndarray<nb::numpy, T> array(std::initializer_list<size_t> shape, std::unique_ptr<T[]> data)
-{
-    T *raw = data.release();
-    nb::capsule owner(raw, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(raw, shape.size(), shape.begin(), owner);
-}
-
 // (S, 8): at, centre, map row by row.
-nb::ndarray<nb::numpy, double> to_python(const std::vector<Seed> &seeds)
+Array<double> to_python(const std::vector<Seed> &seeds)
 {
-    auto rows = std::make_unique<double[]>(std::max<size_t>(1, 8 * seeds.size()));
+    std::vector<double> rows(8 * seeds.size());
     for (size_t k = 0; k < seeds.size(); k++) {
         const Seed &s = seeds[k];
         const double row[8] = {s.at.x(),  s.at.y(),  s.centre.x(), s.centre.y(),
                                s.a(0, 0), s.a(0, 1), s.a(1, 0),    s.a(1, 1)};
-        std::copy_n(row, 8, rows.get() + 8 * k);
+        std::copy_n(row, 8, &rows[8 * k]);
     }
-    return array<double>({seeds.size(), 8}, std::move(rows));
+    return to_numpy(std::move(rows), {seeds.size(), 8});
 }
 
 nb::dict to_python(const Growth &g)
 {
-    const size_t n = g.matches.size(), room = std::max<size_t>(1, n);
-    auto xy1 = std::make_unique<double[]>(2 * room), xy2 = std::make_unique<double[]>(2 * room);
-    auto affine = std::make_unique<double[]>(4 * room), zncc = std::make_unique<double[]>(room);
-    auto parent = std::make_unique<int64_t[]>(room), seed = std::make_unique<int64_t[]>(room);
+    const size_t n = g.matches.size();
+    std::vector<double> xy1(2 * n), xy2(2 * n), affine(4 * n), zncc(n);
+    std::vector<int64_t> parent(n), seed(n);
     for (size_t k = 0; k < n; k++) {
         const Match &m = g.matches[k];
         xy1[2 * k] = m.x;
@@ -68,12 +61,12 @@ nb::dict to_python(const Growth &g)
         seed[k] = m.seed;
     }
     nb::dict out;
-    out["xy1"] = array<double>({n, 2}, std::move(xy1));
-    out["xy2"] = array<double>({n, 2}, std::move(xy2));
-    out["affine"] = array<double>({n, 2, 2}, std::move(affine));
-    out["zncc"] = array<double>({n}, std::move(zncc));
-    out["parent"] = array<int64_t>({n}, std::move(parent));
-    out["seed"] = array<int64_t>({n}, std::move(seed));
+    out["xy1"] = to_numpy(std::move(xy1), {n, 2});
+    out["xy2"] = to_numpy(std::move(xy2), {n, 2});
+    out["affine"] = to_numpy(std::move(affine), {n, 2, 2});
+    out["zncc"] = to_numpy(std::move(zncc), {n});
+    out["parent"] = to_numpy(std::move(parent), {n});
+    out["seed"] = to_numpy(std::move(seed), {n});
     out["seeds_used"] = g.seeds_used;
     out["tried"] = g.tried;
     out["low_zncc"] = g.low_zncc;
@@ -103,10 +96,10 @@ Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at
 }
 
 // Values between pixels, by the cubic spline through them; places within two pixels of the rim are NaN.
-nb::ndarray<nb::numpy, float> sample_image(const Picture &image, const Rows2 &places)
+Array<float> sample_image(const Picture &image, const Rows2 &places)
 {
     const size_t n = places.shape(0);
-    auto values = std::make_unique<float[]>(std::max<size_t>(1, n));
+    std::vector<float> values(n);
     {
         const nb::gil_scoped_release release;
         const ScaleStack stack(view(image));
@@ -119,7 +112,7 @@ nb::ndarray<nb::numpy, float> sample_image(const Picture &image, const Rows2 &pl
                             : std::numeric_limits<float>::quiet_NaN();
         }
     }
-    return array<float>({n}, std::move(values));
+    return to_numpy(std::move(values), {n});
 }
 
 } // namespace

@@ -95,8 +95,8 @@ template <size_t N> std::array<geometry::Vector3d, N> vectors(const Triples &row
     return out;
 }
 
-nb::object sampson_squared(const pf_profile &profile, const Matrix34 &pose, const Pixels &uv1, const Pixels &uv2,
-                           double sigma)
+Array<double> sampson_squared(const pf_profile &profile, const Matrix34 &pose, const Pixels &uv1, const Pixels &uv2,
+                              double sigma)
 {
     const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(pose.data());
     const geometry::Pose relative{m.leftCols<3>(), m.col(3)};
@@ -107,11 +107,11 @@ nb::object sampson_squared(const pf_profile &profile, const Matrix34 &pose, cons
     for (size_t i = 0; i < n; i++) {
         out[i] = geometry::sampson_squared(relative, a[i], b[i]);
     }
-    return to_numpy<double>(out.data(), {n});
+    return to_numpy(std::move(out), {n});
 }
 
 // (m,m) covariance of m linear functions of points: jacobian (m, n, 3) of points (n,).
-nb::object functions(const sfm::BundleCovariance &covariance, const Indices &points, const Jacobians &jacobian)
+Array<double> functions(const sfm::BundleCovariance &covariance, const Indices &points, const Jacobians &jacobian)
 {
     const size_t m = jacobian.shape(0), n = points.shape(0);
     if (jacobian.shape(1) != n) {
@@ -131,22 +131,22 @@ nb::object functions(const sfm::BundleCovariance &covariance, const Indices &poi
     return matrix_to_numpy(covariance.functions({points.data(), n}, a));
 }
 
-nb::object pose_covariances(const sfm::BundleCovariance &covariance)
+Array<double> pose_covariances(const sfm::BundleCovariance &covariance)
 {
     std::vector<double> flat;
     for (size_t f = 0; f < covariance.frames(); f++) { // symmetric: the order of storage does not matter
         flat.insert(flat.end(), covariance.pose(f).data(), covariance.pose(f).data() + 36);
     }
-    return to_numpy<double>(flat.data(), {covariance.frames(), 6, 6});
+    return to_numpy(std::move(flat), {covariance.frames(), 6, 6});
 }
 
-nb::object point_covariances(const sfm::BundleCovariance &covariance)
+Array<double> point_covariances(const sfm::BundleCovariance &covariance)
 {
     std::vector<double> flat;
     for (const geometry::Matrix3d &m : covariance.points()) {
         flat.insert(flat.end(), m.data(), m.data() + 9);
     }
-    return to_numpy<double>(flat.data(), {covariance.points().size(), 3, 3});
+    return to_numpy(std::move(flat), {covariance.points().size(), 3, 3});
 }
 
 nb::dict segment_dict(sfm::Segment &segment)
@@ -163,8 +163,8 @@ nb::dict segment_dict(sfm::Segment &segment)
         points.insert(points.end(), x.data(), x.data() + 3);
     }
     out["first"] = map.first;
-    out["poses"] = to_numpy<double>(poses.data(), {map.poses.size(), 3, 4});
-    out["points"] = to_numpy<double>(points.data(), {map.points.size(), 3});
+    out["poses"] = to_numpy(std::move(poses), {map.poses.size(), 3, 4});
+    out["points"] = to_numpy(std::move(points), {map.points.size(), 3});
     out["tracks"] = to_numpy<int>(map.tracks.data(), {map.tracks.size()});
     const bool uncertain = !segment.total.empty();
     out["random"] = nb::cast(std::move(segment.random));
@@ -259,10 +259,10 @@ void bind_sfm(nb::module_ &m)
           nb::arg("covariance2").noconvert().none(), nb::arg("sigma"), nb::arg("seed"),
           "Relative pose of two views; see pipefish.twoview.");
     nb::class_<sfm::BundleCovariance>(m, "BundleCovariance", "Covariance of an adjustment, correlations kept.")
-        .def_prop_ro("pose", &pose_covariances, "(K,6,6): rotation on the left, centre.")
-        .def_prop_ro("point", &point_covariances, "(N,3,3)")
+        .def_prop_ro("pose", &pose_covariances, nb::rv_policy::move, "(K,6,6): rotation on the left, centre.")
+        .def_prop_ro("point", &point_covariances, nb::rv_policy::move, "(N,3,3)")
         .def_prop_ro(
-            "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); },
+            "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); }, nb::rv_policy::move,
             "Of wheel, gravity (2), sag and camera, those that were estimated.")
         .def("functions", &functions, nb::arg("points").noconvert(), nb::arg("jacobian").noconvert(),
              "(m,m) covariance of m linear functions of points (n,) int32: jacobian (m,n,3).");
@@ -280,7 +280,7 @@ void bind_sfm(nb::module_ &m)
             for (size_t i = 0; i < now.shape(0); i++) {
                 out.push_back(sfm::sag_of(first.data()[i], now.data()[i], f));
             }
-            return to_numpy<double>(out.data(), {out.size()});
+            return to_numpy(std::move(out), {out.size()});
         },
         nb::arg("first").noconvert(), nb::arg("now").noconvert(), nb::arg("f"),
         "Pixels outwards for each px^2 of the sag, of tracks seen first and now at these angles (N,) from the axis.");
@@ -290,7 +290,7 @@ void bind_sfm(nb::module_ &m)
     m.def(
         "five_point",
         [](const Triples &f1, const Triples &f2) {
-            std::vector<nb::object> out;
+            std::vector<Array<double>> out;
             for (const geometry::Matrix3d &e : geometry::five_point(vectors<5>(f1), vectors<5>(f2))) {
                 out.push_back(matrix_to_numpy(e));
             }
@@ -300,7 +300,7 @@ void bind_sfm(nb::module_ &m)
     m.def(
         "three_point",
         [](const Triples &f, const Triples &x) {
-            std::vector<nb::object> out;
+            std::vector<Array<double>> out;
             for (const geometry::Pose &pose : geometry::three_point(vectors<3>(f), vectors<3>(x))) {
                 Eigen::Matrix<double, 3, 4> m34;
                 m34 << pose.r, pose.t;

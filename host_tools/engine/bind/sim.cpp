@@ -1,5 +1,6 @@
 // The simulator for Python: _engine.Scene. A scene is a dict; every field stands once, in a fields() here or in
 // bind/sim_*.hpp, with its range, and serves reading, checking and writing back.
+#include "bind/arrays.hpp"
 #include "bind/sim_camera.hpp"
 #include "bind/sim_light.hpp"
 #include "bind/sim_motion.hpp"
@@ -121,17 +122,10 @@ SceneSpec read_scene(const nb::dict &source)
 using Points2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using Points3 = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
-template <typename T> auto to_numpy(std::vector<T> &&values, std::initializer_list<size_t> shape)
-{
-    auto *kept = new std::vector<T>(std::move(values));
-    nb::capsule owner(kept, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
-    return nb::ndarray<nb::numpy, T>(kept->data(), shape, owner);
-}
-
 nb::object ok_mask(std::vector<uint8_t> &&ok)
 {
     const size_t n = ok.size();
-    return nb::cast(to_numpy<uint8_t>(std::move(ok), {n})).attr("astype")("bool");
+    return nb::cast(to_numpy(std::move(ok), {n})).attr("astype")("bool");
 }
 
 int checked_frame(const Scene &scene, int frame)
@@ -159,7 +153,7 @@ nb::tuple map_points(const Points &points, const Map &map)
         if (ok[i])
             std::copy(item, item + Out, out.data() + Out * i);
     }
-    return nb::make_tuple(to_numpy<double>(std::move(out), {n, Out}), ok_mask(std::move(ok)));
+    return nb::make_tuple(to_numpy(std::move(out), {n, Out}), ok_mask(std::move(ok)));
 }
 
 } // namespace
@@ -199,7 +193,7 @@ void bind_sim(nb::module_ &m)
                         nb::gil_scoped_release release;
                         s.render(frame, threads, image.data());
                     }
-                    return nb::cast(to_numpy<decltype(pixel)>(std::move(image), {height, width}));
+                    return nb::cast(to_numpy(std::move(image), {height, width}));
                 };
                 return s.spec().sensor.bits > 8 ? draw(uint16_t{}) : draw(uint8_t{});
             },

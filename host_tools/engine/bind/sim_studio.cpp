@@ -1,4 +1,5 @@
 // Sheets before the simulator's camera, for Python: _engine.Texture, _engine.Picture, _engine.Studio.
+#include "bind/arrays.hpp"
 #include "bind/sim_camera.hpp"
 #include "parallel.hpp"
 #include "sim/studio.hpp"
@@ -142,17 +143,10 @@ template <typename Make> auto checked(const Make &make)
     }
 }
 
-using Array = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Rows = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Numbers = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-template <typename T> nb::object to_numpy(std::vector<T> &&values, std::initializer_list<size_t> shape)
-{
-    auto *kept = new std::vector<T>(std::move(values));
-    nb::capsule owner(kept, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T>(kept->data(), shape, owner));
-}
-
-void needs_columns(const Array &array, size_t columns)
+void needs_columns(const Rows &array, size_t columns)
 {
     if (array.shape(1) != columns)
         throw nb::value_error(("array: needs " + std::to_string(columns) + " columns").c_str());
@@ -168,12 +162,12 @@ nb::object render(const Studio &studio, const Picture &picture, int samples, int
             nb::gil_scoped_release release;
             studio.render(picture, samples, threads, image.data());
         });
-        return to_numpy(std::move(image), {height, width});
+        return nb::cast(to_numpy(std::move(image), {height, width}));
     };
     return studio.sensor_spec().bits > 8 ? draw(uint16_t{}) : draw(uint8_t{});
 }
 
-nb::tuple look(const Studio &studio, const Picture &picture, const Array &px, int threads)
+nb::tuple look(const Studio &studio, const Picture &picture, const Rows &px, int threads)
 {
     needs_columns(px, 2);
     const size_t n = px.shape(0);
@@ -204,7 +198,7 @@ nb::tuple look(const Studio &studio, const Picture &picture, const Array &px, in
                           to_numpy(std::move(white), {n}));
 }
 
-nb::object place(const Picture &picture, const Numbers &sheet, const Array &at)
+nb::object place(const Picture &picture, const Numbers &sheet, const Rows &at)
 {
     needs_columns(at, 2);
     const size_t n = at.shape(0);
@@ -221,10 +215,10 @@ nb::object place(const Picture &picture, const Numbers &sheet, const Array &at)
             picture.sheets()[static_cast<size_t>(k)].place(at.data()[2 * i], at.data()[2 * i + 1]);
         std::copy(p.data(), p.data() + 3, points.data() + 3 * i);
     }
-    return to_numpy(std::move(points), {n, 3});
+    return nb::cast(to_numpy(std::move(points), {n, 3}));
 }
 
-nb::tuple project(const Studio &studio, const Array &points)
+nb::tuple project(const Studio &studio, const Rows &points)
 {
     needs_columns(points, 3);
     const size_t n = points.shape(0);
@@ -240,7 +234,7 @@ nb::tuple project(const Studio &studio, const Array &points)
     return nb::make_tuple(to_numpy(std::move(px), {n, 2}), to_numpy(std::move(ok), {n}));
 }
 
-std::shared_ptr<Texture> make_print(const Array &figures, double ground)
+std::shared_ptr<Texture> make_print(const Rows &figures, double ground)
 {
     needs_columns(figures, 6);
     std::vector<Figure> list;
@@ -274,7 +268,8 @@ void bind_sim_studio(nb::module_ &m)
         "draw_pattern",
         [](const nb::dict &source) {
             const PatternSpec spec = read<PatternSpec>(source);
-            return to_numpy(draw_pattern(spec), {static_cast<size_t>(spec.rows), static_cast<size_t>(spec.columns)});
+            return nb::cast(
+                to_numpy(draw_pattern(spec), {static_cast<size_t>(spec.rows), static_cast<size_t>(spec.columns)}));
         },
         nb::arg("pattern"), "A rich band-limited texture, (rows, columns) float32.");
     nb::class_<Picture>(m, "Picture", "Sheets, ready to be looked at; docs/simulator.md.")

@@ -1,5 +1,6 @@
 // The unrolled picture for Python; pipefish/unroll.py is what people use.
 #include "unroll/unroll.hpp"
+#include "bind/arrays.hpp"
 #include "pipefish/profile.h"
 
 #include <nanobind/eigen/dense.h>
@@ -49,15 +50,6 @@ std::vector<Picture> pictures_of(const pf_camera &camera, const std::vector<Grey
         out[i] = {images[i].data(), {m.leftCols<3>(), m.col(3)}, views[i]};
     }
     return out;
-}
-
-template <typename T> nb::object to_numpy(const std::vector<T> &data, size_t rows, size_t columns)
-{
-    auto kept = std::make_unique<T[]>(std::max<size_t>(1, data.size()));
-    std::copy(data.begin(), data.end(), kept.get());
-    T *raw = kept.get();
-    const nb::capsule owner(kept.release(), [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T>(raw, {rows, columns}, owner));
 }
 
 // Collects what overlapping keyframes show of the same places, and finds the light that explains it.
@@ -119,8 +111,8 @@ nb::tuple draw_sheet(const pf_profile &profile, const std::vector<Grey> &images,
     }
     const size_t nr = static_cast<size_t>(sheet.node_rows()), nc = static_cast<size_t>(sheet.node_columns());
     const size_t r = static_cast<size_t>(row_count), c = static_cast<size_t>(columns);
-    return nb::make_tuple(to_numpy(out.grey, r, c), to_numpy(out.seen, r, c), to_numpy(out.best, nr, nc),
-                          to_numpy(out.fine, nr, nc));
+    return nb::make_tuple(to_numpy(std::move(out.grey), {r, c}), to_numpy(std::move(out.seen), {r, c}),
+                          to_numpy(std::move(out.best), {nr, nc}), to_numpy(std::move(out.fine), {nr, nc}));
 }
 
 } // namespace
