@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .calib_circle import find_image_circle
+from .calib_circle import ImageEllipse, find_image_ellipse
 from .calib_data import CalibrationError, View
 from .calib_fit import angles
 from .calib_input import Given, Picture, Target3D
@@ -23,6 +23,7 @@ Tell = Callable[[str, float], None]
 
 _FOLDS = 5
 _ROUNDS = 3  # of looking again; each starts from the model that the one before made better
+_RIM = 1.1  # of what is lit: a point beyond is a wrong one, or the rim is
 _ENOUGH = 0.01  # of the points: fewer new ones are not worth another round
 _SETTLED = 6  # points at least of a picture whose place on the target is looked for
 _FIELD = 0.97  # of the angle up to which points have been found: beyond, the lens may cut them
@@ -97,8 +98,9 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
         views = views_of(given, sightings)
         refuse_too_few(given, sightings)
         refuse_wrong_size(given, sightings)
-        if len(given.cameras) == 1:
-            options["image_circle"] = circle_around(brightest[0], views)
+        options["image_circle"] = {
+            c: lit for c, image in brightest.items() if (lit := lit_around(image, [v for v in views if v.camera == c]))
+        }
         for turn in range(_ROUNDS):
             tell("first model", 0.5 + 0.1 * turn)
             first = calibrate(views, model="p9", **options)
@@ -143,14 +145,18 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
     return sightings
 
 
-def circle_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> tuple[float, float, float] | None:
-    """The image circle (u, v, radius), px, with all points of the views inside; None where the sensor is lit wholly."""
-    circle = find_image_circle([brightest])
-    if circle is None:
+def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> ImageEllipse | None:
+    """What the lens lights, with the points of the views inside; None where it is the whole sensor, or where one point
+    of a hundred lies so far out that it cannot be."""
+    lit = find_image_ellipse([brightest])
+    if lit is None:
         return None
-    u, v, radius = circle
-    farthest = max(float(np.linalg.norm(view.pixels - [u, v], axis=1).max()) for view in views)
-    return u, v, max(radius, farthest + 2.0)
+    radii = np.concatenate([lit.radii(view.pixels) for view in views])
+    if (radii > _RIM).mean() > 0.01:
+        return None
+    farthest = float(radii[radii <= _RIM].max())
+    grown = max(1.0, farthest + 2.0 / min(lit.a, lit.b)) if farthest > 1 else 1.0
+    return dataclasses.replace(lit, a=lit.a * grown, b=lit.b * grown)
 
 
 def _sighting(picture: Picture, board: int, found: Detection) -> Sighting:

@@ -21,7 +21,7 @@ from pipefish import cli
 from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
-from pipefish.calib_run import circle_around
+from pipefish.calib_run import lit_around
 from pipefish.calib_run import run as run_pictures
 from pipefish.calib_verdict import verdict
 from synthetic import BOOT, SURVEY, keyframe, start
@@ -342,10 +342,10 @@ def test_points_of_the_target_lie_inside_the_image_circle():
     v, u = np.mgrid[:480, :640]
     lit = np.where(np.hypot(u - 325.3, v - 236.8) < 225.4, 160, 6).astype(np.uint8)
     views = [pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 30.8]])]
-    np.testing.assert_allclose(circle_around(lit, views), [325.3, 236.8, 225.4], atol=1.0)
+    np.testing.assert_allclose(lit_around(lit, views).circle, [325.3, 236.8, 225.4], atol=1.0)
     views.append(pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 10.8]]))
-    assert circle_around(lit, views)[2] == pytest.approx(228, abs=1)
-    assert circle_around(np.full((480, 640), 90, dtype=np.uint8), views) is None
+    assert lit_around(lit, views).a == pytest.approx(228, abs=1)
+    assert lit_around(np.full((480, 640), 90, dtype=np.uint8), views) is None
 
 
 # ---------------------------------------------------------------------- from a device
