@@ -59,8 +59,8 @@ def same_side(data: Data) -> dict[int, str]:
             turned = min(int((hands[mine] > 0).sum()), int((hands[mine] < 0).sum()))
             if turned > max(1, _MOST_MIRRORED * len(mine)):
                 raise CalibrationError(
-                    f"{turned} of {len(mine)} views are numbered mirrored against the others: some pictures are mirrored "
-                    "copies, were taken through a mirror, or show the back of the target; take those of one kind"
+                    f"{turned} of {len(mine)} views are numbered mirrored against the others: some pictures are "
+                    "mirrored copies, were taken through a mirror, or show the target's back; take those of one kind"
                 )
             for v in mine:
                 if usual == 0 or hands[v] != -usual:
