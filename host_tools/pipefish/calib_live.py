@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from .calib_data import CalibrationError, View
 from .calib_input import Target3D
-from .calib_run import one_radius
+from .calib_run import lit_around, one_radius
 from .calib_verdict import verdict
 from .calibration import calibrate
 from .detect import detect_target
@@ -48,10 +48,14 @@ class Guide:
     enough: bool = False
     seen: float = 0.0
     _last: list[View] = dataclasses.field(default_factory=list)  # of the picture before
+    _brightest: npt.NDArray[np.uint8] | None = None  # of all pictures, by pixel
 
     def add(self, name: str, image: npt.NDArray[np.uint8]) -> str:
         """Takes a picture; -> one line about it."""
         self.size = self.size if self.views else (image.shape[1], image.shape[0])
+        if self._brightest is None or self._brightest.shape != image.shape:
+            self._brightest = image
+        self._brightest = np.maximum(self._brightest, image)
         found = []
         reason = ""
         for board, target in enumerate(self.targets):
@@ -111,7 +115,9 @@ class Guide:
                 self.advice = f"next: {self._place((column + 0.5) / _COLUMNS, (row + 0.5) / _ROWS)}, tilted"
             return
         try:
-            result = calibrate(self.views, self.size, "p9", circle_radius=one_radius(self.targets))
+            lit = None if self._brightest is None else lit_around(self._brightest, self.views)
+            radius = one_radius(self.targets)
+            result = calibrate(self.views, self.size, "p9", circle_radius=radius, image_circle=lit)
             report = result.report
         except CalibrationError as error:
             self.advice = f"next: another place, tilted another way ({error})"

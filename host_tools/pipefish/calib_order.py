@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from .calib_data import Array, BoardFrame, Data, compose, inverse
+from .calib_data import Array, BoardFrame, CalibrationError, Data, compose, inverse
 from .calib_fit import Fit, handedness, view_pose
 
 _BETTER, _SURER = (
     0.6,
     25.0,
 )  # of chi square: what another numbering must come down to, by five sigma more than noise can
+
+_MOST_MIRRORED = 0.3  # of the views; with more, which side is the right one is not ours to say
 
 
 def symmetries(board: BoardFrame) -> list[Array]:
@@ -47,13 +49,19 @@ def renumber(data: Data, view: int, motion: Array) -> None:
 
 def same_side(data: Data) -> dict[int, str]:
     """Turns views around that are numbered mirrored against most others of their board and camera; -> those that
-    cannot be, with the reason."""
+    cannot be, with the reason. Raises CalibrationError where too many are for one to know which are right."""
     refused: dict[int, str] = {}
     hands = np.array([handedness(data, v) for v in range(len(data.views))])
     for b in range(len(data.boards)):
         for c in range(len(data.cameras)):
             mine = np.flatnonzero((data.board_of == b) & (data.camera_of == c))
             usual = np.sign(hands[mine].sum())
+            turned = min(int((hands[mine] > 0).sum()), int((hands[mine] < 0).sum()))
+            if turned > max(1, _MOST_MIRRORED * len(mine)):
+                raise CalibrationError(
+                    f"{turned} of {len(mine)} views are numbered mirrored against the others: some pictures are "
+                    "mirrored copies, were taken through a mirror, or show the target's back; take those of one kind"
+                )
             for v in mine:
                 if usual == 0 or hands[v] != -usual:
                     continue

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from . import _engine
+from .calib_circle import ImageEllipse
 from .calib_data import Array, CalibrationError
 from .calib_fit import Fit, angles, handedness
 from .camera import PARAMETERS, Camera
@@ -194,7 +195,9 @@ def covariance_of(fit: Fit) -> list[Uncertainty]:
 _THETA_STEP, _PHI_BINS = math.radians(10), 12
 
 
-def coverage(fit: Fit, index: int, camera: Camera, uncertainty: Uncertainty) -> dict[str, Any]:
+def coverage(
+    fit: Fit, index: int, camera: Camera, uncertainty: Uncertainty, lit: ImageEllipse | None = None
+) -> dict[str, Any]:
     """Points seen in cells of 10 degrees off the axis by 30 degrees around it, what of the image is empty, and where
     the next view should put the board: where a view tells most about projections that are uncertain."""
     data = fit.data
@@ -217,7 +220,9 @@ def coverage(fit: Fit, index: int, camera: Camera, uncertainty: Uncertainty) -> 
     pixels, seen = camera.project(
         np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1).reshape(-1, 3)
     )
-    inside = (seen & camera.in_image(np.nan_to_num(pixels, nan=-1e9))).reshape(counts.shape)
+    pixels = np.nan_to_num(pixels, nan=-1e9)
+    seen &= camera.in_image(pixels)
+    inside = (seen & lit.inside(pixels) if lit else seen).reshape(counts.shape)
     sigma = np.full(counts.size, np.nan)
     where = inside.reshape(-1)
     sigma[where] = uncertainty.sigma(pixels[where])
@@ -249,15 +254,19 @@ def coverage(fit: Fit, index: int, camera: Camera, uncertainty: Uncertainty) -> 
     }
 
 
-def uncertainty_map(camera: Camera, uncertainty: Uncertainty, columns: int = 16) -> dict[str, Any]:
+def uncertainty_map(
+    camera: Camera, uncertainty: Uncertainty, lit: ImageEllipse | None = None, columns: int = 16
+) -> dict[str, Any]:
     """Standard deviation of projections in the worst direction over a grid of pixels, at the boards' distance and at
-    infinity; None outside the model."""
+    infinity; None outside the model and where nothing is lit."""
     rows = max(2, round(columns * camera.height / camera.width))
     u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     out: dict[str, Any] = {"u": u.tolist(), "v": v.tolist(), "distance_m": uncertainty.distance}
     for key, distance in (("sigma_px", None), ("sigma_infinity_px", math.inf)):
-        sigma = uncertainty.sigma(grid, distance).reshape(rows, columns)
+        sigma = uncertainty.sigma(grid, distance)
+        sigma = np.where(lit.inside(grid), sigma, np.nan) if lit else sigma
+        sigma = sigma.reshape(rows, columns)
         out[key] = [[None if math.isnan(s) else float(s) for s in row] for row in sigma]
     return out
 
@@ -380,6 +389,7 @@ def describe(
     notes: list[str],
     cameras: dict[int, Camera],
     uncertainty: list[Uncertainty],
+    lit: dict[int, ImageEllipse],
 ) -> dict[str, Any]:
     """Everything that a report of the calibration shows, as plain values."""
     data = fit.data
@@ -460,8 +470,8 @@ def describe(
                 "noise": {"theta": knots.tolist(), "sigma_px": sigma.tolist()},
                 "residual_scale": uncertainty[c].scale,
                 "corner_shift_px": list(fit.bundle.corner(c)),
-                "coverage": coverage(fit, c, camera, uncertainty[c]),
-                "uncertainty": uncertainty_map(camera, uncertainty[c]),
+                "coverage": coverage(fit, c, camera, uncertainty[c], lit.get(number)),
+                "uncertainty": uncertainty_map(camera, uncertainty[c], lit.get(number)),
                 "pipes": [uncertainty[c].diameter(dn) for dn in DN],
             }
         )

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .calib_circle import find_image_circle
+from .calib_circle import ImageEllipse, find_image_ellipse
 from .calib_data import CalibrationError, View
-from .calib_fit import angles
 from .calib_input import Given, Picture, Target3D
+from .calib_settle import missed_share, settle
 from .calibration import Calibration, calibrate
 from .detect import Detection, detect_target
-from .target import Target
 
 Tell = Callable[[str, float], None]
 
 _FOLDS = 5
 _ROUNDS = 3  # of looking again; each starts from the model that the one before made better
+_RIM = 1.1  # of what is lit: a point beyond is a wrong one, or the rim is
 _ENOUGH = 0.01  # of the points: fewer new ones are not worth another round
-_SETTLED = 6  # points at least of a picture whose place on the target is looked for
-_FIELD = 0.97  # of the angle up to which points have been found: beyond, the lens may cut them
-_LACKS = 0.1  # of the points: more that ought to be seen, and are not, and no place is right
-_SURER = 3  # so many more must lack at every other place
-_MARGIN = 0.5  # steps of the grid from the picture's edge: nearer, a point need not be found
 _BESIDE_PX = 2.0  # a point of the model-guided search that stands so far from one seen before is not the same one
 
 
@@ -97,13 +91,14 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
         views = views_of(given, sightings)
         refuse_too_few(given, sightings)
         refuse_wrong_size(given, sightings)
-        if len(given.cameras) == 1:
-            options["image_circle"] = circle_around(brightest[0], views)
+        options["image_circle"] = {
+            c: lit for c, image in brightest.items() if (lit := lit_around(image, [v for v in views if v.camera == c]))
+        }
         for turn in range(_ROUNDS):
             tell("first model", 0.5 + 0.1 * turn)
             first = calibrate(views, model="p9", **options)
             added = look_again(given, sightings, views, first, lambda s, t=turn: tell("missed points", 0.52 + 0.1 * t))
-            added += sum(settle(given, s, first) for s in sightings if s.status == "ambiguous")
+            added += settle_all(given, sightings, first, lambda s, t=turn: tell("places", 0.58 + 0.1 * t))
             views = views_of(given, sightings)
             if added < _ENOUGH * sum(len(v.pixels) for v in views):
                 break
@@ -143,14 +138,18 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
     return sightings
 
 
-def circle_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> tuple[float, float, float] | None:
-    """The image circle (u, v, radius), px, with all points of the views inside; None where the sensor is lit wholly."""
-    circle = find_image_circle([brightest])
-    if circle is None:
+def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> ImageEllipse | None:
+    """What the lens lights, with the points of the views inside; None where it is the whole sensor, or where one point
+    of a hundred lies so far out that it cannot be."""
+    lit = find_image_ellipse([brightest])
+    if lit is None:
         return None
-    u, v, radius = circle
-    farthest = max(float(np.linalg.norm(view.pixels - [u, v], axis=1).max()) for view in views)
-    return u, v, max(radius, farthest + 2.0)
+    radii = np.concatenate([lit.radii(view.pixels) for view in views])
+    if (radii > _RIM).mean() > 0.01:
+        return None
+    farthest = float(radii[radii <= _RIM].max())
+    grown = max(1.0, farthest + 2.0 / min(lit.a, lit.b)) if farthest > 1 else 1.0
+    return dataclasses.replace(lit, a=lit.a * grown, b=lit.b * grown)
 
 
 def _sighting(picture: Picture, board: int, found: Detection) -> Sighting:
@@ -232,65 +231,25 @@ def look_again(
     return added
 
 
-def settle(given: Given, sighting: Sighting, first: Calibration) -> int:
-    """Which points of the target an ambiguous picture shows, by a first model: of all places that the grid can have on
-    the target, the one that puts no point where the picture would show it and does not. -> points, 0: cannot be told.
-
-    Pictures of a rig are left: their places must go together."""
-    target = given.targets[sighting.board].target
-    if target is None or len(given.cameras) > 1 or len(given.targets) > 1 or len(sighting.ids) < _SETTLED:
+def settle_all(given: Given, sightings: list[Sighting], first: Calibration, share: Callable[[float], None]) -> int:
+    """Settles ambiguous pictures by a first model; -> how many points that gave. Pictures of a rig or of several
+    targets are left: their places must go together."""
+    open_ = [s for s in sightings if s.status == "ambiguous"]
+    target = given.targets[0].target
+    if not open_ or target is None or len(given.cameras) > 1 or len(given.targets) > 1:
         return 0
-    camera, image = first.cameras[sighting.picture.camera], sighting.picture.image()
-    points = given.targets[sighting.board].points
-    best: Detection | None = None
-    lacks: list[int] = []
-    for ids in _places(target, sighting.ids):
-        try:
-            _, poses = first.residuals([View(points[ids], sighting.pixels, sighting.board, sighting.picture.camera)])
-        except CalibrationError:  # no pose explains it
+    missed = missed_share(first, views_of(given, sightings), given.targets)
+    added = 0
+    for done, s in enumerate(open_):
+        share(done / len(open_))
+        found, why = settle(s.picture.image(), target, s.ids, s.pixels, first, missed)
+        if found is None:
+            s.reason = why
             continue
-        pose = np.ascontiguousarray(poses[0])
-        there = points @ pose[:, :3].T + pose[:, 3]
-        at, seen = camera.project(there)
-        seen &= angles(there) < _FIELD * (camera.theta_covered or camera.theta_max)
-        edge = _MARGIN * np.linalg.norm(np.ptp(sighting.pixels, axis=0)) / math.sqrt(len(ids))
-        inside = seen & (at > edge).all(axis=1) & (at < np.array([camera.width, camera.height]) - edge).all(axis=1)
-        found = detect_target(image, target, camera, pose)
-        lacking = int((inside & ~np.isin(np.arange(len(points)), found.ids)).sum())
-        if not lacks or lacking < min(lacks):
-            best = found
-        lacks.append(lacking)
-    lacks.sort()
-    if best is None or len(best.ids) < len(sighting.ids) or lacks[0] > _LACKS * len(best.ids):
-        return 0
-    if len(lacks) > 1 and lacks[1] < lacks[0] + _SURER:
-        return 0
-    sighting.ids, sighting.pixels, sighting.status, sighting.reason = best.ids, best.pixels, "partial", ""
-    sighting.added = len(best.ids)
-    return len(best.ids)
-
-
-def _places(target: Target, ids: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
-    """All rows of a target that a part of it, seen as rows `ids`, may be: shifted along the lattice and turned by 180
-    degrees, of the same colours, without what looks the same as another."""
-    sites = target.lattice()[0]
-    row = {tuple(s): i for i, s in enumerate(sites.tolist())}
-    whole = sites.min(axis=0) + sites.max(axis=0)
-    mine = sites[ids]
-    span = sites.max(axis=0) - sites.min(axis=0)
-    for turned in (False, True):
-        placed = whole - mine if turned else mine
-        alike = all(tuple(s) in row for s in (whole - sites).tolist())
-        if turned and alike and (target.has_circles or whole.sum() % 2 == 0):
-            continue
-        for i in range(-span[0], span[0] + 1):
-            for j in range(-span[1], span[1] + 1):
-                moved = placed + np.array([i, j])
-                if not target.has_circles and (moved - mine)[0].sum() % 2:
-                    continue
-                found = [row.get(tuple(s), -1) for s in moved.tolist()]
-                if min(found) >= 0:
-                    yield np.array(found)
+        s.ids, s.pixels, s.status, s.reason = found.ids, found.pixels, "partial", ""
+        s.added = len(found.ids)
+        added += len(found.ids)
+    return added
 
 
 def _held_out(views: list[View], result: Calibration, model: str, options: dict[str, Any]) -> tuple[float, int] | None:

@@ -115,9 +115,11 @@ def _cautions(
         said.append(f"views that it was not made from fit worse, {held_out:.3f} px rms: take more views")
     if halves is not None and halves > 1.5:
         two = camera["halves"]
+        spreads = [pipe.get("spread_mm", math.nan) for pipe in camera["pipes"]]
+        bounded = ", and is in the bounds above" if all(map(math.isfinite, spreads)) else ""
         said.append(
             f"calibrated from either half of the views the camera differs by {two['rms_px']:.2g} px, of which noise "
-            f"explains {two['expected_px']:.2g} px; the rest is in lens, target or focus, and is in the bounds above"
+            f"explains {two['expected_px']:.2g} px; the rest is in lens, target or focus{bounded}"
         )
     if covered < _NARROW:
         said.append(

@@ -20,6 +20,7 @@ import numpy as np
 
 from . import __version__, _engine
 from .calib_choice import choose
+from .calib_circle import ImageEllipse, ellipses_of, lit_corners
 from .calib_data import (
     Array,
     BoardFrame,
@@ -42,7 +43,8 @@ from .errors import ArgumentError, ProfileError
 __all__ = ["Board", "Calibration", "CalibrationError", "View", "calibrate"]
 
 _MOST_LOST = 0.3  # of the views; with more rejected, nobody knows which ones are right
-_BEYOND = 1.4  # of the largest angle observed: a polynomial says nothing of the lens farther out
+_BEYOND = 1.25  # of the largest angle observed: a polynomial says nothing of the lens farther out
+_BENDS = 2.0  # of the radius' slope where observation ends: a polynomial that bends more is no lens
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -177,7 +179,7 @@ def calibrate(
     *,
     noise: str = "",
     robust: bool = True,
-    image_circle: tuple[float, float, float] | None = None,
+    image_circle: Any = None,
     name: str = "",
     progress: Callable[[str, float], None] | None = None,
 ) -> Calibration:
@@ -188,8 +190,9 @@ def calibrate(
     then centres of gravity of their images; 0 for corners. noise: "field" weights by the noise at each angle off the
     axis, "uniform" does not; by default the paper's models are fitted as in the paper, uniform, "auto" is not. robust:
     mild Huber loss, gross outliers left out; False: least squares of everything.
-    image_circle: (u, v, radius) of a lens that does not fill the image. progress: called with what is done and its
-    share. Raises CalibrationError with what is wrong with the views, ArgumentError for a wrong call.
+    image_circle: (u, v, radius) or ImageEllipse of a lens that does not fill the image, or a dictionary of them by
+    camera. progress: called with what is done and its share. Raises CalibrationError with
+    what is wrong with the views, ArgumentError for a wrong call.
     """
     views = list(views)
     if not all(isinstance(v, View) for v in views):
@@ -202,10 +205,11 @@ def calibrate(
         raise ArgumentError(f"circle_radius: must be metres, at least 0, not {circle_radius!r:.40}")
     sizes = image_sizes(image_size, max((v.camera for v in views), default=0) + 1)
     check_views(views, sizes)
+    lit = ellipses_of(image_circle, sorted({v.camera for v in views}))
     tell = progress or (lambda what, share: None)
     data = Data(views, [sizes[c] for c in sorted({v.camera for v in views})], float(circle_radius))
     tell("start values", 0.0)
-    fit = _start(data, image_circle)
+    fit = _start(data, lit)
     tell("p9 on a flat board", 0.1)
     _settle(fit, Model(), noise, robust)
     notes = fit.notes
@@ -224,10 +228,10 @@ def calibrate(
         fit.descend(chosen)
         _settle(fit, chosen, noise, robust)
     tell("uncertainty", 0.92)
-    return _result(fit, flat, table, notes, noise, robust, image_circle, name)
+    return _result(fit, flat, table, notes, noise, robust, lit, name)
 
 
-def _start(data: Data, image_circle: tuple[float, float, float] | None) -> Fit:
+def _start(data: Data, lit: dict[int, ImageEllipse]) -> Fit:
     """Every camera alone, then the rig."""
     refused = same_side(data)
     fit = Fit(data)
@@ -237,7 +241,8 @@ def _start(data: Data, image_circle: tuple[float, float, float] | None) -> Fit:
     for c in range(len(data.cameras)):
         if (data.camera_of == c).sum() < 3:
             raise CalibrationError(f"camera {data.cameras[c]}: fewer than 3 views")
-        single = Single(data, c, image_circle)
+        of = lit.get(data.cameras[c])
+        single = Single(data, c, of.circle if of else None)
         _refuse_nonsense(data, single)
         cameras[c] = single.bundle.camera(c)
         medians = single.view_errors(single.bundle)
@@ -361,7 +366,7 @@ def _result(
     notes: list[str],
     noise: str,
     robust: bool,
-    image_circle: tuple[float, float, float] | None,
+    lit: dict[int, ImageEllipse],
     name: str,
 ) -> Calibration:
     data = fit.data
@@ -370,14 +375,14 @@ def _result(
     for v in fit.view_reason:
         poses[v] = math.nan
     cameras = {
-        number: _camera(fit, c, uncertainty[c], table, image_circle, name) for c, number in enumerate(data.cameras)
+        number: _camera(fit, c, uncertainty[c], table, lit.get(number), name) for c, number in enumerate(data.cameras)
     }
     for c, number in enumerate(data.cameras):
         uncertainty[c].camera = cameras[number]
     boards = {number: _board(fit, b) for b, number in enumerate(data.board_ids)}
 
     def report() -> dict[str, Any]:
-        return describe(fit, flat, table, notes, cameras, uncertainty) | {"noise": noise, "robust": robust}
+        return describe(fit, flat, table, notes, cameras, uncertainty, lit) | {"noise": noise, "robust": robust}
 
     first = data.cameras[0]
     return Calibration(
@@ -424,10 +429,10 @@ def _camera(
     index: int,
     uncertainty: Uncertainty,
     table: list[dict[str, Any]],
-    image_circle: tuple[float, float, float] | None,
+    lit: ImageEllipse | None,
     name: str,
 ) -> Camera:
-    """The camera as a profile: valid up to the farthest corner of the image, or where its radius stops rising."""
+    """The camera as a profile: valid up to the farthest lit pixel, as far as data carry the radius (`_field_end`)."""
     profile = fit.bundle.camera(index)
     width, height = fit.data.size[index]
     mine = fit.used & (fit.data.camera_of[fit.data.view_of] == index)
@@ -444,8 +449,8 @@ def _camera(
         "cpoly",
     ):
         values[key] = tuple(getattr(profile, key))
-    if image_circle:
-        values |= dict(zip(("circle_u", "circle_v", "circle_radius"), map(float, image_circle), strict=True))
+    if lit:
+        values |= dict(zip(("circle_u", "circle_v", "circle_radius"), lit.circle, strict=True))
     views = len(np.unique(fit.data.view_of[mine]))
     free = fit.model.parameters
     common: dict[str, Any] = {
@@ -467,7 +472,7 @@ def _camera(
         "covariance_parameters": tuple(PARAMETERS[p] for p in free),
         "covariance": uncertainty.covariance[np.ix_(free, free)],
     }
-    wanted = _engine.rising_end(profile, min(_image_end(profile, width, height, image_circle), _BEYOND * covered))
+    wanted = _engine.rising_end(profile, _field_end(profile, lit_corners(lit, width, height), covered))
     error: ProfileError | None = None
     # What cannot be proved one-to-one is not promised: the field shrinks towards what was observed.
     for share in (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.0, -0.02, -0.05):
@@ -479,18 +484,19 @@ def _camera(
     raise CalibrationError(f"the model that fits the views is no lens: {error}")
 
 
-def _image_end(profile: Any, width: int, height: int, circle: tuple[float, float, float] | None) -> float:
-    """Angle of the farthest corner of the image (or edge of the circle) off the axis, with the radius as it is."""
-    if circle:
-        far = circle[2] / min(profile.f_u, profile.f_v)
-    else:
-        far = max(
-            math.hypot((u - profile.c_u) / profile.f_u, (v - profile.c_v) / profile.f_v)
-            for u in (-0.5, width - 0.5)
-            for v in (-0.5, height - 0.5)
-        )
-    grid = np.linspace(0, 3.1, 2000)
-    powers = grid[:, None] ** np.array([1, 3, 5, 7, 9])
-    radius = powers @ np.array([1.0, profile.k2, profile.k3, profile.k4, profile.k5])
-    above = np.flatnonzero(np.maximum.accumulate(radius) >= far * 1.02)
-    return float(grid[above[0]]) if len(above) else 3.1
+def _field_end(profile: Any, corners: Array, covered: float) -> float:
+    """Angle up to which a camera is promised: of the farthest of pixels `corners` (N, 2) on the edge of what is lit, at
+    most _BEYOND times the largest one observed and as long as the radius rises like there, within a factor of two:
+    what bends more is the polynomial, not the lens."""
+    far = float(
+        np.hypot((corners[:, 0] - profile.c_u) / profile.f_u, (corners[:, 1] - profile.c_v) / profile.f_v).max()
+    )
+    grid = np.linspace(0, min(_BEYOND * covered, 3.1), 2000)
+    coefficients = np.array([1.0, profile.k2, profile.k3, profile.k4, profile.k5])
+    radius = grid[:, None] ** np.array([1, 3, 5, 7, 9]) @ coefficients
+    slope = grid[:, None] ** np.array([0, 2, 4, 6, 8]) @ (coefficients * [1, 3, 5, 7, 9])
+    usual = float(np.interp(covered, grid, slope))
+    ends = (np.maximum.accumulate(radius) >= far * 1.005) | (
+        (grid > covered) & ((slope < usual / _BENDS) | (slope > usual * _BENDS))
+    )
+    return max(covered, float(grid[np.argmax(ends)] if ends.any() else grid[-1]))

@@ -11,9 +11,10 @@ import pytest
 import pipefish as pf
 from calib_scenes import RADII, Lens, bearing_error, board, random_lens, turn, views_of
 from pipefish import _engine, calibration
+from pipefish.calib_circle import ImageEllipse, find_image_ellipse
 from pipefish.calib_data import Data
 from pipefish.calib_model import Model
-from pipefish.calib_report import _aligned
+from pipefish.calib_report import _aligned, diameter_spread
 from pipefish.calibration import Calibration, CalibrationError, View, calibrate
 
 LENS = Lens("equidistant", 1280, 800, 330.0, (645.0, 395.0), 1.001, (-0.02, 0.002), math.radians(93))
@@ -321,6 +322,14 @@ def test_boards_seen_mirrored_calibrate_and_a_mirrored_view_is_put_right() -> No
     assert any("view 4" in n and "mirrored" in n for n in result.report["notes"])
 
 
+def test_views_half_of_which_are_mirrored_are_refused() -> None:
+    """They were renumbered and calibrated, though copies of a picture that are mirrored have another centre."""
+    views = unnamed(scene(12)[0])
+    for i in range(0, 12, 2):
+        views[i] = View(views[i].board_xyz, [1279, 0] + views[i].pixels * [-1, 1])
+    assert "6 of 12 views are numbered mirrored" in refusal(views)
+
+
 def bent(points: np.ndarray, height: float) -> np.ndarray:
     x, y = ((points[:, :2] - [0.15, 0.105]) / 0.15).T
     return points + np.stack([0 * x, 0 * x, height * (x * x - 0.5 * x * y + 0.4 * y)], axis=1)
@@ -462,10 +471,10 @@ def test_the_map_of_uncertainty_is_the_scatter_of_projections(model: Model) -> N
     for seed in range(16):
         random = np.random.default_rng(seed)
         views = [View(v.board_xyz, v.pixels + random.normal(0, 0.1, v.pixels.shape)) for v in clean]
-        fit = calibration._start(Data(views, [SIZE]), None)
+        fit = calibration._start(Data(views, [SIZE]), {})
         for m in (Model(), model):
             calibration._settle(fit, m, "uniform", False)
-        result = calibration._result(fit, fit, [], [], "uniform", False, None, "")
+        result = calibration._result(fit, fit, [], [], "uniform", False, {}, "")
         off = (_aligned(fit.bundle.camera(0), points, pixels, weight) - pixels)[-len(spots) :].ravel()
         chi.append(off @ np.linalg.solve(result.uncertainty[0].joint(spots, 0.3), off))
     assert abs(np.mean(chi) - 6) < 4 * math.sqrt(12 / 16)
@@ -557,3 +566,52 @@ def test_the_image_circle_is_found_where_there_is_one() -> None:
 def test_the_call_from_the_package() -> None:
     views, _ = scene(23, 6)
     assert pf.calibrate([pf.View(v.board_xyz, v.pixels) for v in views], SIZE, "p6", "flat").model == "p6"
+
+
+def test_a_camera_that_one_part_of_the_views_holds_alone_has_no_spread() -> None:
+    """The jackknife leaves out every fifth moment in turn: camera 1 of this rig has no view then."""
+    views, _, _ = rig(17)
+    moments = sorted({v.name for v in views}, key=lambda name: int(name.split()[1]))
+    frames = {name: i for i, name in enumerate(moments[:15])}
+    kept = [v for v in views if v.board == 0 and v.name in frames]
+    lone = [v for v in kept if v.camera == 1][:3]
+    both = [v for v in kept if v.camera == 0]
+    names = [v.name for v in both]
+    at = [names[i] for i in (0, 5, 10)]
+    both += [View(v.board_xyz, v.pixels, 0, 1, name) for v, name in zip(lone, at, strict=True)]
+    fit = calibration._start(Data(both, [SIZE, SIZE]), {})
+    fit.free(Model())
+    result = calibrate([v for v in both if v.camera == 0], SIZE, "p9", "flat")
+    spread = diameter_spread(fit, [result.camera, result.camera])
+    assert np.isfinite(spread[0]).all() and np.isnan(spread[1]).all()
+
+
+def test_what_is_lit_may_be_an_ellipse_or_be_cut_by_the_sensor() -> None:
+    v, u = np.mgrid[:480, :640]
+    for truth in (
+        ImageEllipse(322.0, 241.0, 300.0, 225.0, 0.0),
+        ImageEllipse(318.0, 236.0, 280.0, 200.0, 0.3),
+        ImageEllipse(325.0, 236.0, 290.0, 290.0, 0.0),  # cut above and below
+        ImageEllipse(316.0, 244.0, 350.0, 350.0, 0.0),  # all but the corners
+    ):
+        inside = truth.inside(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(u.shape)
+        found = find_image_ellipse([np.where(inside, 150, 4)])
+        assert found is not None
+        assert np.abs(found.radii(truth.rim()) - 1).max() < 0.01
+
+
+def test_a_camera_is_promised_up_to_what_is_lit_and_no_next_view_lies_in_the_dark() -> None:
+    """The field went on to the picture's corner, or to where the polynomial turns."""
+    views, _ = scene(18, 12)
+    lit = ImageEllipse(645.0, 395.0, 420.0, 380.0)
+    views = [View(v.board_xyz[keep], v.pixels[keep]) for v in views if (keep := lit.inside(v.pixels)).sum() > 30]
+    result = calibrate(views, SIZE, "p9", "flat", image_circle=lit)
+    far = np.linalg.norm(
+        result.camera.project(np.array([[math.sin(t), 0, math.cos(t)] for t in [result.camera.theta_max * 0.999]]))[0]
+        - [645, 395]
+    )
+    assert far < 425
+    place = result.report["cameras"][0]["coverage"]["next_view"]["pixel"]
+    assert lit.inside(np.array([place]))[0]
+    whole = calibrate(views, SIZE, "p9", "flat")
+    assert whole.camera.theta_max <= calibration._BEYOND * whole.camera.theta_covered * (1 + 1e-9)

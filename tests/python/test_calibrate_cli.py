@@ -21,8 +21,9 @@ from pipefish import cli
 from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
-from pipefish.calib_run import circle_around
+from pipefish.calib_run import lit_around
 from pipefish.calib_run import run as run_pictures
+from pipefish.calib_settle import places, settle, turns_of
 from pipefish.calib_verdict import verdict
 from synthetic import BOOT, SURVEY, keyframe, start
 from test_page import Outline, data_of
@@ -217,6 +218,10 @@ def test_the_verdict_follows_the_bounds_and_says_why():
         "0.04 px",
     ):
         assert words in said
+    assert "is in the bounds above" not in said  # without a spread they hold no such thing
+    for pipe in pipes:
+        pipe["spread_mm"] = 0.4
+    assert "is in the bounds above" in " ".join(verdict(report, 0.3, math.radians(50))["cautions"])
     camera["pipes"] = [{"dn_mm": 300, "sigma_mm": 2.0}]
     worse = verdict(report, 0.2, math.radians(90))
     assert not worse["usable"] and "Not usable" in worse["text"] and "DN 300" in worse["text"]
@@ -338,14 +343,44 @@ def test_an_ambiguous_picture_is_settled_by_a_first_model():
     assert min(off) < 1.0
 
 
+def test_a_part_of_a_grid_may_lie_wherever_its_colours_do():
+    """A square grid looks the same after quarter turns; a checkerboard's corners exchange their colours then."""
+    dots = pf.Target("circles", 5, 5, 0.03)  # 12 places of 3 x 2, turned four ways, and four of all 48 are one
+    assert turns_of(dots) == [0, 1, 2, 3] and len(places(dots, np.array([0, 1, 2, 5, 6, 7]))) == 12
+    oblong = pf.Target("circles", 5, 7, 0.03)  # 20 places along, 18 across, each turned two ways, which are one
+    assert len(places(oblong, np.array([0, 1, 2, 7, 8, 9]))) == 38
+    board = pf.Target("checkerboard", 7, 9, 0.03)  # corners 6 x 8
+    cols = board.points_shape[0]
+    found = places(board, np.array([0, 1, 2, cols, cols + 1, cols + 2]))
+    code = board.lattice()[0].sum(axis=1) % 2
+    for ids in found:
+        xy = board.points()[ids, :2]
+        along, down = xy[1] - xy[0], xy[3] - xy[0]
+        assert along[0] * down[1] - along[1] * down[0] > 0  # never mirrored
+        assert code[ids[0]] == (0 if abs(along[1]) < 1e-9 else 1)  # a quarter turn exchanges the colours
+    assert len({tuple(i) for i in map(tuple, found)}) == len(found)
+
+
+def test_a_place_that_is_no_better_than_another_is_refused():
+    """Corners of the middle of a large board, in a picture that ends with them: nothing tells which."""
+    board = pf.Target("circles", 9, 9, 0.03)
+    views, _ = scenes.views_of(np.random.default_rng(3), LENS, 8, 0.1, points=board.points())
+    first = pf.calibrate(views, (1280, 960), "p9", "flat")
+    part = np.array([10, 11, 12, 13, 19, 20, 21, 22, 28, 29, 30, 31])
+    pixels = np.stack([600 + 20.0 * (part % 9), 400 + 20.0 * (part // 9)], axis=1)
+    blank = np.full((960, 1280), 128, dtype=np.uint8)
+    found, why = settle(blank, board, part, pixels, first, 0.05)
+    assert found is None and "places" in why
+
+
 def test_points_of_the_target_lie_inside_the_image_circle():
     v, u = np.mgrid[:480, :640]
     lit = np.where(np.hypot(u - 325.3, v - 236.8) < 225.4, 160, 6).astype(np.uint8)
     views = [pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 30.8]])]
-    np.testing.assert_allclose(circle_around(lit, views), [325.3, 236.8, 225.4], atol=1.0)
+    np.testing.assert_allclose(lit_around(lit, views).circle, [325.3, 236.8, 225.4], atol=1.0)
     views.append(pf.View(np.eye(3)[:2], [[325.3, 236.8], [325.3, 10.8]]))
-    assert circle_around(lit, views)[2] == pytest.approx(228, abs=1)
-    assert circle_around(np.full((480, 640), 90, dtype=np.uint8), views) is None
+    assert lit_around(lit, views).a == pytest.approx(228, abs=1)
+    assert lit_around(np.full((480, 640), 90, dtype=np.uint8), views) is None
 
 
 # ---------------------------------------------------------------------- from a device
