@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
+import hashlib
 import io
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -55,13 +56,16 @@ class Target3D:
 
 @dataclasses.dataclass(eq=False)
 class Given:
-    """What there is to calibrate from. views: points that came as such; empty where `pictures` are to be searched."""
+    """What there is to calibrate from. views: points that came as such; empty where `pictures` are to be searched.
+
+    copies: pictures that are left out, (camera, name, name of the one that is the same)."""
 
     cameras: list[str]
     targets: list[Target3D]
     pictures: list[Picture]
     views: list[View]
     sizes: list[tuple[int, int]]
+    copies: list[tuple[int, str, str]] = dataclasses.field(default_factory=list)
 
     def label(self, camera: int, name: str) -> str:
         """A view for messages."""
@@ -94,6 +98,7 @@ def load_views(
     given = Given(list(sources), list(targets), [], [], [])
     sizes: dict[int, tuple[int, int]] = {}
     kinds: set[str] = set()
+    known: dict[tuple[int, bytes], str] = {}  # names of pictures by camera and content
     for camera, paths in enumerate(sources.values()):
         files = [file for path in paths for file in _files(path)]
         kinds |= {"corners" if f.suffix.lower() in CORNERS else "pictures" for f in files}
@@ -108,15 +113,33 @@ def load_views(
                 given.pictures += _keyframes(file, camera)
             else:
                 name = file.stem if len(sources) > 1 else file.name
+                content = (camera, hashlib.sha256(file.read_bytes()).digest())
+                if content in known:
+                    given.copies.append((camera, str(file) if name == known[content] else name, known[content]))
+                    continue
                 if any(p.name == name and p.camera == camera for p in given.pictures):
                     name = str(file)  # the same name in two folders
+                known[content] = name
                 given.pictures.append(Picture(name, camera, str(file), functools.partial(_open, file)))
         if "corners" in kinds:
             beside = {p.parent for p in files} | set(filter(Path.is_dir, paths))
             given.pictures += _beside(beside, [v for v in given.views if v.camera == camera], camera)
         sizes[camera] = sizes.get(camera) or size or _picture_size(given, camera, bool(given.views))
     given.sizes = [sizes[c] for c in range(len(sources))]
+    for camera in {camera for camera, _, _ in given.copies}:
+        _refuse_copies(given, camera)
     return given
+
+
+def _refuse_copies(given: Given, camera: int) -> None:
+    """Raises CalibrationError where hardly anything but copies was given."""
+    different = sum(p.camera == camera for p in given.pictures)
+    if different < 3:
+        texts = [f"{given.label(c, name)} is the same picture as {first}" for c, name, first in given.copies]
+        raise CalibrationError(
+            f"only {different} different picture{'s' if different > 1 else ''}: {'; '.join(texts[:3])}"
+            f"{'; ...' if len(texts) > 3 else ''}. At least 3 are needed, better 15, and the target moved in between"
+        )
 
 
 def _files(path: Path) -> list[Path]:

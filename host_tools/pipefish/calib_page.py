@@ -15,6 +15,7 @@ from PIL import Image
 
 from . import calib_charts, calib_draw
 from .calib_run import Session
+from .calib_size import scale_text
 from .files import write_atomically
 from .page import Chart, chart_html, data_uri, fill, whole_page
 
@@ -75,7 +76,8 @@ def render(session: Session, verdicts: dict[int, dict[str, Any]], title: str) ->
         {
             "verdict": "".join(
                 _verdict(v, f"Camera {session.given.cameras[n]}" if many else "") for n, v in verdicts.items()
-            ),
+            )
+            + f"<p class='note'><b>Scale</b> {html.escape(scale_text(session.given.targets))}.</p>",
             "cameras": "".join(cameras),
             "straight": _straight(session),
             "lost": _lost(session),
@@ -344,6 +346,8 @@ def _views(session: Session) -> str:
     for s in session.unseen:
         label = session.given.label(s.picture.camera, s.picture.name)
         rows.append(("", (label, "0", "-", "-", s.reason or "no target found")))
+    for camera, name, first in session.given.copies:
+        rows.append(("", (session.given.label(camera, name), "-", "-", "-", f"is the same picture as {first}")))
     table = _table(("view", "points", "rms, px", "farthest, deg", "left out because"), rows)
     return f"<details class='card'><summary><h3>All {len(rows)} views</h3></summary>{table}</details>"
 

@@ -159,6 +159,8 @@ def _document(
     live: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """Everything for --json."""
+    from pipefish.calib_size import scale_text
+
     result, report = session.result, session.result.report
     names = session.given.cameras
     return {
@@ -166,6 +168,7 @@ def _document(
         "rig": str(rig) if rig else None,
         "report_file": report_file,
         "recording": live,
+        "scale": scale_text(session.given.targets),
         "model": result.model,
         "rms_px": result.rms,
         "held_out_rms_px": session.held_out[0] if session.held_out else None,
@@ -189,6 +192,9 @@ def _document(
             }
             for s in session.sightings
         ],
+        "copies": [
+            {"camera": names[camera], "picture": name, "same_as": first} for camera, name, first in session.given.copies
+        ],
         "report": finite(report),
     }
 
@@ -207,6 +213,8 @@ def finite(value: Any) -> Any:
 def _text(
     args: argparse.Namespace, session: Any, files: dict[int, Path], verdicts: dict[int, Any], rig: Path | None
 ) -> str:
+    from pipefish.calib_size import scale_text
+
     result, report = session.result, session.result.report
     many = len(files) > 1
     rows: list[tuple[str, object]] = []
@@ -238,9 +246,12 @@ def _text(
         rows.append(
             ("left out", f"{session.given.label(s.picture.camera, s.picture.name)}: {s.reason or 'no target found'}")
         )
+    for camera, name, first in session.given.copies:
+        rows.append(("left out", f"{session.given.label(camera, name)}: is the same picture as {first}"))
     shapes = [b for b in result.boards.values() if b.shape != "flat"]
     rows += [
         ("target", f"bends by {max(b.warp_mm for b in shapes):.2f} mm; taken out" if shapes else "taken as flat"),
+        ("scale", scale_text(session.given.targets)),
         *(("note", note) for note in report["notes"]),
         *(("then", who_of(entry["camera"]) + entry["coverage"]["advice"]) for entry in report["cameras"]),
         *(("written", path) for path in files.values()),
