@@ -35,9 +35,8 @@ def _like(size: tuple[int, int], target: Target) -> tuple[int, int]:
     want = target.points_shape
     if target.kind != "asymmetric-circles":
         return size if (cols >= rows) == (want[0] >= want[1]) else (rows, cols)
-    turned = ((rows + 1) // 2, 2 * cols)  # their lattice looks the same turned by 90 degrees
-    far = [abs(s[0] - want[0]) + abs(s[1] - want[1]) for s in (size, turned)]
-    return size if far[0] <= far[1] else turned
+    # Their lattice looks the same turned by 90 degrees.
+    return want if abs(rows / 2 - want[0]) <= 0.5 and abs(2 * cols - want[1]) <= 1 else size
 
 
 def _text(target: Target, size: tuple[int, int], count: int, pictures: int, name: str) -> str:
