@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import functools
 import hashlib
-import io
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +121,7 @@ def load_views(
                     name = str(file)  # the same name in two folders
                 known[content] = name
                 given.pictures.append(Picture(name, camera, str(file), functools.partial(_open, file)))
+        _refuse_sizes([f for f in files if f.suffix.lower() in PICTURES])
         if "corners" in kinds:
             beside = {p.parent for p in files} | set(filter(Path.is_dir, paths))
             given.pictures += _beside(beside, [v for v in given.views if v.camera == camera], camera)
@@ -129,6 +130,23 @@ def load_views(
     for camera in {camera for camera, _, _ in given.copies}:
         _refuse_copies(given, camera)
     return given
+
+
+def _refuse_sizes(files: Sequence[Path]) -> None:
+    """Raises CalibrationError where pictures have several sizes, FormatError where one cannot be read: at once."""
+    by_size: dict[tuple[int, int], list[Path]] = {}
+    for file in files:
+        with _reading(file), Image.open(file) as opened:
+            by_size.setdefault(opened.size, []).append(file)
+    if len(by_size) < 2:
+        return
+    (usual, most), *odd = sorted(by_size.items(), key=lambda item: -len(item[1]))
+    size, few = odd[0]
+    more = f" and {len(few) - 1} more" if len(few) > 1 else ""
+    raise CalibrationError(
+        f"{few[0]}{more}: {size[0]} x {size[1]} pixels, {len(most)} of {len(files)} pictures have "
+        f"{usual[0]} x {usual[1]}: images of two cameras, or of two settings of one, are mixed"
+    )
 
 
 def _refuse_copies(given: Given, camera: int) -> None:
@@ -171,16 +189,22 @@ def _text(path: Path) -> str:
         raise FormatError(path, None, "not text in UTF-8") from None
 
 
-def _open(source: Path | io.BytesIO, place: Path | None = None) -> npt.NDArray[Any]:
+def _open(file: Path) -> npt.NDArray[Any]:
+    with _reading(file), Image.open(file) as opened:
+        plain = opened.mode in ("L", "RGB", "I;16")
+        return np.asarray(opened if plain else opened.convert("I;16" if opened.mode == "I" else "RGB"))
+
+
+@contextlib.contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """Pillow's errors as ours, with the file."""
     try:
-        with Image.open(source) as opened:
-            plain = opened.mode in ("L", "RGB", "I;16")
-            return np.asarray(opened if plain else opened.convert("I;16" if opened.mode == "I" else "RGB"))
+        yield
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
-        raise FormatError(place or str(source), None, f"not a picture: {error}") from None
+        raise FormatError(file, None, f"not a picture: {error}") from None
     except OSError as error:
         if error.errno is None:  # Pillow's own, for a damaged file
-            raise FormatError(place or str(source), None, f"not a whole picture: {error}") from None
+            raise FormatError(file, None, f"not a whole picture: {error}") from None
         raise
 
 

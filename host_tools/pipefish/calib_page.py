@@ -121,7 +121,7 @@ def _next(session: Session, number: int, v: dict[str, Any]) -> str:
     if v["usable"]:
         steps.insert(0, "Put it on the crawler: pipefish flash DEVICE PROFILE. Freeze focus and zoom as they are now")
     steps.append(f"Scale: {scale_text(session.given.targets)}")
-    return "".join(f"<li>{html.escape(text)}.</li>" for text in steps)
+    return "".join(f"<li class='step'>{html.escape(text)}.</li>" for text in steps)
 
 
 def _verdict(v: dict[str, Any], name: str, steps: str) -> str:
@@ -148,7 +148,7 @@ def _verdict(v: dict[str, Any], name: str, steps: str) -> str:
         f"<section class='card'><h3><span class='badge {badge}'>{word}</span> {html.escape(name)}</h3>"
         f"<p>{html.escape(v['text'])}</p>"
         f"<ul class='why'>{points(v['cautions'], 'caution')}{points(v['reasons'], 'plus')}</ul>"
-        f"<h3>What to do now</h3><ul>{steps}</ul></section>"
+        f"<h3 class='below'>What to do now</h3><ul class='why'>{steps}</ul></section>"
         f"<section class='card'><h3>What the calibration alone puts a diameter off by</h3>{table}"
         "<p class='note'>Mean diameter from wall points seen near 30 and near 80 degrees off the axis, or as far as "
         f"the target was seen; {100 * v['allowed_share']:g} % is allowed. 0.1 % is in it for what no set of views "

@@ -314,7 +314,7 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     assert "found in 0 of 3 pictures" in error and "Is it the target that --target describes?" in error
     Image.fromarray(np.zeros((300, 400), dtype=np.uint8)).save(mixed / "shot0b.png")
     error = refused(mixed)
-    assert "shot0b.png: 400 x 300 pixels, the first picture has 480 x 360" in error and "two cameras" in error
+    assert "shot0b.png: 400 x 300 pixels, 3 of 4 pictures have 480 x 360" in error and "two cameras" in error
     (mixed / "shot0b.png").write_bytes(b"no picture")
     assert "shot0b.png: not a picture" in refused(mixed)
     empty = tmp_path / "empty"

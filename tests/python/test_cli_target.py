@@ -71,25 +71,25 @@ def test_a_description_that_says_too_little_or_nonsense_is_refused(tmp_path, cap
 def drawn(target: pf.Target, scale: float = 3000.0) -> np.ndarray:
     """The sheet as a picture, soft at its edges, `scale` pixels a metre."""
     width, height = (int(scale * side) + 40 for side in target.size_m)
-    y, x = np.mgrid[:height, :width]
-    at = np.stack([x - width / 2 + 0.5, y - height / 2 + 0.5]) / scale
     image = np.full((height, width), target.white)
     for _, u, v, a, b, albedo in target.figures():
-        image[(np.abs(at[0] - u) <= a) & (np.abs(at[1] - v) <= b)] = albedo
+        left, right = (round(width / 2 + scale * x) for x in (u - a, u + a))
+        top, bottom = (round(height / 2 + scale * y) for y in (v - b, v + b))
+        image[top:bottom, left:right] = albedo
     image = sum(np.roll(image, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
     return (255 * image).astype(np.uint8)
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("dictionary", ["4X4_50", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36h11"])
+@pytest.mark.parametrize("dictionary", ["4X4_50", "7X7_1000"])
 def test_charuco_boards_of_opencv_are_found_in_either_layout(dictionary, legacy):
-    target = pf.Target("charuco", 6, 5, 0.03, marker_share=0.75, dictionary=dictionary, legacy=legacy)
+    target = pf.Target("charuco", 6, 4, 0.03, marker_share=0.75, dictionary=dictionary, legacy=legacy)
     image = drawn(target)
     found = pf.detect_target(image, target)
     assert found.status == "ok"
     middle = (np.array(image.shape[::-1]) - 1) / 2
     np.testing.assert_allclose(found.pixels, middle + 3000 * target.flat_points(), atol=0.3)
-    other = pf.Target("charuco", 6, 5, 0.03, marker_share=0.75, dictionary=dictionary, legacy=not legacy)
+    other = pf.Target("charuco", 6, 4, 0.03, marker_share=0.75, dictionary=dictionary, legacy=not legacy)
     assert "legacy" in pf.detect_target(image, other).reason
 
 
