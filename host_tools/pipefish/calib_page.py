@@ -117,7 +117,7 @@ def _next(session: Session, number: int, v: dict[str, Any]) -> str:
     """What to do with it, and what it stands on."""
     entry = next(e for e in session.result.report["cameras"] if e["camera"] == number)
     advice = entry["coverage"]["advice"]
-    steps = [advice[:1].upper() + advice[1:]] if advice else []
+    steps = [f"To make it better: {advice}"] if advice else []
     if v["usable"]:
         steps.insert(0, "Put it on the crawler: pipefish flash DEVICE PROFILE. Freeze focus and zoom as they are now")
     steps.append(f"Scale: {scale_text(session.given.targets)}")
@@ -140,7 +140,7 @@ def _verdict(v: dict[str, Any], name: str, steps: str) -> str:
         )
         for p in v["pipes"]
     ]
-    table = _table(("pipe", "off by (95 %)", "of the diameter", "usable"), rows)
+    table = _table(("pipe", "off by (95 %)", "share", "usable"), rows)
     badge = "good" if v["usable"] and not v["cautions"] else "fair" if v["usable"] else "bad"
     word = {"good": "usable", "fair": "usable, with care", "bad": "not usable"}[badge]
     return (
