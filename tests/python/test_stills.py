@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import load_views
 from pipefish.client import NoDevice
 from pipefish.errors import PipefishError
-from pipefish.stills import StillFolder, Stills, SurveyOver, still_of
+from pipefish.stills import StillFolder, Stills, SurveyOver, _on_enter, still_of
 from pipefish.transport import TcpTransport, open_transport
 from synthetic import SURVEY, keyframe, start
 
@@ -130,6 +131,21 @@ def test_each_line_of_input_is_a_still_also_those_that_come_at_once(tmp_path, ke
     with Device([], SURVEY, state="surveying", stills=[small_still(i) for i in range(5)]) as device:
         assert cli.main(["record", device.address, "-o", str(tmp_path / "a"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"folder": str(tmp_path / "a"), "stills": 3, "ended": "end of input"}
+
+
+def test_lines_that_came_together_do_not_wait_for_the_next_key(keyboard):
+    """They were left in Python's buffer until the pipe or the keyboard gave more."""
+
+    class Served:
+        turns = 0
+
+        def step(self, most_s: float) -> None:
+            self.turns += 1
+            assert self.turns < 20, "a line that is there is not seen"
+
+    keyboard.write(b"\n\n\n")
+    presses = _on_enter(SimpleNamespace(client=Served()))
+    assert [next(presses) for _ in range(3)] == [None] * 3
 
 
 def test_input_that_ends_at_once_leaves_no_folder_and_says_what_to_give(tmp_path, keyboard, capsys):
