@@ -130,3 +130,5 @@ def test_convert_without_an_output_tells_what_a_profile_can_become(tmp_path, cap
     assert forms["binary"]["fits"] and forms["basalt"]["fit"]["exact"] and not forms["ros"]["fits"]
     assert cli.main(["profile", "convert", str(tmp_path / "c.json"), "--to", "ros"]) == 2
     assert "name the file to write" in capsys.readouterr().err
+    assert cli.main(["convert", str(tmp_path / "c.json")]) == 2
+    assert "did you mean: pipefish profile convert" in capsys.readouterr().err
