@@ -143,17 +143,14 @@ std::vector<Eigen::Matrix<double, Eigen::Dynamic, 2, Eigen::RowMajor>> outlines_
     return out;
 }
 
-nb::ndarray<nb::numpy, uint8_t> opencv_marker(int dictionary, int number)
+Array<uint8_t> opencv_marker(int dictionary, int number)
 {
     const auto all = cv::aruco::getPredefinedDictionary(dictionary);
     if (number < 0 || number >= all->bytesList.rows)
         throw nb::value_error("number: the dictionary has no such marker");
     const cv::Mat bits = cv::aruco::Dictionary::getBitsFromByteList(all->bytesList.row(number), all->markerSize);
     const auto side = static_cast<size_t>(all->markerSize);
-    uint8_t *data = nullptr;
-    auto out = array<uint8_t, 2>({side, side}, &data);
-    std::copy_n(bits.ptr(), side * side, data);
-    return out;
+    return to_numpy<uint8_t>(bits.ptr(), {side, side});
 }
 
 } // namespace
