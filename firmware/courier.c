@@ -158,10 +158,11 @@ static bool may_send(const pf_courier *c, uint32_t kind)
 
 static void ask_still(pf_courier *c, pf_msg_reply *reply)
 {
-    if (atomic_load(&c->daemon->state) != PF_STATE_SURVEYING)
-        reply->error = "still: the survey is over, the camera gives no frames";
-    else if (!pf_still_ask(c->daemon->still))
-        reply->error = "still: one is under way: try again";
+    const char *refusal = "still: the survey is over, the camera gives no frames";
+    if (atomic_load(&c->daemon->state) == PF_STATE_SURVEYING)
+        refusal = pf_still_ask(c->daemon->still);
+    if (refusal != NULL)
+        reply->error = refusal;
 }
 
 static void take_profile(pf_courier *c, const pf_link_event *e)
@@ -386,8 +387,10 @@ static void take_event(pf_courier *c, const pf_link_event *e, uint64_t now)
             pf_store_release_slot(c->daemon->store, e->name, false);
         break;
     case PF_LINK_REFUSED:
-        if (end_still(c, e->name))
+        if (end_still(c, e->name)) {
+            pf_log(PF_LOG_ERROR, "the host refuses a still of %u bytes", e->size);
             break;
+        }
         pf_log(PF_LOG_ERROR, "the host refuses an object of %u bytes, kind %u: removed", e->size, e->kind);
         pf_store_release_slot(c->daemon->store, e->name, true);
         break;

@@ -1,6 +1,8 @@
 #include "still.h"
 
+#include <inttypes.h>
 #include <pthread.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -13,18 +15,23 @@ typedef enum still_state { NONE = 0, WANTED, MADE, SENDING } still_state;
 struct pf_still {
     pthread_mutex_t mutex;
     still_state state;
-    size_t capacity, n;
+    size_t capacity, n; /* capacity 0: frames are too large */
+    char refusal[112];
     uint8_t name[32];
     uint8_t bytes[];
 };
 
 bool pf_still_open(pf_still **still, uint32_t width, uint32_t height)
 {
-    const size_t capacity = PF_MSG_RAW_FRAME_MAX((size_t)width * height);
+    const size_t most = PF_MSG_RAW_FRAME_MAX((size_t)width * height);
+    const size_t capacity = most <= PF_STILL_MAX ? most : 0;
     pf_still *s = malloc(sizeof *s + capacity);
     if (s == NULL)
         return false;
     *s = (pf_still){.capacity = capacity};
+    (void)snprintf(s->refusal, sizeof s->refusal,
+                   "still: a frame of %" PRIu32 " x %" PRIu32 " is larger than the %zu MiB that can be sent at once",
+                   width, height, PF_STILL_MAX >> 20);
     pthread_mutex_init(&s->mutex, NULL);
     *still = s;
     return true;
@@ -49,9 +56,11 @@ static bool step(pf_still *s, still_state from, still_state to)
     return is_there;
 }
 
-bool pf_still_ask(pf_still *s)
+const char *pf_still_ask(pf_still *s)
 {
-    return step(s, NONE, WANTED);
+    if (s->capacity == 0)
+        return s->refusal;
+    return step(s, NONE, WANTED) ? NULL : "still: one is under way: try again";
 }
 
 bool pf_still_next(pf_still *s, const uint8_t **bytes, size_t *n, const uint8_t **name)

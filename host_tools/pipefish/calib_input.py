@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import functools
-import io
+import hashlib
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,13 +56,16 @@ class Target3D:
 
 @dataclasses.dataclass(eq=False)
 class Given:
-    """What there is to calibrate from. views: points that came as such; empty where `pictures` are to be searched."""
+    """What there is to calibrate from. views: points that came as such; empty where `pictures` are to be searched.
+
+    copies: pictures that are left out, (camera, name, name of the one that is the same)."""
 
     cameras: list[str]
     targets: list[Target3D]
     pictures: list[Picture]
     views: list[View]
     sizes: list[tuple[int, int]]
+    copies: list[tuple[int, str, str]] = dataclasses.field(default_factory=list)
 
     def label(self, camera: int, name: str) -> str:
         """A view for messages."""
@@ -94,6 +98,7 @@ def load_views(
     given = Given(list(sources), list(targets), [], [], [])
     sizes: dict[int, tuple[int, int]] = {}
     kinds: set[str] = set()
+    known: dict[tuple[int, bytes], str] = {}  # names of pictures by camera and content
     for camera, paths in enumerate(sources.values()):
         files = [file for path in paths for file in _files(path)]
         kinds |= {"corners" if f.suffix.lower() in CORNERS else "pictures" for f in files}
@@ -108,15 +113,51 @@ def load_views(
                 given.pictures += _keyframes(file, camera)
             else:
                 name = file.stem if len(sources) > 1 else file.name
+                content = (camera, hashlib.sha256(file.read_bytes()).digest())
+                if content in known:
+                    given.copies.append((camera, str(file) if name == known[content] else name, known[content]))
+                    continue
                 if any(p.name == name and p.camera == camera for p in given.pictures):
                     name = str(file)  # the same name in two folders
+                known[content] = name
                 given.pictures.append(Picture(name, camera, str(file), functools.partial(_open, file)))
+        _refuse_sizes([f for f in files if f.suffix.lower() in PICTURES])
         if "corners" in kinds:
             beside = {p.parent for p in files} | set(filter(Path.is_dir, paths))
             given.pictures += _beside(beside, [v for v in given.views if v.camera == camera], camera)
         sizes[camera] = sizes.get(camera) or size or _picture_size(given, camera, bool(given.views))
     given.sizes = [sizes[c] for c in range(len(sources))]
+    for camera in {camera for camera, _, _ in given.copies}:
+        _refuse_copies(given, camera)
     return given
+
+
+def _refuse_sizes(files: Sequence[Path]) -> None:
+    """Raises CalibrationError where pictures have several sizes, FormatError where one cannot be read: at once."""
+    by_size: dict[tuple[int, int], list[Path]] = {}
+    for file in files:
+        with _reading(file), Image.open(file) as opened:
+            by_size.setdefault(opened.size, []).append(file)
+    if len(by_size) < 2:
+        return
+    (usual, most), *odd = sorted(by_size.items(), key=lambda item: -len(item[1]))
+    size, few = odd[0]
+    more = f" and {len(few) - 1} more" if len(few) > 1 else ""
+    raise CalibrationError(
+        f"{few[0]}{more}: {size[0]} x {size[1]} pixels, {len(most)} of {len(files)} pictures have "
+        f"{usual[0]} x {usual[1]}: images of two cameras, or of two settings of one, are mixed"
+    )
+
+
+def _refuse_copies(given: Given, camera: int) -> None:
+    """Raises CalibrationError where hardly anything but copies was given."""
+    different = sum(p.camera == camera for p in given.pictures)
+    if different < 3:
+        texts = [f"{given.label(c, name)} is the same picture as {first}" for c, name, first in given.copies]
+        raise CalibrationError(
+            f"only {different} different picture{'s' if different > 1 else ''}: {'; '.join(texts[:3])}"
+            f"{'; ...' if len(texts) > 3 else ''}. At least 3 are needed, better 15, and the target moved in between"
+        )
 
 
 def _files(path: Path) -> list[Path]:
@@ -148,16 +189,22 @@ def _text(path: Path) -> str:
         raise FormatError(path, None, "not text in UTF-8") from None
 
 
-def _open(source: Path | io.BytesIO, place: Path | None = None) -> npt.NDArray[Any]:
+def _open(file: Path) -> npt.NDArray[Any]:
+    with _reading(file), Image.open(file) as opened:
+        plain = opened.mode in ("L", "RGB", "I;16")
+        return np.asarray(opened if plain else opened.convert("I;16" if opened.mode == "I" else "RGB"))
+
+
+@contextlib.contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """Pillow's errors as ours, with the file."""
     try:
-        with Image.open(source) as opened:
-            plain = opened.mode in ("L", "RGB", "I;16")
-            return np.asarray(opened if plain else opened.convert("I;16" if opened.mode == "I" else "RGB"))
+        yield
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
-        raise FormatError(place or str(source), None, f"not a picture: {error}") from None
+        raise FormatError(file, None, f"not a picture: {error}") from None
     except OSError as error:
         if error.errno is None:  # Pillow's own, for a damaged file
-            raise FormatError(place or str(source), None, f"not a whole picture: {error}") from None
+            raise FormatError(file, None, f"not a whole picture: {error}") from None
         raise
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from . import calib_charts, calib_draw
 from .calib_run import Session
+from .calib_size import scale_text
 from .files import write_atomically
 from .page import Chart, chart_html, data_uri, fill, whole_page
 
@@ -24,6 +25,7 @@ _THUMB = 420  # pixels wide
 _MOST_LOST = 12  # rejected views shown
 _MOST_POINTS = 8  # rejected points shown enlarged
 _CUBE_EDGE = 300
+_DARK = 8  # grey value: no darker edge is shown
 _CUBES = 2  # views shown on cube faces, a camera
 
 _LEVELS = {
@@ -52,7 +54,7 @@ def render(session: Session, verdicts: dict[int, dict[str, Any]], title: str) ->
         number = entry["camera"]
         made = _camera_charts(session, entry, str(number) if many else "")
         charts += made
-        name = f"Camera {session.given.cameras[number]}" if many else "What the residuals and the views say"
+        name = f"Camera {session.given.cameras[number]}" if many else "How well it fits, and where"
         cameras.append(
             _section(f"camera{number}", name, "<div class='grid'>" + "".join(map(chart_html, made)) + "</div>")
         )
@@ -74,7 +76,8 @@ def render(session: Session, verdicts: dict[int, dict[str, Any]], title: str) ->
         "calibration.html",
         {
             "verdict": "".join(
-                _verdict(v, f"Camera {session.given.cameras[n]}" if many else "") for n, v in verdicts.items()
+                _verdict(v, f"Camera {session.given.cameras[n]}" if many else "", _next(session, n, v))
+                for n, v in verdicts.items()
             ),
             "cameras": "".join(cameras),
             "straight": _straight(session),
@@ -110,7 +113,18 @@ def _tiles(session: Session, first: dict[str, Any]) -> list[tuple[str, str, str]
     return tiles
 
 
-def _verdict(v: dict[str, Any], name: str) -> str:
+def _next(session: Session, number: int, v: dict[str, Any]) -> str:
+    """What to do with it, and what it stands on."""
+    entry = next(e for e in session.result.report["cameras"] if e["camera"] == number)
+    advice = entry["coverage"]["advice"]
+    steps = [f"To make it better: {advice}"] if advice else []
+    if v["usable"]:
+        steps.insert(0, "Put it on the crawler: pipefish flash DEVICE PROFILE. Freeze focus and zoom as they are now")
+    steps.append(f"Scale: {scale_text(session.given.targets)}")
+    return "".join(f"<li class='step'>{html.escape(text)}.</li>" for text in steps)
+
+
+def _verdict(v: dict[str, Any], name: str, steps: str) -> str:
     def points(items: Iterable[str], kind: str) -> str:
         return "".join(f"<li class='{kind}'>{html.escape(t[:1].upper() + t[1:])}.</li>" for t in items)
 
@@ -119,21 +133,22 @@ def _verdict(v: dict[str, Any], name: str) -> str:
             "",
             (
                 f"DN {p['dn_mm']}",
-                "-" if p["systematic_mm"] is None else f"±{p['systematic_mm']:.2g} mm",
-                "-" if p["share"] is None else f"{100 * p['share']:.2g} %",
+                "-" if p["systematic_mm"] is None else f"±{p['systematic_mm']:.2f} mm",
+                "-" if p["share"] is None else f"{100 * p['share']:.2f} %",
                 "yes" if p["usable"] else "no",
             ),
         )
         for p in v["pipes"]
     ]
-    table = _table(("pipe", "off by (95 %)", "of it", "usable"), rows)
+    table = _table(("pipe", "off by (95 %)", "share", "usable"), rows)
     badge = "good" if v["usable"] and not v["cautions"] else "fair" if v["usable"] else "bad"
     word = {"good": "usable", "fair": "usable, with care", "bad": "not usable"}[badge]
     return (
         "<div class='grid tables below'>"
         f"<section class='card'><h3><span class='badge {badge}'>{word}</span> {html.escape(name)}</h3>"
         f"<p>{html.escape(v['text'])}</p>"
-        f"<ul class='why'>{points(v['cautions'], 'caution')}{points(v['reasons'], 'plus')}</ul></section>"
+        f"<ul class='why'>{points(v['cautions'], 'caution')}{points(v['reasons'], 'plus')}</ul>"
+        f"<h3 class='below'>What to do now</h3><ul class='why'>{steps}</ul></section>"
         f"<section class='card'><h3>What the calibration alone puts a diameter off by</h3>{table}"
         "<p class='note'>Mean diameter from wall points seen near 30 and near 80 degrees off the axis, or as far as "
         f"the target was seen; {100 * v['allowed_share']:g} % is allowed. 0.1 % is in it for what no set of views "
@@ -169,7 +184,7 @@ def _choice(models: list[dict[str, Any]]) -> str:
     """The table of the models that were tried; "" where the user asked for one."""
     if len(models) < 2:
         return ""
-    head = ("lens + shape of the target", "", "parameters", "fitted, px", "held out, px", "gain", "against")
+    head = ("lens + shape of the target", "result", "parameters", "fitted, px", "held out, px", "gain", "against")
     last = max(i for i, m in enumerate(models) if m["accepted"])
     rows = []
     for i, m in enumerate(models):
@@ -186,11 +201,15 @@ def _choice(models: list[dict[str, Any]]) -> str:
         rows.append(("taken" if m["accepted"] else "", cells))
     text = (
         "A fifth of the views at a time was held out: camera and target frozen, their poses refitted. A model is "
-        "accepted "
-        "where nine of ten resamplings of the views gain by it; fewer parameters win a draw."
+        "accepted where nine of ten resamplings of the views gain by it; fewer parameters win a draw. p9 is a lens "
+        "that is the same all around, p23, cpoly2 and cpoly3 are not; e1: its pupil moves with the angle; bend and "
+        "z..: the target's own shape, by degree; saddle: corners that the pictures' light shifts."
     )
     note = f"<p class='note'>{text}</p>"
-    return f"<section class='card full'><h3>Choice of the model</h3>{note}{_table(head, rows)}</section>"
+    return (
+        f"<details class='card full'><summary><h3>Choice of the model: {html.escape(models[last]['model'])} of "
+        f"{len(models)} tried</h3></summary>{note}{_table(head, rows)}</details>"
+    )
 
 
 def _figure(picture: Image.Image, alt: str, caption: str, quality: int = 82) -> str:
@@ -315,7 +334,8 @@ def _cube(session: Session, view: int, number: int) -> str:
         else ""
     )
     name = session.given.label(v.camera, v.name)
-    return _figure(made.picture, f"View {name} on the faces of a cube", f"{name}.{off}")
+    box = made.picture.convert("L").point(lambda grey: 255 * (grey > _DARK)).getbbox()
+    return _figure(made.picture.crop(box), f"View {name} on the faces of a cube", f"{name}.{off}")
 
 
 # ---------------------------------------------------------------------- on record
@@ -344,6 +364,8 @@ def _views(session: Session) -> str:
     for s in session.unseen:
         label = session.given.label(s.picture.camera, s.picture.name)
         rows.append(("", (label, "0", "-", "-", s.reason or "no target found")))
+    for camera, name, first in session.given.copies:
+        rows.append(("", (session.given.label(camera, name), "-", "-", "-", f"is the same picture as {first}")))
     table = _table(("view", "points", "rms, px", "farthest, deg", "left out because"), rows)
     return f"<details class='card'><summary><h3>All {len(rows)} views</h3></summary>{table}</details>"
 

@@ -14,6 +14,7 @@ from .calib_circle import ImageEllipse, find_image_ellipse
 from .calib_data import CalibrationError, View
 from .calib_input import Given, Picture, Target3D
 from .calib_settle import missed_share, settle
+from .calib_size import refuse_other_size
 from .calibration import Calibration, calibrate
 from .detect import Detection, detect_target
 
@@ -36,6 +37,7 @@ class Sighting:
     pixels: npt.NDArray[np.float64]
     status: str
     reason: str
+    seen: tuple[int, int] = (0, 0)  # Detection.seen
     added: int = 0
 
     @property
@@ -89,6 +91,8 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
         brightest: dict[int, npt.NDArray[np.uint8]] = {}
         sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
         views = views_of(given, sightings)
+        if len(given.targets) == 1:
+            refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
         refuse_too_few(given, sightings)
         refuse_wrong_size(given, sightings)
         options["image_circle"] = {
@@ -153,7 +157,7 @@ def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> Image
 
 
 def _sighting(picture: Picture, board: int, found: Detection) -> Sighting:
-    return Sighting(picture, board, found.ids, found.pixels, found.status, found.reason)
+    return Sighting(picture, board, found.ids, found.pixels, found.status, found.reason, found.seen)
 
 
 def views_of(given: Given, sightings: Sequence[Sighting]) -> list[View]:
@@ -178,7 +182,11 @@ def refuse_too_few(given: Given, sightings: Sequence[Sighting]) -> None:
         reasons = Counter(s.reason or "not found" for s in failed)
         why = f" ({failed[0].picture.name}: {failed[0].reason})" if failed else ""
         most = f"; most often: {reasons.most_common(1)[0][0]}" if len(reasons) > 1 else ""
-        ask = ". Is it the target that --target describes?" if pictures >= 3 and not seen else ""
+        ask = (
+            ". Is it the target that --target describes? Sharp, evenly lit, with its white margin in view?"
+            if not seen
+            else ""
+        )
         raise CalibrationError(
             f"{who}the target was found in {len(seen)} of {pictures} pictures; at least 3 are needed, better "
             f"15{why}{most}"

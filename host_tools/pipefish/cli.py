@@ -347,6 +347,10 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
+        if message.startswith("argument COMMAND: invalid choice"):
+            for action in ("convert", "check"):
+                if f"choice: '{action}'" in message:
+                    message = f"there is no command {action}; did you mean: pipefish profile {action}"
         raise UsageError(f"{self.prog.removeprefix('pipefish').strip()}: {message}".removeprefix(": "))
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +30,26 @@ def run_calibrate(args: argparse.Namespace) -> Result:
     from pipefish.calib_run import run
     from pipefish.progress import Progress
 
+    _may_write(args)
     targets = [load_target(Path(path)) for path in args.target]
     live: dict[str, Any] | None = None
     if args.device:
         from pipefish.calib_live import collect
         from pipefish.transport import open_transport
 
-        live = collect(
-            open_transport(args.device, args.baud),
-            targets,
-            _recording(args),
-            most=args.most,
-            timeout_s=args.timeout,
-            quiet=args.json,
-        )
+        folder = _recording(args)
+        try:
+            live = collect(
+                open_transport(args.device, args.baud),
+                targets,
+                folder,
+                most=args.most,
+                timeout_s=args.timeout,
+                quiet=args.json,
+            )
+        finally:
+            with contextlib.suppress(OSError):  # the folder goes where nothing came into it
+                folder.rmdir()
         sources = {"camera": [Path(live["folder"])]}
     elif args.camera:
         sources = {}
@@ -59,6 +67,24 @@ def run_calibrate(args: argparse.Namespace) -> Result:
         session = run(given, model=args.model, board=args.board, tell=tell)
         tell("report", 0.98)
         return _written(args, session, live)
+
+
+def _may_write(args: argparse.Namespace) -> None:
+    """Raises UsageError where a result could not be written after minutes of work, or over what it is made from."""
+    out = Path(args.output)
+    for option, path in (("-o", out), ("--report", Path(args.report) if args.report else None)):
+        if path is None:
+            continue
+        if any(path.exists() and Path(one).exists() and path.samefile(one) for one in (*args.target, *args.views)):
+            raise UsageError(f"calibrate: {option} {path}: is what it calibrates from; name another file")
+        is_rig = args.camera and path is out
+        folder = path if is_rig else path.parent
+        while is_rig and not folder.exists():
+            folder = folder.parent
+        if not folder.is_dir():
+            raise UsageError(f"calibrate: {option} {path}: there is no folder {folder}")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise UsageError(f"calibrate: {option} {path}: the folder {folder} may not be written to")
 
 
 def _recording(args: argparse.Namespace) -> Path:
@@ -159,6 +185,8 @@ def _document(
     live: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """Everything for --json."""
+    from pipefish.calib_size import scale_text
+
     result, report = session.result, session.result.report
     names = session.given.cameras
     return {
@@ -166,6 +194,7 @@ def _document(
         "rig": str(rig) if rig else None,
         "report_file": report_file,
         "recording": live,
+        "scale": scale_text(session.given.targets),
         "model": result.model,
         "rms_px": result.rms,
         "held_out_rms_px": session.held_out[0] if session.held_out else None,
@@ -189,6 +218,9 @@ def _document(
             }
             for s in session.sightings
         ],
+        "copies": [
+            {"camera": names[camera], "picture": name, "same_as": first} for camera, name, first in session.given.copies
+        ],
         "report": finite(report),
     }
 
@@ -207,6 +239,8 @@ def finite(value: Any) -> Any:
 def _text(
     args: argparse.Namespace, session: Any, files: dict[int, Path], verdicts: dict[int, Any], rig: Path | None
 ) -> str:
+    from pipefish.calib_size import scale_text
+
     result, report = session.result, session.result.report
     many = len(files) > 1
     rows: list[tuple[str, object]] = []
@@ -238,9 +272,12 @@ def _text(
         rows.append(
             ("left out", f"{session.given.label(s.picture.camera, s.picture.name)}: {s.reason or 'no target found'}")
         )
+    for camera, name, first in session.given.copies:
+        rows.append(("left out", f"{session.given.label(camera, name)}: is the same picture as {first}"))
     shapes = [b for b in result.boards.values() if b.shape != "flat"]
     rows += [
         ("target", f"bends by {max(b.warp_mm for b in shapes):.2f} mm; taken out" if shapes else "taken as flat"),
+        ("scale", scale_text(session.given.targets)),
         *(("note", note) for note in report["notes"]),
         *(("then", who_of(entry["camera"]) + entry["coverage"]["advice"]) for entry in report["cameras"]),
         *(("written", path) for path in files.values()),
@@ -281,7 +318,8 @@ def add_calibrate(commands: Any) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="the JSON that `pipefish target` wrote; again for each target of a run",
+        help="the JSON that `pipefish target` writes, also of a target that you have (`pipefish target --help`); again "
+        "for each target of a run",
     )
     p.add_argument("-o", "--output", required=True, metavar="FILE", help="profile to write; of a rig: a folder of them")
     p.add_argument("--report", metavar="FILE.html", help="a page that tells whether it is good, and why")
@@ -319,7 +357,10 @@ def add_calibrate(commands: Any) -> None:
                 "calibrate: give either VIEWS, or --camera NAME=FOLDER for each camera of a rig, or --device"
             )
         if not args.target and not (args.views and all(str(v).lower().endswith(".csv") for v in args.views)):
-            raise UsageError("calibrate: --target FILE is needed: the JSON that `pipefish target` wrote")
+            raise UsageError(
+                "calibrate: --target FILE is needed: the JSON that `pipefish target` wrote; to describe a target you "
+                "have: pipefish target checkerboard --corners 9x6 --spacing 25 -o board.json"
+            )
         if args.report and not args.report.lower().endswith((".html", ".htm")):
             raise UsageError(f"calibrate: --report {args.report}: the name must end in .html")
         if args.recording and not args.device:

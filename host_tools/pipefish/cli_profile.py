@@ -131,6 +131,10 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
     from pipefish.files import write_atomically
     from pipefish.formats import write
 
+    if args.out is None:
+        if args.to:
+            raise UsageError(f"profile convert: --to {args.to}: name the file to write as well: OUT")
+        return _convertible(args)
     out = Path(args.out)
     if out.exists() and Path(args.profile).exists() and out.samefile(args.profile):
         raise UsageError(f"profile convert: {out} would be written over what it is made from")
@@ -167,6 +171,37 @@ def run_profile_convert(args: argparse.Namespace) -> Result:
         *(("note", note) for note in notes if note not in loaded.notes),
     ]
     return document, table(rows)
+
+
+def _convertible(args: argparse.Namespace) -> Result:
+    """What a profile can be converted to, with the error of each; nothing is written."""
+    from pipefish.formats import WRITERS
+    from pipefish.formats.writers import Wanted
+
+    loaded = load_profile(args)
+    camera, wanted = loaded.camera, Wanted(args.max_error, _radians(args.max_theta))
+    exact = {"json": "exact; OUT.json", "binary": "exact, for devices; OUT.profile or OUT.bin"}
+    forms: dict[str, dict[str, Any]] = {form: {"fits": True, "fit": None, "reason": ""} for form in exact}
+    rows: list[tuple[str, object]] = [
+        ("name", camera.name or "unnamed"),
+        ("read as", f"{loaded.form}, {loaded.fit}" if loaded.fit else loaded.form),
+        ("picture", f"{camera.width} x {camera.height}"),
+        ("field of view", f"{2 * math.degrees(camera.theta_max):.1f} deg"),
+        ("can become", "(nothing has been written)"),
+        *((f"  {form}", text) for form, text in exact.items()),
+    ]
+    for form in WRITTEN:
+        if form in exact:
+            continue
+        try:
+            fit = WRITERS[form](camera, wanted).fit
+            forms[form] = {"fits": True, "fit": fit_document(fit), "reason": ""}
+            rows.append((f"  {form}", f"{fit}; OUT --to {form}"))
+        except ProfileError as error:
+            forms[form] = {"fits": False, "fit": None, "reason": error.reason}
+            rows.append((f"  {form}", f"no: {error.reason.removeprefix(form).strip(' :')}"))
+    rows.append(("next", f"pipefish profile convert {args.profile} OUT [--to FORMAT]"))
+    return {"file": args.profile, "read_as": loaded.form, "forms": forms, "notes": list(loaded.notes)}, table(rows)
 
 
 def _radians(degrees: float | None) -> float | None:
@@ -281,11 +316,18 @@ def add_profile(commands: Any) -> None:
         "convert",
         run_profile_convert,
         "Convert a profile: JSON for people, binary for devices, or another program's format, with the error of it.",
-        "pipefish profile convert camchain.yaml camera.profile\n"
+        "pipefish profile convert camera.json\n"
+        "  pipefish profile convert camchain.yaml camera.profile\n"
         "  pipefish profile convert camera.json camera.yaml --to opencv-fisheye",
     )
     p.add_argument("profile", metavar="PROFILE", help=which)
-    p.add_argument("out", metavar="OUT", help="file to write; without --to: .json is JSON, .profile and .bin binary")
+    p.add_argument(
+        "out",
+        metavar="OUT",
+        nargs="?",
+        help="file to write; without --to: .json is JSON, .profile and .bin binary. Without OUT: only tell what "
+        "it can become",
+    )
     p.add_argument(
         "--to", choices=WRITTEN, help="format to write, whatever the name is; needed for all but .json, .profile, .bin"
     )

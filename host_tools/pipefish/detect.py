@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from pipefish import _engine
 from pipefish.errors import ArgumentError
-from pipefish.target import Target, marker_bits
+from pipefish.target import Target
 
 if TYPE_CHECKING:
     from pipefish.camera import Camera
@@ -24,7 +24,7 @@ class Detection:
     status: "ok" (all points), "partial" (some), "ambiguous" (some, and which ones is known only up to a shift along the
     board), "none". reason: in plain words, what is missing or why there is nothing; "" when there is nothing to say.
     turns: in how many ways the target may be turned and look the same; above 1 the order that reads most like text is
-    given. mirrored: the target is seen as in a mirror.
+    given. mirrored: the target is seen as in a mirror. With a model `seen` is not told.
     """
 
     ids: npt.NDArray[np.int64]  #: (M,) rows of Target.points(), ascending
@@ -34,6 +34,10 @@ class Detection:
     reason: str
     turns: int = 1
     mirrored: bool = False
+    seen: tuple[int, int] = (
+        0,
+        0,
+    )  #: points in a row and rows of the grid seen, whatever the target has; 0: none, markers
     outlines: npt.NDArray[np.float64] | None = None  #: of discs: (M, 32, 2) points on the rims, NaN where there is none
 
     def __bool__(self) -> bool:
@@ -70,12 +74,12 @@ def _board(target: Target) -> _engine.Board:
     if target.kind == "sleeve":
         code = target.sleeve_bits().ravel().astype(np.uint8)
     elif not target.has_circles:
-        # The square to the upper left of corner (0, 0) is the dark square (0, 0).
-        code = (1 - sites.sum(1) % 2).astype(np.uint8)
+        # The square to the upper left of corner (0, 0) is the square (0, 0).
+        code = ((sites.sum(1) + target.dark_parity + 1) % 2).astype(np.uint8)
     if target.kind == "charuco":
         middles = target.marker_middles()
         bits, side = target.marker_bits, target.marker_share * target.spacing_m
-        codes = np.array([marker_bits(target.first_marker + k, bits) for k in range(len(middles))], dtype=np.uint8)
+        codes = np.array([target.marker(target.first_marker + k) for k in range(len(middles))], dtype=np.uint8)
     return _engine.Board(
         kind=target.kind,
         flat=np.ascontiguousarray(flat),
@@ -86,10 +90,21 @@ def _board(target: Target) -> _engine.Board:
         radius=target.radius_m,
         diameter=target.diameter_m,
         marker_bits=bits,
+        marker_errors=_correctable(codes) if bits else 0,
         marker_side=side,
         marker_middles=np.ascontiguousarray(middles, dtype=float),
         marker_codes=np.ascontiguousarray(codes),
     )
+
+
+def _correctable(codes: npt.NDArray[np.uint8]) -> int:
+    """In how many bits a marker (of codes (K, side, side)) may be misread and still be told from all others, turned or
+    not; no more than a third of a side's."""
+    side = codes.shape[1]
+    turned = np.stack([np.rot90(codes, k, (1, 2)) for k in range(4)]).reshape(4, len(codes), -1)
+    apart = (turned[:, :, None] != turned[0]).sum(-1)
+    apart[0][np.diag_indices(len(codes))] = side * side
+    return min(int(apart.min() - 1) // 2, (side - 3) // 2 + 1) if len(codes) else 0
 
 
 def detect_target(

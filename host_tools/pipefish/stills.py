@@ -9,6 +9,7 @@ import contextlib
 import csv
 import hashlib
 import io
+import os
 import select
 import sys
 import time
@@ -31,6 +32,7 @@ from .transport import Transport, TransportClosed
 
 OBJECT_RAW_FRAME = 5  # pf_object_kind
 _ASK_AGAIN_S = 0.05  # after "try again": the device has not heard yet that the last still is here
+_INPUT_ENDED = "end of input"
 _OVER_S = 2.0  # of a survey that is over, for a still that was made before
 _COLUMNS = (
     *("sequence", "time_ns", "encoder_count", "roll_rad", "pitch_rad", "attitude_sigma_rad"),
@@ -191,37 +193,57 @@ class StillFolder:
             raise file_error(error, path) from error
         self._rows: list[list[object]] = []
 
+    def remove(self) -> None:
+        """Takes the folder away where nothing came into it, so that the next try may have its name."""
+        with contextlib.suppress(OSError):
+            self.path.rmdir()
+
     def add(self, still: Still) -> Path:
         """Writes a still. Raises PipefishError if the device has restarted since the first: its clock began anew."""
         self._boot = self._boot or still.boot_id
         if still.boot_id != self._boot:
             raise PipefishError(f"the device has restarted; {self.count} stills are in {self.path}")
-        self.count += 1
-        path = self.path / f"shot{self.count}.png"
-        write_atomically(path, still.png())
+        path = self.path / f"shot{self.count + 1}.png"
         t = still.telemetry
-        self._rows.append(
-            [
-                *(still.sequence, still.time_ns),
-                *(_cell(getattr(t, name)) if t.HasField(name) else "" for name in _COLUMNS[2:9]),
-                hashlib.sha256(still.image.tobytes()).hexdigest(),
-            ]
-        )
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *self._rows])
-        write_atomically(self.path / TELEMETRY, text.getvalue().encode())
+        row = [
+            *(still.sequence, still.time_ns),
+            *(_cell(getattr(t, name)) if t.HasField(name) else "" for name in _COLUMNS[2:9]),
+            hashlib.sha256(still.image.tobytes()).hexdigest(),
+        ]
+        try:
+            write_atomically(path, still.png())
+            self._write([*self._rows, row])
+        except BaseException:  # Ctrl-C too: a picture without its row would make the folder no recording
+            path.unlink(missing_ok=True)
+            if self._rows:
+                self._write(self._rows)
+            raise
+        self._rows.append(row)
+        self.count += 1
         return path
+
+    def _write(self, rows: list[list[object]]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
+        write_atomically(self.path / TELEMETRY, text.getvalue().encode())
 
 
 def _on_enter(stills: Stills) -> Iterator[None]:
-    """Yields at each line of standard input, until it ends; the link is served meanwhile."""
+    """Yields at each line of standard input, until it ends; the link is served meanwhile. Read past Python's buffer:
+    lines that lie in it would be seen by no select. What comes while a still is taken waits its turn."""
+    if sys.stdin is None:
+        return
+    keys, waiting = sys.stdin.fileno(), 0
     while True:
         stills.client.step(0.0)
-        readable, _, _ = select.select([sys.stdin], [], [], 0.05)
-        if readable:
-            if not sys.stdin.readline():
-                return
+        if waiting:
+            waiting -= 1
             yield
+        elif select.select([keys], [], [], 0.05)[0]:
+            typed = os.read(keys, 4096)
+            if not typed:
+                return
+            waiting = typed.count(b"\n")
 
 
 def _every(stills: Stills, seconds: float) -> Iterator[None]:
@@ -244,7 +266,8 @@ def record(
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Stills into a folder, at each line of standard input (every_s None) or at intervals; until there are `count`,
-    the input or the survey ends, or Ctrl-C. -> folder, stills, ended. Raises PipefishError where none came."""
+    the input or the survey ends, or Ctrl-C. -> folder, stills, ended. Raises PipefishError where none came, and the
+    folder goes again."""
     kept = StillFolder(folder)
     ended = f"{count} stills"
     try:
@@ -255,11 +278,16 @@ def record(
                 if count is not None and kept.count >= count:
                     break
             else:
-                ended = "end of input"
+                ended = _INPUT_ENDED
     except KeyboardInterrupt:
         ended = "stopped by Ctrl-C"
     except (NoDevice, SurveyOver) as error:
         if not kept.count:
+            kept.remove()
             raise
         ended = str(error)
+    if not kept.count:
+        kept.remove()
+        ask = "; without a keyboard give --every SECONDS" if ended == _INPUT_ENDED else ""
+        raise PipefishError(f"no still was taken: {ended}{ask}")
     return {"folder": str(folder), "stills": kept.count, "ended": ended}

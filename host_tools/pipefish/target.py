@@ -25,6 +25,17 @@ FORMAT = "pipefish-target"
 KINDS = ("checkerboard", "circles", "asymmetric-circles", "charuco", "sleeve")
 WHITE, BLACK = 0.85, 0.05  # albedo of paper and of toner
 
+OWN = "pipefish"  # the dictionary of marker_bits
+# OpenCV's, in the order of its numbers: bits of a marker's side, markers.
+DICTIONARIES = {
+    **{f"{n}X{n}_{count}": (n, count) for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "ARUCO_ORIGINAL": (5, 1024),
+    "APRILTAG_16h5": (4, 30),
+    "APRILTAG_25h9": (5, 35),
+    "APRILTAG_36h10": (6, 2320),
+    "APRILTAG_36h11": (6, 587),
+}
+
 
 @dataclass(frozen=True)
 class Target:
@@ -34,9 +45,11 @@ class Target:
     in each row, every other row half a step to the right. spacing_m: of a square's side, else of neighbouring centres
     in a row and between rows; asymmetric circles: of a column, rows are half of it apart. radius_m: of circles and of a
     sleeve's discs [0.3 spacing; asymmetric 0.2; sleeve 0.25]. margin_m: white around it all [one spacing; sleeve half].
-    marker_share: a charuco marker's side to a square's. marker_bits: of a marker's side without its black border.
-    first_marker: number of the first one. diameter_m: of the pipe that a sleeve goes around the inside of; it decides
-    the spacing around it. Raises ArgumentError that names the field.
+    marker_share: a charuco marker's side to a square's. dictionary: its markers, OWN or one of DICTIONARIES;
+    marker_bits: of a marker's side without its black border, of OWN (the others have their own). first_marker: number
+    of the first one. legacy: laid out as OpenCV before 4.6 did, where an even number of rows begins with a marker.
+    diameter_m: of the pipe that a sleeve goes around the inside of; it decides the spacing around it. Raises
+    ArgumentError that names the field.
     """
 
     kind: str
@@ -48,6 +61,8 @@ class Target:
     marker_share: float = 0.7
     marker_bits: int = 5
     first_marker: int = 0
+    dictionary: str = OWN
+    legacy: bool = False
     diameter_m: float = 0.0
     white: float = field(default=WHITE)
     black: float = field(default=BLACK)
@@ -74,10 +89,9 @@ class Target:
                 raise ArgumentError(f"{name}: must be a number from {low:g} to {high:g}, not {value!r}")
         if self.white <= self.black:
             raise ArgumentError("white: must be above black")
-        if self.marker_bits not in (4, 5, 6):
-            raise ArgumentError(f"marker_bits: must be 4, 5 or 6, not {self.marker_bits!r}")
-        if not 0 <= self.first_marker <= 1000:
+        if not isinstance(self.first_marker, int) or not 0 <= self.first_marker <= 1000:
             raise ArgumentError("first_marker: must be within 0 and 1000")
+        self._check_markers()
         if sleeve != (self.diameter_m > 0):
             raise ArgumentError("diameter_m: a sleeve needs it, nothing else has it")
         share = {"asymmetric-circles": 0.2, "sleeve": 0.25}.get(self.kind, 0.3)
@@ -88,6 +102,24 @@ class Target:
         gap = 0.5 * min(self.spacing_m, self.spacing_x) * (math.sqrt(0.5) if self.kind == "asymmetric-circles" else 1)
         if self.has_circles and not self.radius_m < 0.95 * gap:
             raise ArgumentError(f"radius_m: circles of {self.radius_m:g} m touch: must be below {0.95 * gap:g}")
+
+    def _check_markers(self) -> None:
+        charuco = self.kind == "charuco"
+        if not isinstance(self.legacy, bool) or (self.legacy and not charuco):
+            raise ArgumentError("legacy: must be true or false, and is for charuco")
+        if self.dictionary == OWN:
+            if self.marker_bits not in (4, 5, 6):
+                raise ArgumentError(f"marker_bits: must be 4, 5 or 6, not {self.marker_bits!r}")
+            return
+        if not charuco or self.dictionary not in DICTIONARIES:
+            raise ArgumentError(
+                f"dictionary: must be {OWN} or, of a charuco, one of {', '.join(DICTIONARIES)}, not {self.dictionary!r}"
+            )
+        bits, count = DICTIONARIES[self.dictionary]
+        last = self.first_marker + len(self.marker_middles())
+        if last > count:
+            raise ArgumentError(f"dictionary: {self.dictionary} has {count} markers, the board needs {last}")
+        object.__setattr__(self, "marker_bits", bits)
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Target:
@@ -187,7 +219,20 @@ class Target:
         """(K, 2) middles of a ChArUco board's markers on the sheet, in the order of their numbers."""
         row, col = np.mgrid[: self.rows, : self.cols].reshape(2, -1)
         at = np.column_stack([col - (self.cols - 1) / 2, row - (self.rows - 1) / 2]) * self.spacing_m
-        return at[(row + col) % 2 == 1]
+        return at[(row + col) % 2 != self.dark_parity]
+
+    @property
+    def dark_parity(self) -> int:
+        """Row plus column, modulo 2, of the dark squares."""
+        return int(self.legacy and self.rows % 2 == 0)
+
+    def marker(self, number: int) -> np.ndarray:
+        """The inner bits of one of its dictionary's markers, (side, side), 1 = white."""
+        if self.dictionary == OWN:
+            return marker_bits(number, self.marker_bits)
+        from pipefish import _engine
+
+        return _engine.opencv_marker(list(DICTIONARIES).index(self.dictionary), number)
 
     def points(self) -> np.ndarray:
         """Corners or centres (N, 3), row by row. A sleeve's in the pipe's frame: Z along it, X to the right, Y down,
@@ -215,7 +260,7 @@ class Target:
             for col in range(self.cols):
                 x = (col - (self.cols - 1) / 2) * self.spacing_m
                 y = (row - (self.rows - 1) / 2) * self.spacing_m
-                if (row + col) % 2 == 0:
+                if (row + col) % 2 == self.dark_parity:
                     made.append((0, x, y, half, half, self.black))
                 elif self.kind == "charuco":
                     made += self._marker(marker, x, y)
@@ -223,7 +268,7 @@ class Target:
         return np.array(made)
 
     def _marker(self, number: int, x: float, y: float) -> list[tuple[float, ...]]:
-        bits = marker_bits(number, self.marker_bits)
+        bits = self.marker(number)
         side = self.marker_share * self.spacing_m
         cell = side / (self.marker_bits + 2)
         made: list[tuple[float, ...]] = [(0, x, y, side / 2, side / 2, self.black)]

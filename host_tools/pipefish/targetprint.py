@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipefish.errors import ArgumentError
-from pipefish.target import Target
+from pipefish.target import OWN, Target
 
 PAPERS = {
     "A0": (841.0, 1189.0),
@@ -120,7 +120,12 @@ def describe(target: Target) -> str:
         )
     if target.kind == "charuco":
         last = target.first_marker + len(target.marker_middles()) - 1
-        return f"ChArUco, {target.cols} x {target.rows} squares of {step}, markers {target.first_marker} to {last}"
+        kind = "" if target.dictionary == OWN else f" of {target.dictionary}"
+        legacy = ", legacy" if target.legacy else ""
+        return (
+            f"ChArUco, {target.cols} x {target.rows} squares of {step}, markers {target.first_marker} to {last}{kind}"
+            f"{legacy}"
+        )
     radius = f"radius {1000 * target.radius_m:g} mm"
     if target.kind == "sleeve":
         return (
@@ -128,6 +133,8 @@ def describe(target: Target) -> str:
             f"discs, {radius}, rings {step} apart"
         )
     name = "asymmetric circles" if target.kind == "asymmetric-circles" else "circles"
+    if target.kind == "asymmetric-circles":
+        step = f"{step} within a row ({500 * target.spacing_m:g} mm from row to row)"
     return f"{name}, {target.cols} x {target.rows}, spacing {step}, {radius}"
 
 

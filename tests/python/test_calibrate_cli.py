@@ -19,11 +19,13 @@ import pipefish as pf
 from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
+from pipefish.calib_data import CalibrationError
 from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
 from pipefish.calib_run import lit_around
 from pipefish.calib_run import run as run_pictures
 from pipefish.calib_settle import places, settle, turns_of
+from pipefish.calib_size import refuse_other_size
 from pipefish.calib_verdict import verdict
 from synthetic import BOOT, SURVEY, keyframe, start
 from test_page import Outline, data_of
@@ -312,16 +314,108 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     mixed.mkdir()
     for i in range(3):
         shutil.copy(folder / f"shot{i}.png", mixed)
-    pf.Target("checkerboard", 12, 14, 0.03).save(tmp_path / "other.json")
-    assert "found in 0 of 3 pictures" in refused(mixed, tmp_path / "other.json")
+    pf.Target("circles", 12, 14, 0.03).save(tmp_path / "other.json")
+    error = refused(mixed, tmp_path / "other.json")
+    assert "found in 0 of 3 pictures" in error and "Is it the target that --target describes?" in error
     Image.fromarray(np.zeros((300, 400), dtype=np.uint8)).save(mixed / "shot0b.png")
     error = refused(mixed)
-    assert "shot0b.png: 400 x 300 pixels, the first picture has 480 x 360" in error and "two cameras" in error
+    assert "shot0b.png: 400 x 300 pixels, 3 of 4 pictures have 480 x 360" in error and "two cameras" in error
     (mixed / "shot0b.png").write_bytes(b"no picture")
     assert "shot0b.png: not a picture" in refused(mixed)
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no pictures" in refused(empty)
+
+
+@pytest.mark.parametrize(
+    ("squares", "words"),
+    [
+        ((5, 8), ["larger than described", "6 x 9 squares", "inner corners were given as --grid", "--grid 6x9"]),
+        ((11, 8), ["smaller than described", "8 x 5 inner corners (9 x 6 squares)", "described are 10 x 7 inner"]),
+    ],
+)
+def test_a_board_of_another_size_is_told_with_what_to_type(pictures, tmp_path, capsys, squares, words):
+    """Squares for inner corners, exchanged too; a larger and a smaller board."""
+    for i in range(3):
+        shutil.copy(pictures[0] / f"shot{i}.png", tmp_path)
+    pf.Target("checkerboard", squares[1], squares[0], 0.03).save(tmp_path / "other.json")
+    assert run(tmp_path, "--target", tmp_path / "other.json", "-o", tmp_path / "c.json") == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and all(w in error for w in words), error
+
+
+def test_which_size_a_target_has_is_told_by_half_of_the_pictures_not_by_parts_of_it():
+    def refuse(kind, cols, rows, seen):
+        refuse_other_size(pf.Target(kind, rows, cols, 0.04), seen, "mine")
+
+    refuse("circles", 7, 7, [(7, 7), (6, 7), (5, 5), (0, 0)])
+    refuse("circles", 9, 8, [(7, 7), (6, 7), (5, 5), (4, 8)])  # parts, each another one
+    refuse("circles", 9, 8, [(7, 7), (7, 7), (7, 7), (9, 8)])  # once it was seen whole
+    refuse("checkerboard", 9, 6, [(5, 8), (5, 8), (5, 8)])  # turned
+    refuse("charuco", 9, 6, [(3, 3)] * 9)
+    refuse("asymmetric-circles", 4, 11, [(4, 11), (6, 8), (6, 8)])  # their lattice turned by 90 degrees looks the same
+    with pytest.raises(
+        CalibrationError, match=r"smaller than described: 3 of 5 pictures show 7 x 7 circles, .* --grid 7x7"
+    ):
+        refuse("circles", 9, 8, [(7, 7), (7, 7), (7, 7), (5, 5), (0, 0)])
+    with pytest.raises(CalibrationError, match=r"not the one described: 1 of 1 .*--grid 9x6"):
+        refuse("checkerboard", 12, 5, [(5, 8)])
+    with pytest.raises(
+        CalibrationError, match=r"Columns and rows are exchanged.*--grid 4x11 --spacing 40 -o mine.json"
+    ):
+        refuse("asymmetric-circles", 11, 4, [(4, 11), (4, 11)])
+
+
+def test_copies_of_a_picture_are_left_out_and_named(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    names = ("a.png", "b.png", "c.png", "d.png", "e.png")
+    for name, shot in zip(names, (0, 1, 2, 0, 0), strict=True):
+        shutil.copy(folder / f"shot{shot}.png", tmp_path / name)
+    given = load_views({"camera": [tmp_path]}, [load_target(target)])
+    assert [p.name for p in given.pictures] == ["a.png", "b.png", "c.png"]
+    assert given.copies == [(0, "d.png", "a.png"), (0, "e.png", "a.png")]
+    same = [tmp_path / n for n in ("a.png", "d.png", "e.png")]
+    assert run(*same, "--target", target, "-o", tmp_path / "c.json") == 1
+    error = capsys.readouterr().err
+    assert "only 1 different picture: d.png is the same picture as a.png; e.png is the same picture as a.png" in error
+
+
+def test_one_or_two_pictures_are_told_to_be_too_few(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    assert run(folder / "shot0.png", folder / "shot1.png", "--target", target, "-o", tmp_path / "c.json") == 1
+    assert "found in 2 of 2 pictures; at least 3 are needed, better 15" in capsys.readouterr().err
+
+
+def test_what_cannot_be_written_is_told_before_the_work(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    for more, words in (
+        (["-o", tmp_path / "no" / "c.json"], "there is no folder"),
+        (["-o", tmp_path / "c.json", "--report", tmp_path / "no" / "r.html"], "there is no folder"),
+        (["-o", target], "is what it calibrates from"),
+    ):
+        assert run(folder, "--target", target, *more) == 2
+        assert words in capsys.readouterr().err
+    assert load_target(target).target
+
+
+def test_a_device_that_is_not_there_leaves_no_folder(tmp_path, target, capsys):
+    assert run("--device", "tcp://127.0.0.1:1", "--timeout", 0.5, "--target", target, "-o", tmp_path / "c.json") == 1
+    assert "no device answers on tcp://127.0.0.1:1" in capsys.readouterr().err
+    assert not (tmp_path / "c-shots").exists()
+
+
+def test_a_wrong_spacing_changes_lengths_and_no_angle_as_is_said(made, pictures):
+    """Checked on the calibration itself: a target and its views may be scaled together."""
+    views = simulated(8)
+    one = pf.calibrate(views, image_size=(1280, 960), model="p9")
+    other = pf.calibrate([pf.View(v.board_xyz * 1.01, v.pixels) for v in views], image_size=(1280, 960), model="p9")
+    rays = [
+        c.unproject(np.array([[100.0, 500.0], [640.0, 400.0], [900.0, 800.0]]))[0] for c in (one.camera, other.camera)
+    ]
+    np.testing.assert_allclose(rays[0], rays[1], atol=1e-6)
+    np.testing.assert_allclose(other.poses[0][:, 3], 1.01 * one.poses[0][:, 3], rtol=1e-4)
+    assert "small's spacing of 30 mm" in made[0]["scale"] and "angles stay right" in made[0]["scale"]
+    assert "small&#x27;s spacing of 30 mm" in made[2].read_text(encoding="utf-8")
 
 
 def test_an_ambiguous_picture_is_settled_by_a_first_model():

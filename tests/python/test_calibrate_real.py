@@ -85,8 +85,9 @@ def test_a_board_with_a_row_less_than_was_said_is_refused(
 ) -> None:
     """Stray corners beyond its edge were once taken for that row in half of the pictures, and the lens was "usable"."""
     target, out = tmp_path / "board.pdf", tmp_path / "camera.json"
-    pictures = str(real_data("calibration/camodocal"))
+    pictures = [str(p) for p in sorted(real_data("calibration/camodocal").glob("*.png"))[::4]]
     grid = ["--grid", "10x8", "--spacing", "60", "--paper", "700x600"]
     assert main(["target", "checkerboard", *grid, "-o", str(target)]) == 0
-    assert main(["calibrate", pictures, "--target", str(target.with_suffix(".json")), "-o", str(out)]) == 1
-    assert "a row of points less" in capsys.readouterr().err and not out.exists()
+    assert main(["calibrate", *pictures, "--target", str(target.with_suffix(".json")), "-o", str(out)]) == 1
+    error = capsys.readouterr().err
+    assert "smaller than described" in error and "show 9 x 6 inner corners" in error and not out.exists()

@@ -159,7 +159,8 @@ def test_a_board_that_looks_the_same_turned_reports_it() -> None:
 def test_a_board_of_another_size_is_refused_with_both_sizes() -> None:
     seen = view(BOARD, "fisheye-185", FACING)
     found = pf.detect_target(seen.image, pf.Target("checkerboard", 5, 7, 0.03))
-    assert found.status == "none" and "8 x 5 found, the target has 6 x 4" in found.reason
+    assert found.status == "none" and found.seen == (8, 5)
+    assert "8 x 5 inner corners (9 x 6 squares) are seen, described are 6 x 4 inner corners" in found.reason
 
 
 def test_a_mirrored_picture_of_a_coded_target_is_recognised() -> None:

@@ -7,6 +7,8 @@ import hashlib
 import io
 import itertools
 import json
+import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.calib_input import load_views
 from pipefish.client import NoDevice
 from pipefish.errors import PipefishError
-from pipefish.stills import StillFolder, Stills, SurveyOver, still_of
+from pipefish.stills import StillFolder, Stills, SurveyOver, _on_enter, still_of
 from pipefish.transport import TcpTransport, open_transport
 from synthetic import SURVEY, keyframe, start
 
@@ -106,6 +108,98 @@ def test_record_writes_a_folder_that_plays_and_calibrates(crawler, tmp_path, cap
         serve(player, client, lambda: len(store.ends) > 0)
     player.kill()
     assert store.ends[0].frames == 3 and store.ends[0].reason == "end of recording"
+
+
+def small_still(sequence: int) -> bytes:
+    frame = pb.RawFrame(frame_sequence=sequence, width=4, height=3, encoding="mono8", pixels=bytes(12))
+    frame.time.boot_id = 7
+    return frame.SerializeToString()
+
+
+@pytest.fixture
+def keyboard(monkeypatch):
+    """Standard input as a pipe; -> its writing end."""
+    read, write = os.pipe()
+    with open(read) as stdin, open(write, "wb", buffering=0) as keys:
+        monkeypatch.setattr("sys.stdin", stdin)
+        yield keys
+
+
+def test_each_line_of_input_is_a_still_also_those_that_come_at_once(tmp_path, keyboard, capsys):
+    keyboard.write(b"\n\nand one more\n")
+    keyboard.close()
+    with Device([], SURVEY, state="surveying", stills=[small_still(i) for i in range(5)]) as device:
+        assert cli.main(["record", device.address, "-o", str(tmp_path / "a"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"folder": str(tmp_path / "a"), "stills": 3, "ended": "end of input"}
+
+
+def test_lines_that_came_together_do_not_wait_for_the_next_key(keyboard):
+    """They were left in Python's buffer until the pipe or the keyboard gave more."""
+
+    class Served:
+        turns = 0
+
+        def step(self, most_s: float) -> None:
+            self.turns += 1
+            assert self.turns < 20, "a line that is there is not seen"
+
+    keyboard.write(b"\n\n\n")
+    presses = _on_enter(SimpleNamespace(client=Served()))
+    assert [next(presses) for _ in range(3)] == [None] * 3
+
+
+def test_input_that_ends_at_once_leaves_no_folder_and_says_what_to_give(tmp_path, keyboard, capsys):
+    keyboard.close()
+    with Device([], SURVEY, state="surveying", stills=[small_still(0)]) as device:
+        assert cli.main(["record", device.address, "-o", str(tmp_path / "a")]) == 1
+    assert "no still was taken: end of input; without a keyboard give --every" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_ctrl_c_keeps_what_was_taken_and_a_half_written_still_leaves_nothing(tmp_path, monkeypatch):
+    folder = StillFolder(tmp_path / "a")
+    folder.add(still_of(small_still(1)))
+    before = {p.name: p.read_bytes() for p in folder.path.iterdir()}
+
+    def interrupted(self, rows):
+        if len(rows) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(StillFolder, "_write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            folder.add(still_of(small_still(2)))
+    assert {p.name: p.read_bytes() for p in folder.path.iterdir()} == before
+    assert folder.add(still_of(small_still(3))).name == "shot2.png"
+    assert len((folder.path / "telemetry.csv").read_text().splitlines()) == 3
+
+
+def test_ctrl_c_at_the_keyboard_ends_with_what_there_is(tmp_path, monkeypatch, capsys):
+    def presses(stills):
+        yield
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipefish.stills._on_enter", presses)
+    with Device([], SURVEY, state="surveying", stills=[small_still(0)]) as device:
+        assert cli.main(["record", device.address, "-o", str(tmp_path / "a")]) == 0
+    assert "stopped by Ctrl-C" in capsys.readouterr().out and (tmp_path / "a" / "shot1.png").exists()
+
+
+def test_a_daemon_says_at_once_that_its_frames_are_too_large_to_be_sent(tmp_path, capsys):
+    width, height = 8192, 4097  # just above 32 MiB
+    with (tmp_path / "survey.y4m").open("wb") as out:
+        out.write(f"YUV4MPEG2 W{width} H{height} F1:1 Ip A1:1 Cmono\n".encode())
+        for _ in range(2):
+            out.write(b"FRAME\n" + bytes(width * height))
+    (tmp_path / "survey.csv").write_text("sequence,time_ns\n0,1\n1,1000000001\n")
+    daemon = Crawler(tmp_path, camera__speed="recorded", daemon__exit_when_done="false")
+    daemon.start()
+    try:
+        address = f"tcp://127.0.0.1:{daemon.port}"
+        assert cli.main(["record", address, "-o", str(tmp_path / "a"), "--every", "0", "--timeout", "20"]) == 1
+    finally:
+        daemon.kill()
+    assert "a frame of 8192 x 4097 is larger than the 32 MiB" in capsys.readouterr().err
 
 
 def test_a_damaged_or_unknown_still_is_told(tmp_path):

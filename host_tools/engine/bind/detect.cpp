@@ -5,6 +5,8 @@
 #include "detect/find.hpp"
 #include "pipefish/profile.h"
 
+#include <opencv2/aruco.hpp>
+
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -71,12 +73,14 @@ nb::dict to_python(const Detection &d)
     out["reason"] = d.reason;
     out["turns"] = d.turns;
     out["mirrored"] = d.mirrored;
+    out["seen"] = nb::make_tuple(d.seen[0], d.seen[1]);
     return out;
 }
 
 void make_board(Board *self, const std::string &kind, const Rows2 &flat, const Sites &sites, const Bytes &code,
                 const Eigen::Matrix2d &steps, const std::array<int, 2> &size, double radius, double diameter,
-                int marker_bits, double marker_side, const Rows2 &marker_middles, const Bytes &marker_codes)
+                int marker_bits, int marker_errors, double marker_side, const Rows2 &marker_middles,
+                const Bytes &marker_codes)
 {
     Board b;
     b.kind = kind_of(kind);
@@ -92,6 +96,7 @@ void make_board(Board *self, const std::string &kind, const Rows2 &flat, const S
     b.diameter = diameter;
     b.columns = diameter > 0 ? size[0] : 0;
     b.marker_bits = marker_bits;
+    b.marker_errors = marker_errors;
     b.marker_side = marker_side;
     const size_t bits = size_t(marker_bits * marker_bits);
     for (size_t k = 0; k < marker_middles.shape(0); k++) {
@@ -138,6 +143,16 @@ std::vector<Eigen::Matrix<double, Eigen::Dynamic, 2, Eigen::RowMajor>> outlines_
     return out;
 }
 
+Array<uint8_t> opencv_marker(int dictionary, int number)
+{
+    const auto all = cv::aruco::getPredefinedDictionary(dictionary);
+    if (number < 0 || number >= all->bytesList.rows)
+        throw nb::value_error("number: the dictionary has no such marker");
+    const cv::Mat bits = cv::aruco::Dictionary::getBitsFromByteList(all->bytesList.row(number), all->markerSize);
+    const auto side = static_cast<size_t>(all->markerSize);
+    return to_numpy<uint8_t>(bits.ptr(), {side, side});
+}
+
 } // namespace
 
 void bind_detect(nb::module_ &m)
@@ -145,7 +160,9 @@ void bind_detect(nb::module_ &m)
     nb::class_<Board>(m, "Board", "A target as the detector needs it; pipefish.detect fills it.")
         .def("__init__", &make_board, nb::arg("kind"), nb::arg("flat"), nb::arg("sites"), nb::arg("code"),
              nb::arg("steps"), nb::arg("size"), nb::arg("radius"), nb::arg("diameter"), nb::arg("marker_bits"),
-             nb::arg("marker_side"), nb::arg("marker_middles"), nb::arg("marker_codes"));
+             nb::arg("marker_errors"), nb::arg("marker_side"), nb::arg("marker_middles"), nb::arg("marker_codes"));
+    m.def("opencv_marker", &opencv_marker, nb::arg("dictionary"), nb::arg("number"),
+          "Inner bits of a marker of one of OpenCV's dictionaries, by its number there: (side,side) uint8, 1 = white.");
     m.def("find_outlines", &outlines_in, nb::arg("image"), "(H,W) uint8 -> list of (K,2) outlines of dark discs.");
     m.def(
         "find_target", [](const Picture &image, const Board &board) { return to_python(find(image, board)); },

@@ -29,6 +29,7 @@ struct Board {
     double diameter = 0.0;            // of a sleeve's pipe, metres; 0: flat
     int columns = 0;                  // of a sleeve: its lattice closes after so many
     int marker_bits = 0;              // of a ChArUco marker's side
+    int marker_errors = 0;            // bits of one that may be misread
     double marker_side = 0.0;         // metres
     std::vector<Marker> markers;
 

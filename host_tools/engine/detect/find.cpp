@@ -18,23 +18,13 @@ namespace pipefish::detect
 namespace
 {
 
-std::string grid_text(const Grid &grid)
+// A size as people count it: a checkerboard by its squares too.
+std::string size_text(const std::array<int, 2> &size, const Board &board)
 {
-    if (grid.empty())
-        return "no points in a grid";
-    Site low = grid.begin()->first, high = low;
-    for (const auto &[site, point] : grid)
-        for (size_t k = 0; k < 2; k++) {
-            low[k] = std::min(low[k], site[k]);
-            high[k] = std::max(high[k], site[k]);
-        }
-    return std::to_string(grid.size()) + " points in a grid of " + std::to_string(high[0] - low[0] + 1) + " x " +
-           std::to_string(high[1] - low[1] + 1);
-}
-
-std::string target_text(const Board &board)
-{
-    return std::to_string(board.size[0]) + " x " + std::to_string(board.size[1]);
+    const auto by = [&](int more) { return std::to_string(size[0] + more) + " x " + std::to_string(size[1] + more); };
+    if (board.discs())
+        return by(0) + " circles";
+    return by(0) + " inner corners (" + by(1) + " squares)";
 }
 
 cv::Mat evened(const cv::Mat &image)
@@ -213,7 +203,9 @@ void finish(const cv::Mat &image, const Board &board, Placed placed, Detection &
     out.mirrored = placed.placement.mirrored;
     const size_t count = out.ids.size();
     if (count < std::min<size_t>(6, board.flat.size())) {
+        const auto seen = out.seen;
         out = Detection{};
+        out.seen = seen;
         out.reason = "too few points could be measured: " + std::to_string(count);
         return;
     }
@@ -238,13 +230,15 @@ Detection from_grid(const cv::Mat &image, const Board &board, Grid grid, const s
     Detection out;
     const size_t least = std::min<size_t>(board.flat.size(), 6);
     if (grid.size() < least) {
-        out.reason = "no target found: " + grid_text(grid);
+        out.reason = "no target found";
         return out;
     }
+    out.seen = extent(grid, board);
     const auto placement = place_grid(grid, absent, board);
     const double share = board.kind == Kind::sleeve ? 0.8 : 0.9;
     if (!placement || placement->hits < share * static_cast<double>(grid.size())) {
-        out.reason = "another target: " + grid_text(grid) + " found, the target has " + target_text(board);
+        out.reason = "another target: " + size_text(out.seen, board) + " are seen, described are " +
+                     size_text(board.size, board);
         return out;
     }
     finish(image, board, onto_board(grid, *placement, board), out);
@@ -349,7 +343,7 @@ Detection find_charuco(const cv::Mat &image, const Board &board)
         const cv::Mat bits(side, side, CV_8U, const_cast<uint8_t *>(m.bits.data()));
         bytes.push_back(cv::aruco::Dictionary::getByteListFromBits(bits));
     }
-    const auto dictionary = cv::makePtr<cv::aruco::Dictionary>(bytes, side, (side - 3) / 2 + 1);
+    const auto dictionary = cv::makePtr<cv::aruco::Dictionary>(bytes, side, board.marker_errors);
     const auto parameters = cv::aruco::DetectorParameters::create();
     parameters->adaptiveThreshWinSizeMax = 53;
     parameters->minMarkerPerimeterRate = 0.01;
@@ -358,7 +352,7 @@ Detection find_charuco(const cv::Mat &image, const Board &board)
     std::vector<int> ids;
     cv::aruco::detectMarkers(image, dictionary, quads, ids, parameters);
     if (ids.empty()) {
-        out.reason = "no target found: none of its markers is seen";
+        out.reason = "no target found: none of its markers is seen (is the dictionary right?)";
         return out;
     }
     // A marker's corners carry the corners of the squares around it: its four diagonal neighbours' shared corners are
@@ -397,6 +391,11 @@ Detection find_charuco(const cv::Mat &image, const Board &board)
             continue;
         if (const auto p = measure_point(image, board, point.at, f->cell, board.code[size_t(id_at(board, site))]))
             placed.grid[site] = *p;
+    }
+    if (rough.size() >= 6 && 4 * placed.grid.size() < rough.size()) {
+        out.reason = "its markers are seen, but no squares' corners where the target has them: another grid, or legacy "
+                     "(OpenCV before 4.6) is the other way";
+        return out;
     }
     finish(image, board, placed, out);
     return out;

@@ -28,6 +28,8 @@ struct Detection {
     std::vector<std::vector<Eigen::Vector2d>> outlines; // of discs: points on the rim, pixels
     int turns = 1;         // orderings that look the same; the one that reads most like text is given
     bool mirrored = false; // the target is seen as in a mirror
+    std::array<int, 2> seen = {0,
+                               0}; // points in a row and rows of the grid in the picture, whatever the target; 0: none
 };
 
 constexpr int kOutlinePoints = 32;

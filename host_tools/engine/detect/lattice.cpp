@@ -344,6 +344,49 @@ std::vector<std::array<int, 4>> matrices(const Board &board, bool mirrored)
 
 } // namespace
 
+std::array<int, 2> extent(const Grid &grid, const Board &board)
+{
+    std::array<int, 2> best = {0, 0};
+    double most = -1.0;
+    const bool staggered = board.kind == Kind::asymmetric_circles;
+    for (const auto &m : matrices(board, false)) {
+        std::vector<Site> sites;
+        for (const auto &[site, point] : grid) {
+            const Site s = Placement{m}(site);
+            sites.push_back(staggered ? Site{s[0] - s[1], s[0] + s[1]} : s); // halves of a column, and the row
+        }
+        std::array<int, 2> size = {0, 0};
+        for (size_t before = sites.size() + 1; !sites.empty() && sites.size() < before;) {
+            before = sites.size();
+            Site low = sites[0], high = low;
+            std::map<int, size_t> along[2];
+            for (const Site &s : sites)
+                for (size_t k = 0; k < 2; k++) {
+                    low[k] = std::min(low[k], s[k]);
+                    high[k] = std::max(high[k], s[k]);
+                    along[k][s[k]]++;
+                }
+            size = {high[0] - low[0] + 1, high[1] - low[1] + 1};
+            const std::array<double, 2> full = {staggered ? size[1] / 2.0 : size[1],
+                                                staggered ? size[0] / 2.0 : size[0]};
+            std::erase_if(sites, [&](const Site &s) {
+                for (size_t k = 0; k < 2; k++)
+                    if ((s[k] == low[k] || s[k] == high[k]) && 2.0 * double(along[k][s[k]]) < full[k])
+                        return true;
+                return false;
+            });
+        }
+        if (staggered)
+            size[0] = size[0] / 2;
+        const double filled = size[0] > 0 ? double(sites.size()) * double(sites.size()) / (size[0] * size[1]) : 0.0;
+        if (filled > most) {
+            most = filled;
+            best = size;
+        }
+    }
+    return best;
+}
+
 // In how many ways the whole board may be turned and look the same.
 static int own_turns(const Board &board)
 {

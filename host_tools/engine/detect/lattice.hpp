@@ -51,6 +51,10 @@ struct Placement {
 // None without a hit.
 std::optional<Placement> place_grid(const Grid &grid, const std::vector<Site> &absent, const Board &board);
 
+// How many points a row of the grid has, and how many rows there are, in the base in which it fills its rows best, and
+// without outer rows that are not half filled: the size of the target that is seen, or of the part of it.
+std::array<int, 2> extent(const Grid &grid, const Board &board);
+
 // Where a site is, from its neighbours within three steps: quadratic as far as they determine it.
 struct Forecast {
     Eigen::Vector2d at;
