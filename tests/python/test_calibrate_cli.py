@@ -19,6 +19,7 @@ import pipefish as pf
 from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
+from pipefish.calib_data import CalibrationError
 from pipefish.calib_input import Given, Picture, Target3D, load_target, load_views, natural
 from pipefish.calib_live import Guide
 from pipefish.calib_run import lit_around
@@ -322,6 +323,22 @@ def test_pictures_that_do_not_go_together_are_refused(pictures, tmp_path, capsys
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no pictures" in refused(empty)
+
+
+def test_a_target_that_is_not_there_is_known_after_a_few_pictures():
+    """Every picture of a folder was searched to the end: minutes, to say that the board is another one."""
+    board = pf.Target("checkerboard", 6, 9, 0.03)
+    opened = []
+
+    def blank(i):
+        opened.append(i)
+        return np.full((60, 80), 90, dtype=np.uint8)
+
+    pictures = [Picture(f"p{i}", 0, f"p{i}", lambda i=i: blank(i)) for i in range(60)]
+    given = Given(["camera"], [Target3D("b", board.points(), 0.0, board)], pictures, [], [(80, 60)])
+    with pytest.raises(CalibrationError, match="none of 20 pictures, taken evenly from all 60"):
+        run_pictures(given, model="p9", board="flat", tell=lambda *_: None)
+    assert len(opened) == 20 and max(np.diff(sorted(opened))) <= 6
 
 
 def test_an_ambiguous_picture_is_settled_by_a_first_model():
