@@ -23,6 +23,8 @@ Tell = Callable[[str, float], None]
 _FOLDS = 5
 _ROUNDS = 3  # of looking again; each starts from the model that the one before made better
 _RIM = 1.1  # of what is lit: a point beyond is a wrong one, or the rim is
+_GIVE_UP = 20  # pictures without the target, taken evenly from all
+_GOLDEN = 0.6180339887498949  # its multiples modulo 1 are spread evenly at any moment
 _ENOUGH = 0.01  # of the points: fewer new ones are not worth another round
 _BESIDE_PX = 2.0  # a point of the model-guided search that stands so far from one seen before is not the same one
 
@@ -122,12 +124,24 @@ def one_radius(targets: Sequence[Target3D]) -> float:
 def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Callable[[float], None]) -> list[Sighting]:
     """Every target in every picture; `brightest` gets the largest value of each pixel, by camera.
 
-    Raises CalibrationError where pictures of two cameras are mixed."""
+    Raises CalibrationError where pictures of two cameras are mixed, and where many show no target."""
     if not all(t.target for t in given.targets) or not given.targets:
         raise CalibrationError("pictures need a --target that can be found in them: a JSON file of `pipefish target`")
-    sightings = []
-    for done, picture in enumerate(given.pictures):
-        share(done / len(given.pictures))
+    sightings: list[Sighting] = []
+    count = len(given.pictures)
+    # In an order that is spread over all at any moment: a target that is not the one described costs the most time a
+    # picture, and is known after a few.
+    for done, i in enumerate(sorted(range(count), key=lambda i: i * _GOLDEN % 1.0)):
+        picture = given.pictures[i]
+        share(done / count)
+        if done == _GIVE_UP and all(s.status == "none" for s in sightings):
+            if len(given.targets) == 1:
+                refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
+            raise CalibrationError(
+                f"the target was found in none of {done} pictures, taken evenly from all {count} "
+                f"({sightings[0].picture.name}: {sightings[0].reason}). Is it the one that --target describes? If "
+                "few pictures show it, give only those"
+            )
         image = picture.image()
         size, first = (image.shape[1], image.shape[0]), given.sizes[picture.camera]
         if size != first:
@@ -139,7 +153,8 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
         for board, target in enumerate(given.targets):
             assert target.target is not None
             sightings.append(_sighting(picture, board, detect_target(image, target.target)))
-    return sightings
+    place = {picture: i for i, picture in enumerate(given.pictures)}
+    return sorted(sightings, key=lambda s: (place[s.picture], s.board))
 
 
 def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> ImageEllipse | None:

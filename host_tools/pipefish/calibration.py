@@ -43,7 +43,7 @@ from .errors import ArgumentError, ProfileError
 __all__ = ["Board", "Calibration", "CalibrationError", "View", "calibrate"]
 
 _MOST_LOST = 0.3  # of the views; with more rejected, nobody knows which ones are right
-_BEYOND = 1.25  # of the largest angle observed: a polynomial says nothing of the lens farther out
+_BEYOND = 1.15  # of the largest angle observed: farther out a polynomial is off by pixels (docs/calibration.md)
 _BENDS = 2.0  # of the radius' slope where observation ends: a polynomial that bends more is no lens
 
 

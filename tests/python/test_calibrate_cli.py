@@ -418,6 +418,22 @@ def test_a_wrong_spacing_changes_lengths_and_no_angle_as_is_said(made, pictures)
     assert "small&#x27;s spacing of 30 mm" in made[2].read_text(encoding="utf-8")
 
 
+def test_a_target_that_is_not_there_is_known_after_a_few_pictures():
+    """Every picture of a folder was searched to the end: minutes, to say that the board is another one."""
+    board = pf.Target("checkerboard", 6, 9, 0.03)
+    opened = []
+
+    def blank(i):
+        opened.append(i)
+        return np.full((60, 80), 90, dtype=np.uint8)
+
+    pictures = [Picture(f"p{i}", 0, f"p{i}", lambda i=i: blank(i)) for i in range(60)]
+    given = Given(["camera"], [Target3D("b", board.points(), 0.0, board)], pictures, [], [(80, 60)])
+    with pytest.raises(CalibrationError, match="none of 20 pictures, taken evenly from all 60"):
+        run_pictures(given, model="p9", board="flat", tell=lambda *_: None)
+    assert len(opened) == 20 and max(np.diff(sorted(opened))) <= 6
+
+
 def test_an_ambiguous_picture_is_settled_by_a_first_model():
     """The picture's edge, or the lens's, cuts a grid of discs: a model tells where it would show more of them."""
     board = pf.Target("circles", 6, 8, 0.03)
