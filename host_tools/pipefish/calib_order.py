@@ -57,7 +57,7 @@ def same_side(data: Data) -> dict[int, str]:
             mine = np.flatnonzero((data.board_of == b) & (data.camera_of == c))
             usual = np.sign(hands[mine].sum())
             turned = min(int((hands[mine] > 0).sum()), int((hands[mine] < 0).sum()))
-            if turned > max(1, _MOST_MIRRORED * len(mine)):
+            if len(data.boards) == 1 and turned > max(1, _MOST_MIRRORED * len(mine)):  # of several, the rig tells
                 raise CalibrationError(
                     f"{turned} of {len(mine)} views are numbered mirrored against the others: some pictures are "
                     "mirrored copies, were taken through a mirror, or show the target's back; take those of one kind"
