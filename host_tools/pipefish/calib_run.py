@@ -23,7 +23,8 @@ Tell = Callable[[str, float], None]
 _FOLDS = 5
 _ROUNDS = 3  # of looking again; each starts from the model that the one before made better
 _RIM = 1.1  # of what is lit: a point beyond is a wrong one, or the rim is
-_GIVE_UP = 20  # pictures without the target, taken evenly from all
+_LOOK = 10  # pictures, taken evenly from all: enough to see a target of another size
+_GIVE_UP = 20  # pictures, likewise, without the target
 _GOLDEN = 0.6180339887498949  # its multiples modulo 1 are spread evenly at any moment
 _ENOUGH = 0.01  # of the points: fewer new ones are not worth another round
 _BESIDE_PX = 2.0  # a point of the model-guided search that stands so far from one seen before is not the same one
@@ -93,8 +94,7 @@ def run(given: Given, *, model: str, board: str, noise: str = "", robust: bool =
         brightest: dict[int, npt.NDArray[np.uint8]] = {}
         sightings = search(given, brightest, lambda share: tell("finding the target", 0.5 * share))
         views = views_of(given, sightings)
-        if len(given.targets) == 1:
-            refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
+        _refuse_other_size(given, sightings)
         refuse_too_few(given, sightings)
         refuse_wrong_size(given, sightings)
         options["image_circle"] = {
@@ -134,9 +134,9 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
     for done, i in enumerate(sorted(range(count), key=lambda i: i * _GOLDEN % 1.0)):
         picture = given.pictures[i]
         share(done / count)
+        if done in (_LOOK, _GIVE_UP):
+            _refuse_other_size(given, sightings)
         if done == _GIVE_UP and all(s.status == "none" for s in sightings):
-            if len(given.targets) == 1:
-                refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
             raise CalibrationError(
                 f"the target was found in none of {done} pictures, taken evenly from all {count} "
                 f"({sightings[0].picture.name}: {sightings[0].reason}). Is it the one that --target describes? If "
@@ -155,6 +155,11 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
             sightings.append(_sighting(picture, board, detect_target(image, target.target)))
     place = {picture: i for i, picture in enumerate(given.pictures)}
     return sorted(sightings, key=lambda s: (place[s.picture], s.board))
+
+
+def _refuse_other_size(given: Given, sightings: Sequence[Sighting]) -> None:
+    if len(given.targets) == 1:
+        refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
 
 
 def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> ImageEllipse | None:
