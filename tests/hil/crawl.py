@@ -24,6 +24,7 @@ PIPEFISH = Path(sys.executable).with_name("pipefish")
 HOST_DAEMON = ROOT / "build" / "release" / "firmware" / "pipefishd"
 FRAME = b"FRAME\n"
 SETTINGS = {
+    "camera.driver": "v4l2",
     "camera.profile": "{folder}/crawl.profile",
     "tracker.max_tracks": "80",
     "keyframe.parallax_deg": "3",
@@ -105,7 +106,6 @@ class Crawl:
         """The arm64 daemon, its spool on the board's disk and its frame index in the shared folder."""
         self.board.run("mkdir -p /mnt/index; : > /run/empty.ini")
         settings = {
-            "camera.driver": "v4l2",
             "camera.index": "/mnt/index",
             "spool.path": "/data/spool.db",
             "daemon.status_file": "/run/status.json",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 
 from crawl import Result
+from usb_camera import ADDRESS, UsbCamera
 
 LOOPBACK = "modprobe v4l2loopback devices=1 exclusive_caps=0 max_buffers=32"
 RATE = 5
@@ -248,3 +249,57 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     status = board.status()
     assert status["camera"]["damaged"] >= 1 and status["camera"]["restarts"] >= 1 and status["camera"]["reopens"] >= 1
     end(survey, note, "camera faults, unplugged", recovery, with_noise=True)
+
+
+VHCI = "/sys/devices/platform/vhci_hcd.0"
+
+
+def plug_usb_camera(board, port: int) -> None:
+    """Hands the camera's socket to the kernel, as usbip does: the shell that writes has it as its standard input."""
+    script = f"#!/bin/sh\\necho 0 0 {ADDRESS} > {VHCI}/attach\\n"
+    board.run(f"printf '{script}' > /run/attach; chmod +x /run/attach; nc 10.0.2.2 {port} -e /run/attach")
+
+
+def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
+    camera = {"camera__driver": "libcamera", "camera__exposure": "device", "tracker__reset_gap": "100000"}
+    size = {"camera__width": "320", "camera__height": "240", "camera__device": "1209:0001"}
+    survey = crawl(**{**SERIAL, **size, **camera}, status__interval_ms="100")
+    board = survey.board
+    board.run("/lib/systemd/systemd-udevd --daemon 2>/dev/null; modprobe vimc; modprobe vhci-hcd; modprobe uvcvideo")
+    board.run("modprobe vhci-node; udevadm trigger -s media -s video4linux; udevadm settle")
+    # The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours.
+    vimc = "camera.driver=libcamera camera.device=vimc camera.width=318 camera.height=240 spool.path=/run/spool.db"
+    extra = "daemon.status_file=/run/status.json status.interval_ms=100 daemon.drain_s=0"
+    flags = " ".join(f"--set {setting}" for setting in f"{vimc} {extra}".split())
+    pattern = board.spawn(f": > /run/vimc.ini; exec /mnt/pipefishd --config /run/vimc.ini {flags}", "vimc.log")
+    survey.wait_until(frames(10), "frames of vimc")
+    status = board.status()
+    assert status["tracks_live"] > 20 and status["camera"]["bad_stamps"] == 0, status
+    board.run(f"kill {pattern}; rm /run/status.json")
+    board.wait(pattern)
+    # A USB camera, plugged in after the daemon has started, unplugged, and silent for longer than a stream may be.
+    pixels = [survey.recording.frames[name] for name in survey.recording.order]
+    usb_camera = UsbCamera(pixels, 320, 240, 30)
+    try:
+        survey.start_receiver(usb(survey))
+        survey.start_daemon()
+        survey.wait_for("begins")
+        usb_camera.show(0, 15, RATE)
+        plug_usb_camera(board, usb_camera.port)
+        survey.wait_until(frames(8), "8 frames")
+        board.run(f"echo 0 > {VHCI}/detach")
+        survey.wait_for("no camera")
+        plug_usb_camera(board, usb_camera.port)
+        survey.wait_for("the camera is there")
+        usb_camera.wait(20)
+        survey.wait_until(lambda s: s["camera"]["restarts"] >= 1, "a restart of the silent stream")
+        before = board.status()["frames"]
+        start = time.monotonic()
+        usb_camera.show(15, 25, RATE)
+        survey.wait_until(frames(before + 1), "frames again")
+        recovery = time.monotonic() - start
+        usb_camera.wait(20)
+        result = end(survey, note, "libcamera: unplugged, stalled", recovery)
+    finally:
+        usb_camera.close()
+    assert result.frames_in >= 30 and result.keyframes_out >= 15

@@ -3,10 +3,14 @@
  * keeps its texture. A high percentile of the image circle is therefore led to a target below white. Exposure comes
  * first, for gain brings noise, up to a limit that keeps motion blur small; then gain.
  */
-#ifndef PIPEFISH_V4L2_EXPOSURE_H
-#define PIPEFISH_V4L2_EXPOSURE_H
+#ifndef PIPEFISH_CAMERA_EXPOSURE_H
+#define PIPEFISH_CAMERA_EXPOSURE_H
 
 #include "pipefish/image.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
 
 #define PF_EXPOSURE_PERCENTILE 95u
 #define PF_EXPOSURE_TARGET     190u /* grey level of that percentile */
@@ -42,5 +46,9 @@ void pf_exposure_init(pf_exposure *exposure, int64_t time, int64_t gain);
 /* Judges a frame; true: time_now or gain_now have changed and are to be set. Looks at every 4th pixel of every 4th row,
  * of one frame in PF_EXPOSURE_DELAY while it changes anything. */
 bool pf_exposure_judge(pf_exposure *exposure, const pf_image *image);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -1,4 +1,4 @@
-#include "camera_v4l2/timing.h"
+#include "camera_common/timing.h"
 
 #include <string.h>
 

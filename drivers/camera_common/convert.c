@@ -1,7 +1,9 @@
-#include "camera_v4l2/convert.h"
+#include "camera_common/convert.h"
 
 #include <linux/videodev2.h>
 #include <string.h>
+#include <sys/mman.h>
+#include <turbojpeg.h>
 
 #ifndef V4L2_PIX_FMT_Y12P /* not in the kernel headers of Debian 12 */
 #define V4L2_PIX_FMT_Y12P v4l2_fourcc('Y', '1', '2', 'P')
@@ -13,7 +15,8 @@ static const pf_pixel_format formats[] = {
     {V4L2_PIX_FMT_YUV420, "YU12", PF_LAYOUT_LUMA, 8},     {V4L2_PIX_FMT_Y10P, "Y10P", PF_LAYOUT_PACKED_10, 10},
     {V4L2_PIX_FMT_Y12P, "Y12P", PF_LAYOUT_PACKED_12, 12}, {V4L2_PIX_FMT_Y10, "Y10", PF_LAYOUT_WORDS, 10},
     {V4L2_PIX_FMT_Y12, "Y12", PF_LAYOUT_WORDS, 12},       {V4L2_PIX_FMT_YUYV, "YUYV", PF_LAYOUT_LUMA_EVEN, 8},
-    {V4L2_PIX_FMT_UYVY, "UYVY", PF_LAYOUT_LUMA_ODD, 8},   {V4L2_PIX_FMT_MJPEG, "MJPG", PF_LAYOUT_JPEG, 8},
+    {V4L2_PIX_FMT_UYVY, "UYVY", PF_LAYOUT_LUMA_ODD, 8},   {V4L2_PIX_FMT_RGB24, "RGB3", PF_LAYOUT_RGB, 8},
+    {V4L2_PIX_FMT_BGR24, "BGR3", PF_LAYOUT_BGR, 8},       {V4L2_PIX_FMT_MJPEG, "MJPG", PF_LAYOUT_JPEG, 8},
     {V4L2_PIX_FMT_JPEG, "JPEG", PF_LAYOUT_JPEG, 8},
 };
 
@@ -52,6 +55,9 @@ uint32_t pf_pixel_format_row(const pf_pixel_format *format, uint32_t width)
         return (width + 3) / 4 * 5;
     case PF_LAYOUT_PACKED_12:
         return (width + 1) / 2 * 3;
+    case PF_LAYOUT_RGB:
+    case PF_LAYOUT_BGR:
+        return 3 * width;
     case PF_LAYOUT_JPEG:
         break;
     }
@@ -73,6 +79,13 @@ static void unpack_words(const uint8_t *from, uint32_t width, uint32_t shift, ui
         uint32_t v = (uint32_t)from[2 * x] | (uint32_t)from[2 * x + 1] << 8;
         to[x] = (uint8_t)((v > top ? top : v) >> shift);
     }
+}
+
+/* Luma of ITU-R BT.601, in 256ths; `red` is the offset of the red byte, 0 or 2. */
+static void mix_colours(const uint8_t *from, uint32_t width, uint32_t red, uint8_t *to)
+{
+    for (uint32_t x = 0; x < width; x++, from += 3)
+        to[x] = (uint8_t)((77u * from[red] + 150u * from[1] + 29u * from[2 - red] + 128u) >> 8);
 }
 
 void pf_pixels_to_grey(const pf_pixel_format *format, const uint8_t *from, uint32_t width, uint32_t height,
@@ -102,8 +115,40 @@ void pf_pixels_to_grey(const pf_pixel_format *format, const uint8_t *from, uint3
             for (uint32_t x = 0; x < width; x++)
                 grey[x] = from[x / 2 * 3 + x % 2];
             break;
+        case PF_LAYOUT_RGB:
+            mix_colours(from, width, 0, grey);
+            break;
+        case PF_LAYOUT_BGR:
+            mix_colours(from, width, 2, grey);
+            break;
         case PF_LAYOUT_JPEG:
             return;
         }
     }
+}
+
+pf_status pf_jpeg_to_grey(void *turbo, const uint8_t *from, size_t n, uint32_t width, uint32_t height, uint8_t *grey,
+                          pf_failure *failure)
+{
+    int w, h, sampling, space;
+    if (tjDecompressHeader3(turbo, from, (unsigned long)n, &w, &h, &sampling, &space) != 0)
+        return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is damaged: %s", tjGetErrorStr2(turbo));
+    if (w != (int)width || h != (int)height)
+        return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is of %d x %d", w, h);
+    if (tjDecompress2(turbo, from, (unsigned long)n, grey, w, w, h, TJPF_GRAY, 0) != 0 &&
+        tjGetErrorCode(turbo) == TJERR_FATAL)
+        return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is damaged: %s", tjGetErrorStr2(turbo));
+    return PF_OK;
+}
+
+bool pf_mapping_keep(void *memory, size_t n)
+{
+    void *copy = mmap(NULL, n, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (copy == MAP_FAILED)
+        return false;
+    memcpy(copy, memory, n);
+    if (mremap(copy, n, n, MREMAP_MAYMOVE | MREMAP_FIXED, memory) == memory)
+        return true;
+    (void)munmap(copy, n);
+    return false;
 }

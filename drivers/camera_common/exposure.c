@@ -1,4 +1,4 @@
-#include "camera_v4l2/exposure.h"
+#include "camera_common/exposure.h"
 
 #include <math.h>
 #include <stdlib.h>

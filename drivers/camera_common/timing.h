@@ -1,9 +1,13 @@
 /* What a camera driver makes of the kernel's numbers and silences, without a device: frame numbers and times that only
  * rise, and when to restart a stream that has stopped. */
-#ifndef PIPEFISH_V4L2_TIMING_H
-#define PIPEFISH_V4L2_TIMING_H
+#ifndef PIPEFISH_CAMERA_TIMING_H
+#define PIPEFISH_CAMERA_TIMING_H
 
 #include "pipefish/base.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
 
 /* ---- numbers and times */
 
@@ -71,5 +75,9 @@ void pf_recovery_closed(pf_recovery *recovery, uint64_t now_ns); /* or could not
 void pf_recovery_frame(pf_recovery *recovery, uint64_t now_ns);
 void pf_recovery_error(pf_recovery *recovery);  /* the queue has failed: do not wait for silence */
 void pf_recovery_unplug(pf_recovery *recovery); /* the device has gone */
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
