@@ -145,6 +145,7 @@ class Board:
             ),
             *("-device", "qemu-xhci", "-chardev", f"socket,id=usb,path={self.folder}/usb.sock,server=on,wait=off"),
             *("-device", "usb-serial,chardev=usb"),
+            *("-device", "i6300esb"),  # a watchdog; with -no-reboot a reset ends QEMU
         ]
 
     def power_on(self) -> float:
@@ -213,6 +214,16 @@ class Board:
             self._qemu.kill()
             self._qemu.wait()
             self._qemu = None
+
+    def wait_for_reset(self, timeout: float) -> float:
+        """Until the board has reset itself, which leaves it off; the seconds that took."""
+        start = time.monotonic()
+        try:
+            self._qemu.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise BoardError("the board does not reset: " + self.console()) from error
+        self.power_cut()
+        return time.monotonic() - start
 
     def close(self) -> None:
         self.power_cut()

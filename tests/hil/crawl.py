@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import json
 import os
 import signal
 import socket
@@ -23,6 +24,11 @@ from pipefish.survey import Survey
 PIPEFISH = Path(sys.executable).with_name("pipefish")
 HOST_DAEMON = ROOT / "build" / "release" / "firmware" / "pipefishd"
 FRAME = b"FRAME\n"
+# Settings that a replay on the host has no use for.
+BOARD_ONLY = (
+    *("gpio.", "camera.device", "camera.format", "camera.buffers"),
+    *("link.device", "link.baud", "link.trust", "link.address"),
+)
 SETTINGS = {
     "camera.driver": "v4l2",
     "camera.profile": "{folder}/crawl.profile",
@@ -90,6 +96,7 @@ class Crawl:
         self.output = folder / "survey.mcap"
         self.daemon = 0
         self.starts = 0
+        self.environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "host")}
         self._receiver: subprocess.Popen[bytes] | None = None
         for suffix in ("y4m", "profile"):
             target = board.share / f"crawl.{suffix}"
@@ -101,6 +108,21 @@ class Crawl:
     def _arguments(self, settings: dict[str, str], folder: str) -> list[str]:
         lines = {**self.settings, **settings}
         return [f"{key}={value.format(folder=folder)}" for key, value in lines.items()]
+
+    def pair(self) -> str:
+        """Lets this host in over the network, as the board's owner does on its console; what to receive from."""
+        key = self._pipefish("pair", "--json")["host"]["key"]
+        trust = self.settings["link.trust"]
+        said = self.board.run(
+            ": > /run/empty.ini; /mnt/pipefishd --config /run/empty.ini --set camera.driver=v4l2 "
+            f'--set link.trust={trust} --pair "operator {key} hil"'
+        )
+        self._pipefish("pair", "--json", "--device-key", said.split()[-1], "--device-name", "board")
+        return f"tls://127.0.0.1:{self.board.port}"
+
+    def _pipefish(self, *arguments: str) -> dict:
+        done = subprocess.run([PIPEFISH, *arguments], env=self.environment, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)
 
     def start_daemon(self) -> None:
         """The arm64 daemon, its spool on the board's disk and its frame index in the shared folder."""
@@ -150,7 +172,10 @@ class Crawl:
     def start_receiver(self, device: str) -> None:
         with (self.folder / "receive.log").open("ab") as log:
             self._receiver = subprocess.Popen(
-                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "60"], stdout=log, stderr=log
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "60"],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
             )
 
     def kill_receiver(self) -> None:
@@ -210,9 +235,7 @@ class Crawl:
         (folder / "empty.ini").touch()
         command = [HOST_DAEMON, "--config", folder / "empty.ini"]
         for argument in self._arguments(settings, str(self.board.share)):
-            if not argument.startswith(
-                ("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")
-            ):
+            if not argument.startswith(BOARD_ONLY):
                 command += ["--set", argument]
         with (folder / "daemon.log").open("wb") as log:
             daemon = subprocess.Popen(command, stderr=log)

@@ -17,6 +17,10 @@ SERIAL = {"link__transport": "serial", "link__device": "/dev/ttyUSB0", "link__ba
 SIZE = {"camera__device": "/dev/video0", "camera__width": "320", "camera__height": "240", "camera__buffers": "32"}
 
 
+# The board's only port that the host reaches, TLS on it: the network of a real crawler.
+TLS = {"link__transport": "tls", "link__address": "0.0.0.0", "link__port": "7448", "link__trust": "/data/trust"}
+
+
 def usb(survey) -> str:
     return f"serial:{survey.board.usb.device}@3000000"
 
@@ -63,8 +67,20 @@ def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
     end(survey, note, "serial adapter unplugged", recovery)
 
 
-def test_a_killed_daemon_goes_on_with_its_survey(crawl, note):
-    survey = begin(crawl)
+def begin_tls(crawl):
+    """A survey over the network that is waiting for its camera, with a host that was let in."""
+    survey = crawl(**{**TLS, **SIZE})
+    survey.board.run(LOOPBACK)
+    device = survey.pair()
+    survey.start_daemon()
+    survey.wait_for("begins")
+    survey.start_receiver(device)
+    survey.wait_until(lambda s: s.get("link", {}).get("up"), "the host let in")
+    return survey
+
+
+def test_a_killed_daemon_goes_on_with_its_survey_over_tls(crawl, note):
+    survey = begin_tls(crawl)
     world = survey.show(0, 45, RATE, "/dev/video0")
     survey.wait_until(frames(20), "20 frames")
     survey.board.run(f"kill -9 {survey.daemon}")
@@ -74,12 +90,14 @@ def test_a_killed_daemon_goes_on_with_its_survey(crawl, note):
     survey.wait_until(frames(3), "frames again")
     recovery = time.monotonic() - killed
     survey.board.wait(world)
-    end(survey, note, "daemon killed", recovery)
+    network = survey.board.status()["network"]
+    assert network["role"] == "operator" and network["sessions"] >= 1 and network["refused_handshake"] == 0, network
+    end(survey, note, "daemon killed, over TLS", recovery)
     assert len(survey.indices()) == 2
 
 
-def test_a_power_cut_loses_nothing_that_was_acknowledged(crawl, note):
-    survey = begin(crawl)
+def test_a_power_cut_loses_nothing_that_was_acknowledged_over_tls(crawl, note):
+    survey = begin_tls(crawl)
     survey.show(0, 25, RATE, "/dev/video0")
     survey.wait_until(lambda s: s.get("spool", {}).get("acknowledged", 0) >= 4, "acknowledged keyframes")
     survey.board.power_cut()
@@ -92,7 +110,7 @@ def test_a_power_cut_loses_nothing_that_was_acknowledged(crawl, note):
     survey.wait_until(frames(1), "frames again")
     recovery = time.monotonic() - start
     survey.board.wait(world)
-    end(survey, note, "power cut", recovery)
+    end(survey, note, "power cut, over TLS", recovery)
     assert len(survey.indices()) == 2
 
 
@@ -123,6 +141,24 @@ def test_a_network_that_goes_away_and_a_host_that_is_killed_lose_nothing(crawl, 
     read = [(k.encoder_count, turned[k.message.frame_sha256.hex()]) for k in survey.received.keyframes]
     # v4l2loopback may hand the first frame over late, stamped with that moment.
     assert all(got == made for got, made in read[1:]) and read[-1][0] > 300, read
+
+
+def test_the_watchdog_resets_a_board_whose_daemon_hangs_and_no_other(crawl):
+    watchdog = {"daemon__watchdog": "/dev/watchdog", "daemon__watchdog_s": "3", "daemon__drain_s": "0"}
+    survey = crawl(**{**SERIAL, **SIZE, **watchdog})
+    board = survey.board
+    board.run(f"{LOOPBACK}; modprobe i6300esb")
+    survey.start_daemon()
+    survey.wait_for("begins")
+    board.run("sleep 4")  # one that is well is let be
+    survey.stop_daemon()
+    board.wait(survey.daemon)
+    board.run("sleep 4")  # so is a board whose daemon ended of itself
+    survey.start_daemon()
+    survey.wait_for("begins")
+    board.run(f"kill -STOP {survey.daemon}")
+    board.wait_for_reset(60)
+    board.power_on()
 
 
 GPIO = {
