@@ -66,14 +66,17 @@ lint: packages-test $(STAMP)/venv
 	@clang-format --dry-run --Werror $(C_FILES)
 	@$(VENV)/bin/ruff check --quiet . && $(VENV)/bin/ruff format --check --quiet .
 
-# Every parser and state machine for a fixed number of inputs, under clang with sanitizers; `make accept` runs longer.
+# Every parser and state machine for a fixed number of inputs, from those in tests/fuzz/corpus on, under clang with
+# sanitizers; `make accept` runs longer, and keeps what it finds.
 fuzz-build: packages-test
 	@test -f build/clang/build.ninja || cmake --preset clang
 	@cmake --build --preset clang
 
 fuzz-smoke: fuzz-build
-	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
-	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
+	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; n=$${f##*fuzz_}; \
+	    rm -rf build/fuzz/$$n; mkdir -p build/fuzz/$$n; \
+	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 build/fuzz/$$n $$(ls -d tests/fuzz/corpus/$$n 2>/dev/null) \
+	        2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
 
 # The protocols, in every state that small bounds reach (tests/proof).
 proof: packages-test

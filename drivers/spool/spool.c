@@ -63,8 +63,8 @@ static const char *const sql[SQL_STATEMENTS] = {
     [SQL_SET] = "INSERT INTO value (key, bytes) VALUES (?1, ?2) ON CONFLICT (key) DO UPDATE SET bytes = excluded.bytes",
     [SQL_DELETE] = "DELETE FROM value WHERE key = ?1",
     [SQL_RANK] = "INSERT OR REPLACE INTO evictable (row, importance, number) VALUES (?1, ?2, ?3)",
-    [SQL_VICTIMS] = "SELECT e.row, e.number, length(o.bytes) FROM evictable e JOIN object o ON o.row = e.row "
-                    "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3",
+    [SQL_VICTIMS] = ("SELECT e.row, e.number, length(o.bytes) FROM evictable e JOIN object o ON o.row = e.row "
+                     "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3"),
     [SQL_KEEP_ALL] = "DELETE FROM evictable",
 };
 

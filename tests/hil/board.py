@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "build" / "board"
 PROGRAMS = ROOT / "build" / "arm64"
-BOOT_S, COMMAND_S = 25, 60
+BOOT_S, COMMAND_S = 60, 60
 DISK_BYTES = 256 << 20
 
 
@@ -219,10 +219,11 @@ class Board:
         """Until the board has reset itself, which leaves it off; the seconds that took."""
         start = time.monotonic()
         try:
-            self._qemu.wait(timeout)
+            code = self._qemu.wait(timeout)
         except subprocess.TimeoutExpired as error:
             raise BoardError("the board does not reset: " + self.console()) from error
         self.power_cut()
+        assert code == 0, f"QEMU failed with code {code}"
         return time.monotonic() - start
 
     def close(self) -> None:

@@ -158,7 +158,6 @@ def test_the_watchdog_resets_a_board_whose_daemon_hangs_and_no_other(crawl):
     survey.wait_for("begins")
     board.run(f"kill -STOP {survey.daemon}")
     board.wait_for_reset(60)
-    board.power_on()
 
 
 GPIO = {
