@@ -19,7 +19,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
+.PHONY: build demo test bench accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
 
 build: native $(STAMP)/python
 
@@ -99,12 +99,7 @@ pytest: build
 
 # Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
 # scenarios are skipped and say so.
-hil: build packages-board
-	@if tools/board-image; then \
-	    test -f build/arm64/build.ninja || cmake --preset board && cmake --build --preset board; \
-	else \
-	    echo "NO EMULATED BOARD: tests/hil are skipped"; \
-	fi
+hil: build deb-arm64
 	@$(PY) -m pytest -q tests/hil
 
 bench: build $(STAMP)/venv-peers
@@ -113,11 +108,23 @@ bench: build $(STAMP)/venv-peers
 	@cmake --build --preset peers
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-# Debian packages of the daemon and of the C library, in build/deb.
-deb: native
-	@cmake -E make_directory build/deb
-	@cd build/release && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb -D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log || { cat $(CURDIR)/build/deb/log; exit 1; }
-	@rm -rf build/deb/_CPack_Packages; ls build/deb/*.deb
+# Debian packages in build/deb: the daemon, the C library and the host tools for this machine; the daemon and the library
+# for 64-bit ARM boards too, cross-compiled.
+deb: build deb-arm64
+	@$(call cpack,release)
+	@$(PY) tools/host-package build/deb >/dev/null
+	@ls build/deb/*.deb
+
+deb-arm64: packages-board
+	@if [ "$$(uname -m)" = aarch64 ]; then exit 0; fi; \
+	if tools/board-image; then \
+	    { test -f build/arm64/build.ninja || cmake --preset board; } && cmake --build --preset board && $(call cpack,arm64); \
+	else \
+	    echo "NO PACKAGES FOR arm64: they need Debian's, over the network"; \
+	fi
+
+cpack = mkdir -p build/deb && (cd build/$(1) && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb \
+	-D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log) || { cat build/deb/log; exit 1; }; rm -rf build/deb/_CPack_Packages
 
 accept: build unit fuzz-build cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json

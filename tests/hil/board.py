@@ -19,12 +19,23 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "build" / "board"
 PROGRAMS = ROOT / "build" / "arm64"
+PACKAGES = ROOT / "build" / "deb"
 BOOT_S, COMMAND_S = 60, 60
 DISK_BYTES = 256 << 20
 
 
 class BoardError(AssertionError):
     """The board did not do what it was told, with what it said."""
+
+
+def find_daemon(folder: Path) -> Path:
+    """The daemon of the arm64 package as dpkg lays it out, if it is made of what was built last; else as it was built."""
+    built = PROGRAMS / "firmware/pipefishd"
+    packages = [p for p in PACKAGES.glob("pipefishd_*_arm64.deb") if p.stat().st_mtime >= built.stat().st_mtime]
+    if not packages:
+        return built
+    subprocess.run(["dpkg-deb", "-x", packages[-1], folder / "package"], check=True)
+    return folder / "package/usr/bin/pipefishd"
 
 
 class UsbSerial:
@@ -104,8 +115,8 @@ class Board:
         self.folder, self.port = folder, port
         self.share = folder / "share"
         self.share.mkdir(parents=True)
-        for program in ("firmware/pipefishd", "tests/hil/pipefish-world"):
-            shutil.copy(PROGRAMS / program, self.share)
+        shutil.copy(PROGRAMS / "tests/hil/pipefish-world", self.share)
+        shutil.copy(find_daemon(folder), self.share)
         self.disk = folder / "disk.img"
         with self.disk.open("wb") as disk:
             disk.truncate(DISK_BYTES)
