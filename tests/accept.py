@@ -84,6 +84,11 @@ def check_recon() -> list[Row]:
     return rows_of("accept_recon.py")
 
 
+def check_link() -> list[Row]:
+    """10,000 sessions over bad lines, and a million frames through the daemon."""
+    return rows_of("accept_link.py")
+
+
 def check_link_seeds() -> list[Row]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -167,6 +172,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "selfcal": check_selfcal,
     "recon": check_recon,
     "link_seeds": check_link_seeds,
+    "link": check_link,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
     "golden_replay": check_golden_replay,

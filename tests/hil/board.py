@@ -29,7 +29,7 @@ class BoardError(AssertionError):
 
 
 def find_daemon(folder: Path) -> Path:
-    """The daemon of the arm64 package as dpkg lays it out, if it is made of what was built last; else as it was built."""
+    """The daemon of the arm64 package as dpkg lays it out, if that is made of the last build; else as it was built."""
     built = PROGRAMS / "firmware/pipefishd"
     packages = [p for p in PACKAGES.glob("pipefishd_*_arm64.deb") if p.stat().st_mtime >= built.stat().st_mtime]
     if not packages:
