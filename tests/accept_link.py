@@ -116,7 +116,7 @@ def resident_kb(process: int) -> int:
 
 
 def run_soak(piece: int) -> dict:
-    """One daemon, one receiver, PIECE frames: memory a tenth into it and at most later, and what was lost on the way."""
+    """One daemon, one receiver, PIECE frames: memory a tenth into it and its most later, and what was lost."""
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(1) as pool:
         folder = Path(name)
         write_loop(folder / "loop.y4m")
