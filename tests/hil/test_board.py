@@ -232,6 +232,7 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     assert read[-1][0] > 100
     assert received.keyframes[-1].telemetry["emergency_stop"]
     assert "emergency_stop" not in received.keyframes[0].telemetry
+    assert received.keyframes[-1].telemetry["limit_front"] and "limit_front" not in received.keyframes[0].telemetry
     assert received.keyframes[0].telemetry["lamp"] == 1 and received.keyframes[-1].telemetry["lamp"] == 0
     assert result.keyframes_out > 10
 
