@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "build" / "board"
 PROGRAMS = ROOT / "build" / "arm64"
 PACKAGES = ROOT / "build" / "deb"
-BOOT_S, COMMAND_S = 60, 60
+BOOT_S, COMMAND_S = 120, 120
 DISK_BYTES = 256 << 20
 
 

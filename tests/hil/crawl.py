@@ -139,7 +139,7 @@ class Crawl:
         )
         self.starts += 1
 
-    def wait_for(self, text: str, timeout: float = 20) -> float:
+    def wait_for(self, text: str, timeout: float = 80) -> float:
         """Until the daemon's log of this start has `text`; the seconds that took."""
         start = time.monotonic()
         log = self.board.share / f"daemon{self.starts - 1}.log"
@@ -149,7 +149,7 @@ class Crawl:
             time.sleep(0.05)
         return time.monotonic() - start
 
-    def wait_until(self, condition, what: str, timeout: float = 30) -> float:
+    def wait_until(self, condition, what: str, timeout: float = 120) -> float:
         """Until condition(status) of the daemon's status file; the seconds that took."""
         start = time.monotonic()
         while not condition(self.board.status()):
@@ -172,7 +172,7 @@ class Crawl:
     def start_receiver(self, device: str) -> None:
         with (self.folder / "receive.log").open("ab") as log:
             self._receiver = subprocess.Popen(
-                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "60"],
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "150"],
                 env=self.environment,
                 stdout=log,
                 stderr=log,
@@ -182,7 +182,7 @@ class Crawl:
         self._receiver.send_signal(signal.SIGKILL)
         self._receiver.wait()
 
-    def finish(self, timeout: float = 60) -> Survey:
+    def finish(self, timeout: float = 180) -> Survey:
         """Waits for the receiver; the survey it got."""
         try:
             code = self._receiver.wait(timeout)
@@ -241,7 +241,7 @@ class Crawl:
             daemon = subprocess.Popen(command, stderr=log)
         try:
             receive = [PIPEFISH, "receive", f"tcp://127.0.0.1:{port}", "-o", folder / "replay.mcap"]
-            subprocess.run(receive, check=True, capture_output=True, timeout=60)
+            subprocess.run(receive, check=True, capture_output=True, timeout=180)
             daemon.wait(30)
         finally:
             daemon.kill()

@@ -86,7 +86,7 @@ def test_a_killed_daemon_goes_on_with_its_survey_over_tls(crawl, note):
     survey.board.run(f"kill -9 {survey.daemon}")
     killed = time.monotonic()
     survey.start_daemon()
-    survey.wait_for("goes on", 30)
+    survey.wait_for("goes on")
     survey.wait_until(frames(3), "frames again")
     recovery = time.monotonic() - killed
     survey.board.wait(world)
@@ -272,7 +272,7 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     for fault in FAULTS:
         before = board.status()["frames"]
         board.run("; ".join(f"v4l2-ctl -d0 -c {name}=1" for name in fault.split()))
-        survey.wait_until(frames(before + 5), f"frames after {fault}", 20)
+        survey.wait_until(frames(before + 5), f"frames after {fault}")
     board.run("rm /run/camera; v4l2-ctl -d0 -c disconnect=1")
     survey.wait_for("no camera")
     board.run(f"kill {world}", check=False)
@@ -327,14 +327,14 @@ def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
         survey.wait_for("no camera")
         plug_usb_camera(board, usb_camera.port)
         survey.wait_for("the camera is there")
-        usb_camera.wait(20)
+        usb_camera.wait(120)
         survey.wait_until(lambda s: s["camera"]["restarts"] >= 1, "a restart of the silent stream")
         before = board.status()["frames"]
         start = time.monotonic()
         usb_camera.show(15, 25, RATE)
         survey.wait_until(frames(before + 1), "frames again")
         recovery = time.monotonic() - start
-        usb_camera.wait(20)
+        usb_camera.wait(120)
         result = end(survey, note, "libcamera: unplugged, stalled", recovery)
     finally:
         usb_camera.close()
