@@ -27,6 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from accept_rows import Row, at_most, exactly, print_rows
 
 from pipefish.files import write_atomically
 from pipefish.survey import Survey
@@ -47,10 +48,6 @@ SETTINGS = {
     "status.interval_ms": "200",
     "link.transport": "tcp",
 }
-
-
-def row(name: str, value: float, bound: str, holds: bool) -> dict:
-    return {"name": name, "value": value, "bound": bound, "holds": bool(holds)}
 
 
 def pieces(name: str, program: Path, count: int, minutes: float, measure) -> Iterator[dict]:
@@ -84,15 +81,15 @@ def run_sessions(batch: int) -> dict:
     return {"sessions": BATCH, "failed": 0 if good else 1, "said": "" if good else done.stdout[-500:]}
 
 
-def check_sessions(minutes: float) -> list[dict]:
+def check_sessions(minutes: float) -> list[Row]:
     done = list(pieces("sessions", CHANNEL, SESSIONS // BATCH, minutes, run_sessions))
     for piece in done:
         if piece["failed"]:
             print(piece["said"], file=sys.stderr)
     ran, failed = sum(p["sessions"] for p in done), sum(p["failed"] for p in done)
     return [
-        row("link.sessions", ran, f"= {SESSIONS}", ran == SESSIONS),
-        row("link.sessions_batches_failed", failed, "= 0", failed == 0),
+        exactly("link.sessions", ran, SESSIONS),
+        exactly("link.sessions_batches_failed", failed, 0),
     ]
 
 
@@ -161,18 +158,18 @@ def run_soak(piece: int) -> dict:
         }
 
 
-def check_soak(minutes: float) -> list[dict]:
+def check_soak(minutes: float) -> list[Row]:
     done = list(pieces("soak", DAEMON, SOAK // PIECE, minutes, run_soak))
     frames = sum(p["frames"] for p in done)
-    rows = [row("soak.frames", frames, f"= {SOAK}", frames == SOAK)]
+    rows = [exactly("soak.frames", frames, SOAK)]
     if done:
         # The spool's page cache (2 MB at most) grows once when the host lags: what leaks grows in every piece.
         growth = sorted(p["growth_kb"] for p in done)
         rows += [
-            row("soak.growth_kb_median", growth[len(growth) // 2], "<= 512", growth[len(growth) // 2] <= 512),
-            row("soak.growth_kb_most", growth[-1], "<= 2560", growth[-1] <= 2560),
-            row("soak.frames_dropped", sum(p["dropped"] for p in done), "= 0", all(p["dropped"] == 0 for p in done)),
-            row("soak.surveys_wrong", sum(p["wrong"] for p in done), "= 0", all(p["wrong"] == 0 for p in done)),
+            at_most("soak.growth_kb_median", growth[len(growth) // 2], 512),
+            at_most("soak.growth_kb_most", growth[-1], 2560),
+            exactly("soak.frames_dropped", sum(p["dropped"] for p in done), 0),
+            exactly("soak.surveys_wrong", sum(p["wrong"] for p in done), 0),
         ]
     return rows
 
@@ -186,7 +183,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=600)
     args = parser.parse_args()
     rows = [r for name, check in CHECKS.items() if args.only in name for r in check(args.minutes)]
-    print(json.dumps(rows))
+    print_rows(rows)
 
 
 if __name__ == "__main__":
