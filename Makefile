@@ -19,7 +19,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
+.PHONY: build demo test bench accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
 
 build: native $(STAMP)/python
 
@@ -66,14 +66,17 @@ lint: packages-test $(STAMP)/venv
 	@clang-format --dry-run --Werror $(C_FILES)
 	@$(VENV)/bin/ruff check --quiet . && $(VENV)/bin/ruff format --check --quiet .
 
-# Every parser and state machine for a fixed number of inputs, under clang with sanitizers; `make accept` runs longer.
+# Every parser and state machine for a fixed number of inputs, from those in tests/fuzz/corpus on, under clang with
+# sanitizers; `make accept` runs longer, and keeps what it finds.
 fuzz-build: packages-test
 	@test -f build/clang/build.ninja || cmake --preset clang
 	@cmake --build --preset clang
 
 fuzz-smoke: fuzz-build
-	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; \
-	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
+	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; n=$${f##*fuzz_}; \
+	    rm -rf build/fuzz/$$n; mkdir -p build/fuzz/$$n; \
+	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 build/fuzz/$$n $$(ls -d tests/fuzz/corpus/$$n 2>/dev/null) \
+	        2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
 
 # The protocols, in every state that small bounds reach (tests/proof).
 proof: packages-test
@@ -96,12 +99,7 @@ pytest: build
 
 # Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
 # scenarios are skipped and say so.
-hil: build packages-board
-	@if tools/board-image; then \
-	    test -f build/arm64/build.ninja || cmake --preset board && cmake --build --preset board; \
-	else \
-	    echo "NO EMULATED BOARD: tests/hil are skipped"; \
-	fi
+hil: build deb-arm64
 	@$(PY) -m pytest -q tests/hil
 
 bench: build $(STAMP)/venv-peers
@@ -110,11 +108,23 @@ bench: build $(STAMP)/venv-peers
 	@cmake --build --preset peers
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
-# Debian packages of the daemon and of the C library, in build/deb.
-deb: native
-	@cmake -E make_directory build/deb
-	@cd build/release && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb -D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log || { cat $(CURDIR)/build/deb/log; exit 1; }
-	@rm -rf build/deb/_CPack_Packages; ls build/deb/*.deb
+# Debian packages in build/deb: the daemon, the C library and the host tools for this machine; the daemon and the library
+# for 64-bit ARM boards too, cross-compiled.
+deb: build deb-arm64
+	@$(call cpack,release)
+	@$(PY) tools/host-package build/deb >/dev/null
+	@ls build/deb/*.deb
+
+deb-arm64: packages-board
+	@if [ "$$(uname -m)" = aarch64 ]; then exit 0; fi; \
+	if tools/board-image; then \
+	    { test -f build/arm64/build.ninja || cmake --preset board; } && cmake --build --preset board && $(call cpack,arm64); \
+	else \
+	    echo "NO PACKAGES FOR arm64: they need Debian's, over the network"; \
+	fi
+
+cpack = mkdir -p build/deb && (cd build/$(1) && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb \
+	-D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log) || { cat build/deb/log; exit 1; }; rm -rf build/deb/_CPack_Packages
 
 accept: build unit fuzz-build cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json

@@ -27,8 +27,9 @@ static const setting settings[] = {
     {"survey", "nominal_diameter_mm", NUMBER, AT(survey.nominal_diameter_mm), "mm", "0", 0, 20000, NULL,
      "of the pipe; 0 = unknown"},
 
-    {"camera", "driver", CHOICE, AT(camera.driver), "", "replay", 0, 0, "replay|v4l2",
-     "where frames come from; replay plays a recording, v4l2 is a camera of the kernel's"},
+    {"camera", "driver", CHOICE, AT(camera.driver), "", "replay", 0, 0, "replay|v4l2|libcamera",
+     "where frames come from; replay plays a recording, v4l2 is a camera of the kernel's, libcamera one that it puts "
+     "together"},
     {"camera", "path", TEXT, AT(camera.path), "", "", 0, 0, NULL,
      "replay: the recording: a .y4m file, or a folder of PNG, JPEG or PGM images; required"},
     {"camera", "csv", TEXT, AT(camera.csv), "", "", 0, 0, NULL,
@@ -38,26 +39,29 @@ static const setting settings[] = {
     {"camera", "loops", INTEGER, AT(camera.loops), "", "1", 0, 1000000, NULL,
      "play it so often; 0 = for ever; each begins with a marked break"},
     {"camera", "frame_rate", NUMBER, AT(camera.frame_rate), "1/s", "0", 0, 10000, NULL,
-     "replay: of a recording without times; 0 = 10. v4l2: to ask for; 0 = as the camera is set"},
-    {"camera", "device", TEXT, AT(camera.device), "", "/dev/video0", 0, 0, NULL,
-     "v4l2: the camera; a link in /dev/v4l/by-path stays the same when it is plugged in again"},
+     "replay: of a recording without times; 0 = 10. cameras: to ask for; 0 = as the camera is set"},
+    {"camera", "device", TEXT, AT(camera.device), "", "", 0, 0, NULL,
+     "v4l2: the camera, empty = /dev/video0; a link in /dev/v4l/by-path stays the same when it is plugged in again. "
+     "libcamera: a part of the camera's id (the log tells it), empty = the first"},
     {"camera", "width", INTEGER, AT(camera.width), "px", "0", 0, 16384, NULL,
-     "v4l2: of the frames; 0 = as the camera is set. If it is given the daemon starts without the camera and waits"},
-    {"camera", "height", INTEGER, AT(camera.height), "px", "0", 0, 16384, NULL, "v4l2: together with width"},
+     "cameras: of the frames; 0 = as the camera is set. If it is given the daemon starts without the camera and waits"},
+    {"camera", "height", INTEGER, AT(camera.height), "px", "0", 0, 16384, NULL, "cameras: together with width"},
     {"camera", "format", TEXT, AT(camera.format), "", "", 0, 0, NULL,
-     "v4l2: GREY NV12 NM12 NV21 YU12 Y10P Y12P Y10 Y12 YUYV UYVY MJPG or JPEG; empty = the first of these it has"},
+     "cameras: GREY NV12 NM12 NV21 YU12 Y10P Y12P Y10 Y12 YUYV UYVY RGB3 BGR3 MJPG or JPEG; empty = the first of "
+     "these it has"},
     {"camera", "buffers", INTEGER, AT(camera.buffers), "", "6", 4, 32, NULL,
-     "v4l2: frames that the kernel has room for, three of them in use here; more = longer pauses are bridged"},
+     "cameras: frames that there is room for, three of them in use here; more = longer pauses are bridged"},
     {"camera", "exposure", CHOICE, AT(camera.exposure), "", "auto", 0, 0, "auto|hold|fixed|device",
-     "v4l2: auto = ours, for a lamp-lit pipe; hold = auto until it has settled, then fixed: for calibration; fixed = "
+     "cameras: auto = ours, for a lamp-lit pipe; hold = auto until it has settled, then fixed: for calibration; fixed "
+     "= "
      "as "
      "set here; device = the camera's own"},
     {"camera", "exposure_us", INTEGER, AT(camera.exposure_us), "us", "0", 0, 1000000, NULL,
-     "v4l2: with exposure = fixed; 0 = as the camera is set"},
+     "cameras: with exposure = fixed; 0 = as the camera is set"},
     {"camera", "gain", NUMBER, AT(camera.gain), "", "0", 0, 1000000, NULL,
-     "v4l2: with exposure = fixed, in the camera's own units; 0 = as the camera is set"},
+     "cameras: with exposure = fixed, in the camera's own units (libcamera: a factor); 0 = as the camera is set"},
     {"camera", "exposure_max_us", INTEGER, AT(camera.exposure_max_us), "us", "10000", 0, 1000000, NULL,
-     "v4l2: longest exposure of auto and hold, against motion blur; 0 = the camera's limit"},
+     "cameras: longest exposure of auto and hold, against motion blur; 0 = the camera's limit"},
     {"camera", "zero_copy", SWITCH, AT(camera.zero_copy), "", "true", 0, 0, NULL,
      "track frames where the driver put them; false = copy each first, for boards that read such memory slowly"},
     {"camera", "index", TEXT, AT(camera.index), "", "", 0, 0, NULL,
@@ -398,8 +402,6 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
     const char *why = NULL;
     if (c->camera.driver == PF_CAMERA_REPLAY && c->camera.path[0] == '\0')
         why = "camera.path: must be set: the recording to play";
-    else if (c->camera.driver == PF_CAMERA_V4L2 && c->camera.device[0] == '\0')
-        why = "camera.device: must be set";
     else if ((c->camera.width == 0) != (c->camera.height == 0))
         why = "camera.width and camera.height: both or neither";
     else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')

@@ -13,7 +13,7 @@
 #define PF_CONFIG_LINE_MAX 640u /* bytes of "section.key = value", with its zero */
 #define PF_CONFIG_KEYS_MAX 128u
 
-enum { PF_CAMERA_REPLAY = 0, PF_CAMERA_V4L2 = 1 };
+enum { PF_CAMERA_REPLAY = 0, PF_CAMERA_V4L2 = 1, PF_CAMERA_LIBCAMERA = 2 };
 enum { PF_SPEED_RECORDED = 0, PF_SPEED_FAST = 1 };
 enum { PF_CELLS_GRID = 0, PF_CELLS_POLAR = 1 };
 enum { PF_TRANSPORT_SERIAL = 0, PF_TRANSPORT_TCP = 1, PF_TRANSPORT_TLS = 2 };

@@ -77,7 +77,7 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status, char *peer)
                   .store = mean_us(store.store_ns, store.stored),
                   .frame_max = (float)((double)c->frame_max_ns / 1e3)},
         .spool = {store.spool.objects, store.spool.bytes, store.spool.stored, store.spool.acknowledged,
-                  store.spool.errors},
+                  store.spool.errors, (uint32_t)store.spool.evicted, store.trouble[0] != '\0'},
         .link_up = c->link_up,
         .link = c->link,
         .telemetry = c->telemetry,
@@ -183,9 +183,10 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   (double)s->stage.keyframe, (double)s->stage.store, (double)s->stage.frame_max);
     (void)fprintf(out,
                   "  \"spool\": {\"objects\": %" PRIu64 ", \"bytes\": %" PRIu64 ", \"stored\": %" PRIu64
-                  ", \"acknowledged\": %" PRIu64 ", \"errors\": %" PRIu64 ", \"refused\": %" PRIu64 "},\n",
-                  s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.errors,
-                  store->refused);
+                  ", \"acknowledged\": %" PRIu64 ", \"evicted\": %u, \"errors\": %" PRIu64 ", \"refused\": %" PRIu64
+                  "},\n",
+                  s->spool.objects, s->spool.bytes, s->spool.stored, s->spool.acknowledged, s->spool.evicted,
+                  s->spool.errors, store->refused);
     print_camera(out, camera);
     print_gpio(out, gpio);
     print_tracking(out, &s->tracking);
@@ -197,6 +198,7 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   s->link_up ? "true" : "false", s->link.bytes_out, s->link.bytes_in, s->link.frames_out,
                   s->link.frames_in, s->link.crc_errors, s->link.malformed, s->link.fragments_sent,
                   s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us);
+    print_text(out, "spool_trouble", store->trouble);
     if (s->telemetry.has_encoder)
         (void)fprintf(out, ",\n  \"encoder_count\": %" PRId64, s->telemetry.encoder_count);
     if (s->has_profile) {

@@ -172,26 +172,27 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
     return pf_sha256(bytes, d->profile_size, d->profile_sha256) == PF_OK;
 }
 
-static pf_status open_v4l2(pf_daemon *d, char *error, size_t n)
+static pf_status open_live(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
+    const bool is_v4l2 = c->camera.driver == PF_CAMERA_V4L2;
     double u = 0, v = 0, radius = pf_tracking_circle(d, &u, &v);
     bool has_circle = radius > 0 && u > 0 && v > 0;
-    return pf_v4l2_open(&d->camera,
-                        &(pf_v4l2_config){.device = c->camera.device,
-                                          .width = c->camera.width,
-                                          .height = c->camera.height,
-                                          .frame_rate = c->camera.frame_rate,
-                                          .format = c->camera.format,
-                                          .buffers = c->camera.buffers,
-                                          .mode = (pf_exposure_mode)c->camera.exposure,
-                                          .exposure_us = c->camera.exposure_us,
-                                          .gain = c->camera.gain,
-                                          .exposure_max_us = c->camera.exposure_max_us,
-                                          .circle_u = has_circle ? (uint32_t)u : 0,
-                                          .circle_v = has_circle ? (uint32_t)v : 0,
-                                          .circle_radius = has_circle ? (uint32_t)radius : 0},
-                        error, n);
+    const pf_camera_config config = {.device =
+                                         is_v4l2 && c->camera.device[0] == '\0' ? "/dev/video0" : c->camera.device,
+                                     .width = c->camera.width,
+                                     .height = c->camera.height,
+                                     .frame_rate = c->camera.frame_rate,
+                                     .format = c->camera.format,
+                                     .buffers = c->camera.buffers,
+                                     .mode = (pf_exposure_mode)c->camera.exposure,
+                                     .exposure_us = c->camera.exposure_us,
+                                     .gain = c->camera.gain,
+                                     .exposure_max_us = c->camera.exposure_max_us,
+                                     .circle_u = has_circle ? (uint32_t)u : 0,
+                                     .circle_v = has_circle ? (uint32_t)v : 0,
+                                     .circle_radius = has_circle ? (uint32_t)radius : 0};
+    return (is_v4l2 ? pf_v4l2_open : pf_libcamera_open)(&d->camera, &config, error, n);
 }
 
 static pf_status open_replay(pf_daemon *d, char *error, size_t n)
@@ -210,7 +211,7 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
     const pf_camera_info *info;
-    if ((c->camera.driver == PF_CAMERA_V4L2 ? open_v4l2 : open_replay)(d, error, n) != PF_OK)
+    if ((c->camera.driver == PF_CAMERA_REPLAY ? open_replay : open_live)(d, error, n) != PF_OK)
         return false;
     info = d->camera.ops->info(d->camera.self);
     (void)snprintf(d->source, sizeof d->source, "%s", info->source);

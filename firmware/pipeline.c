@@ -260,8 +260,11 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
         m.has_lamp = true;
         m.lamp = (float)lamp;
     }
-    if (d->gpio.ops->stopped(d->gpio.self, &m.emergency_stop) != PF_OK)
-        m.emergency_stop = false;
+    pf_gpio_state gpio;
+    d->gpio.ops->state(d->gpio.self, &gpio);
+    m.emergency_stop = gpio.is_stopped;
+    m.limit_front = gpio.limits & PF_LIMIT_FRONT;
+    m.limit_rear = gpio.limits & PF_LIMIT_REAR;
     return m;
 }
 
@@ -308,6 +311,7 @@ static bool make_keyframe(pf_pipeline *p, const pf_shot *shot)
     }
     job->kind = PF_OBJECT_KEYFRAME;
     job->index = k.index;
+    job->is_event = k.cause == PF_KEYFRAME_FIRST || k.cause == PF_KEYFRAME_STATE;
     memcpy(job->break_reason, p->break_reason, sizeof job->break_reason);
     pf_store_give(d->store, job);
     return true;

@@ -42,14 +42,18 @@ struct pf_store {
     bool is_hurried, is_flushing, is_quitting;
     pf_store_stats stats;
     /* The thread's own: */
-    bool was_blocked, was_failing;        /* has said so */
-    char lost_break[PF_BREAK_REASON_MAX]; /* of a keyframe that was lost: the next one that is stored tells it */
+    bool was_blocked, was_failing, was_evicting; /* has said so */
+    char lost_break[PF_BREAK_REASON_MAX];        /* of a keyframe that was lost: the next one that is stored tells it */
 };
 
 /* ---- the thread's work: each is called without the mutex */
 
-static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey, const char *break_reason)
+/* Stores a job, and takes the victims out. */
+static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey, const char *break_reason,
+                              const pf_spool_victim *victims, uint32_t count)
 {
+    const pf_spool_rank rank = {pf_survey_importance(job->index), job->index};
+    bool may_go = job->kind == PF_OBJECT_KEYFRAME && !job->is_event && break_reason[0] == '\0';
     size_t n = job->n; /* the bytes behind are free: a job that waits is stored again */
     uint8_t name[32], value[PF_SURVEY_BYTES];
     size_t value_n = 0; /* of the survey's end: the value is deleted */
@@ -59,7 +63,29 @@ static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *s
         return PF_ERR_IO;
     if (job->kind != PF_OBJECT_SURVEY_END)
         value_n = pf_survey_pack(survey, value);
-    return s->spool.ops->put_and_set(s->spool.self, job->kind, name, job->bytes, n, PF_SURVEY_KEY, value, value_n);
+    return s->spool.ops->exchange(s->spool.self, victims, count, job->kind, name, job->bytes, n, may_go ? &rank : NULL,
+                                  PF_SURVEY_KEY, value, value_n);
+}
+
+typedef struct sacrifice {
+    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
+    uint32_t count;
+} sacrifice;
+
+/* A full spool makes room for a keyframe by giving up less important ones that no slot holds; the survey that is stored
+ * with it remembers them. */
+static pf_status store_instead(pf_store *s, const pf_job *job, pf_survey *survey, const char *break_reason,
+                               uint64_t cursor, sacrifice *made)
+{
+    uint32_t importance = job->is_event ? UINT32_MAX : pf_survey_importance(job->index);
+    pf_status status = s->spool.ops->victims(s->spool.self, cursor, importance, job->n, made->victims, &made->count);
+    for (uint32_t i = 0; status == PF_OK && i < made->count; i++)
+        pf_survey_lose(survey, made->victims[i].number);
+    if (status == PF_OK)
+        status = store_object(s, job, survey, break_reason, made->victims, made->count);
+    if (status != PF_OK)
+        made->count = 0;
+    return status;
 }
 
 static bool is_keyframe(const pf_job *job)
@@ -86,6 +112,12 @@ static const char *what(const pf_job *job)
     return is_keyframe(job) ? "a keyframe" : "the survey's start or end";
 }
 
+/* With the mutex, right after the call. */
+static void note_trouble(pf_store *s, bool is_there)
+{
+    (void)snprintf(s->stats.trouble, sizeof s->stats.trouble, "%s", is_there ? s->spool.ops->error(s->spool.self) : "");
+}
+
 static void free_job(pf_store *s, pf_job *job)
 {
     s->free_job[s->free_count++] = job;
@@ -109,6 +141,8 @@ static void do_job(pf_store *s)
     bool may_wait = !s->is_flushing && (s->config.is_patient || !is_keyframe(job));
     bool is_waiting;
     char break_reason[PF_BREAK_REASON_MAX] = "";
+    uint64_t cursor = s->cursor;
+    sacrifice made = {.count = 0};
     pf_status status;
 
     if (is_keyframe(job))
@@ -116,18 +150,26 @@ static void do_job(pf_store *s)
     pthread_mutex_unlock(&s->mutex);
     if (is_keyframe(job))
         memcpy(break_reason, job->break_reason[0] ? job->break_reason : s->lost_break, sizeof break_reason);
-    status = store_object(s, job, &survey, break_reason);
+    status = store_object(s, job, &survey, break_reason, NULL, 0);
+    if (status == PF_ERR_SPACE && is_keyframe(job) && !s->config.is_patient)
+        status = store_instead(s, job, &survey, break_reason, cursor, &made);
     is_waiting = status == PF_ERR_SPACE && may_wait;
+    bool is_evicting = is_keyframe(job) && (made.count > 0 || (status == PF_ERR_SPACE && !is_waiting));
+    if (is_evicting && !s->was_evicting)
+        pf_log(PF_LOG_WARNING, "%s: keyframes are given up from now on, the least important first",
+               made.count > 0 ? "the spool is full" : s->spool.ops->error(s->spool.self));
     if (is_waiting && !s->was_blocked)
         pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
-    else if (status != PF_OK && !is_waiting)
+    else if (status != PF_OK && !is_waiting && !is_evicting)
         pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self), what(job));
     s->was_blocked = is_waiting;
+    s->was_evicting = is_evicting;
     if (is_keyframe(job) && status == PF_OK)
         s->lost_break[0] = '\0';
     else if (is_keyframe(job) && !is_waiting)
         memcpy(s->lost_break, break_reason, sizeof s->lost_break);
     pthread_mutex_lock(&s->mutex);
+    note_trouble(s, status != PF_OK);
     if (is_waiting) {
         s->is_blocked = !s->is_flushing;
         s->retry_ns = pf_now() + RETRY_NS;
@@ -137,6 +179,8 @@ static void do_job(pf_store *s)
         s->has_more = true;
         s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
         if (is_keyframe(job)) {
+            for (uint32_t i = 0; i < made.count; i++)
+                pf_survey_lose(&s->survey, made.victims[i].number);
             s->survey.next_index = job->index + 1;
             s->stats.store_ns += pf_now() - start;
             s->stats.stored++;
@@ -184,6 +228,8 @@ static void fill_slot(pf_store *s, pf_slot *slot)
     }
     note_failure(s, status == PF_ERR_IO);
     pthread_mutex_lock(&s->mutex);
+    if (status == PF_OK || status == PF_ERR_IO)
+        note_trouble(s, status != PF_OK);
     if (after != s->cursor || status == PF_ERR_IO)
         s->has_more = true;
     s->cursor = after;
@@ -206,6 +252,7 @@ static void empty_slot(pf_store *s, pf_slot *slot)
     is_removed = s->spool.ops->remove(s->spool.self, row) == PF_OK;
     note_failure(s, !is_removed);
     pthread_mutex_lock(&s->mutex);
+    note_trouble(s, !is_removed);
     if (is_removed) {
         slot->state = SLOT_EMPTY;
         s->is_blocked = false;
@@ -339,6 +386,12 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
     s->survey = *survey;
     s->config = *config;
     s->has_more = true;
+    /* What other surveys left is whole, or its end has told what is lost. */
+    if (!survey->is_resumed && spool->ops->keep_all(spool->self) != PF_OK) {
+        (void)snprintf(error, n, "%s", spool->ops->error(spool->self));
+        release(s);
+        return false;
+    }
     if (!measure_spool(s, error, n)) {
         release(s);
         return false;

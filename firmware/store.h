@@ -8,12 +8,14 @@
 #include "survey.h"
 
 #define PF_BREAK_REASON_MAX 128u /* bytes, with the zero */
+#define PF_TROUBLE_MAX      256u /* likewise */
 
 typedef struct pf_job {
     uint8_t *bytes; /* capacity of pf_store_capacity() */
     size_t n;
     uint32_t kind;                          /* pf_object_kind */
     uint32_t index;                         /* of a keyframe */
+    bool is_event;                          /* a keyframe that is never given up (pf_survey_importance) */
     char break_reason[PF_BREAK_REASON_MAX]; /* of a keyframe; "" = tracks go on from the one before. Not in `bytes` */
 } pf_job;
 
@@ -27,16 +29,18 @@ typedef struct pf_store_config {
     uint32_t jobs;   /* that may wait for the disk, > 0 */
     uint32_t slots;  /* objects under way, > 0 */
     size_t capacity; /* most bytes of an object of this run; slots also hold the largest one already in the spool */
-    bool is_patient; /* what does not fit waits until the host has made room; else keyframes are dropped */
+    bool is_patient; /* what does not fit waits until the host has made room; else keyframes are given up: the least
+                        important of those that wait and of this one */
     int wake_fd;     /* eventfd of the courier: written when a slot is ready */
 } pf_store_config;
 
 typedef struct pf_store_stats {
     pf_spool_stats spool;
-    uint64_t keyframes_dropped; /* made but not stored */
-    uint64_t refused;           /* objects that the host will never take */
-    uint64_t store_ns, stored;  /* time spent on storing keyframes, and how many */
-    bool has_failed;            /* the survey's start or end could not be stored */
+    uint64_t keyframes_dropped;   /* made but not stored; those that made room later are spool.evicted */
+    uint64_t refused;             /* objects that the host will never take */
+    uint64_t store_ns, stored;    /* time spent on storing keyframes, and how many */
+    bool has_failed;              /* the survey's start or end could not be stored */
+    char trouble[PF_TROUBLE_MAX]; /* why something cannot be stored or removed now; "" = well */
 } pf_store_stats;
 
 typedef struct pf_store pf_store;

@@ -139,3 +139,11 @@ void pf_survey_lose(pf_survey *s, uint32_t index)
     s->lost_count[at] = 1;
     s->lost_ranges++;
 }
+
+uint32_t pf_survey_importance(uint32_t index)
+{
+    uint32_t importance = 0;
+    for (; index != 0 && index % 2 == 0; index /= 2)
+        importance++;
+    return importance;
+}

@@ -32,6 +32,12 @@ bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool,
  * left out: the next boot uses their numbers again. */
 size_t pf_survey_pack(const pf_survey *survey, uint8_t *out);
 
+/* How much a keyframe would be missed by those that the spool has no room for: the number of times that its index can
+ * be halved. While the spool is full the odd ones go first, then every second of the rest, and so on: the oldest first
+ * of each kind. What is left is spread over the whole survey. A keyframe at which something happened (the first one,
+ * after a break, a change of the scene's state) is no part of that: it is never given up. */
+uint32_t pf_survey_importance(uint32_t index);
+
 /* Remembers a keyframe that was made but cannot be delivered. Of more than PF_SURVEY_LOST_MAX ranges the closest two
  * become one, which then covers keyframes that are not lost: the host counts those that it has as received. */
 void pf_survey_lose(pf_survey *survey, uint32_t index);

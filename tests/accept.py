@@ -84,6 +84,11 @@ def check_recon() -> list[Row]:
     return rows_of("accept_recon.py")
 
 
+def check_link() -> list[Row]:
+    """10,000 sessions over bad lines, and a million frames through the daemon."""
+    return rows_of("accept_link.py")
+
+
 def check_link_seeds() -> list[Row]:
     """The link's fault scenarios on 20 times as many lines as `make test` takes."""
     program = BUILD / "debug/tests/unit/test_link_channel"
@@ -128,15 +133,19 @@ def check_golden_replay() -> list[Row]:
 
 
 def check_fuzz() -> list[Row]:
-    """Every fuzz target for two million inputs."""
+    """Every fuzz target for two million inputs, from the corpora on that earlier runs left in build/accept/corpus."""
     folder = BUILD / "clang/tests/fuzz"
     targets = [t for t in sorted(folder.glob("fuzz_*")) if t.is_file() and os.access(t, os.X_OK)]
     if not targets:
         raise SystemExit(f"no fuzz target in {folder}: `make accept` builds them")
     rows = []
     for target in targets:
-        done = run(target, "-runs=2000000", "-max_len=4096", "-max_total_time=600", "-verbosity=0")
-        rows.append(exactly(f"fuzz.{target.name.removeprefix('fuzz_')}_crashes", done.returncode, 0))
+        name = target.name.removeprefix("fuzz_")
+        kept, given = BUILD / "accept/corpus" / name, ROOT / "tests/fuzz/corpus" / name
+        kept.mkdir(parents=True, exist_ok=True)
+        corpora = [kept, *([given] if given.is_dir() else [])]
+        done = run(target, "-runs=2000000", "-max_len=4096", "-max_total_time=600", "-verbosity=0", *corpora)
+        rows.append(exactly(f"fuzz.{name}_crashes", done.returncode, 0))
     return rows
 
 
@@ -163,6 +172,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "selfcal": check_selfcal,
     "recon": check_recon,
     "link_seeds": check_link_seeds,
+    "link": check_link,
     "profile_store": check_profile_store,
     "daemon_kills": check_daemon_kills,
     "golden_replay": check_golden_replay,

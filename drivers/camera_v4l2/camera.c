@@ -100,14 +100,7 @@ static pf_status convert(pf_v4l2 *c, const pf_v4l2_buffer *b, size_t n, pf_v4l2_
         pf_pixels_to_grey(c->format, b->memory, width, height, c->stride, to->pixels);
         return PF_OK;
     }
-    int w, h, sampling, space;
-    if (tjDecompressHeader3(c->turbo, b->memory, (unsigned long)n, &w, &h, &sampling, &space) != 0 || w != (int)width ||
-        h != (int)height ||
-        (tjDecompress2(c->turbo, b->memory, (unsigned long)n, to->pixels, w, (int)width, h, TJPF_GRAY, 0) != 0 &&
-         tjGetErrorCode(c->turbo) == TJERR_FATAL))
-        return pf_fail(&c->failure, PF_ERR_CHECKSUM, "%s: a frame's JPEG is damaged: %s", c->device,
-                       tjGetErrorStr2(c->turbo));
-    return PF_OK;
+    return pf_jpeg_to_grey(c->turbo, b->memory, n, width, height, to->pixels, &c->failure);
 }
 
 /* Moment of the kernel's stamp, of whatever clock (the numbering believes it only if it can be of ours), that is the
@@ -278,7 +271,7 @@ static void v4l2_close(void *self)
     free(c);
 }
 
-static pf_status check(pf_v4l2 *c, const pf_v4l2_config *config)
+static pf_status check(pf_v4l2 *c, const pf_camera_config *config)
 {
     if (config->device == NULL || config->device[0] == '\0')
         return pf_fail(&c->failure, PF_ERR_ARGUMENT, "v4l2: no device");
@@ -295,7 +288,7 @@ static pf_status check(pf_v4l2 *c, const pf_v4l2_config *config)
     return PF_OK;
 }
 
-static pf_status open_parts(pf_v4l2 *c, const pf_v4l2_config *config)
+static pf_status open_parts(pf_v4l2 *c, const pf_camera_config *config)
 {
     bool is_absent = false;
     pf_status status = check(c, config);
@@ -325,7 +318,7 @@ static pf_status open_parts(pf_v4l2 *c, const pf_v4l2_config *config)
     return PF_OK;
 }
 
-pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_v4l2_config *config, const pf_v4l2_io *io, char *error,
+pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_camera_config *config, const pf_v4l2_io *io, char *error,
                             size_t n)
 {
     static const pf_camera_source_ops ops = {.info = v4l2_info,
@@ -364,7 +357,7 @@ pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_v4l2_config *conf
     return PF_OK;
 }
 
-pf_status pf_v4l2_open(pf_camera_source *source, const pf_v4l2_config *config, char *error, size_t n)
+pf_status pf_v4l2_open(pf_camera_source *source, const pf_camera_config *config, char *error, size_t n)
 {
     return pf_v4l2_open_with(source, config, &pf_v4l2_kernel, error, n);
 }

@@ -4,7 +4,6 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <poll.h>
-#include <string.h>
 #include <sys/ioctl.h>
 #include <sys/mman.h>
 #include <time.h>
@@ -48,14 +47,7 @@ static void kernel_unmap(void *self, void *memory, size_t n)
 static bool kernel_keep(void *self, void *memory, size_t n)
 {
     (void)self;
-    void *copy = mmap(NULL, n, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
-    if (copy == MAP_FAILED)
-        return false;
-    memcpy(copy, memory, n);
-    if (mremap(copy, n, n, MREMAP_MAYMOVE | MREMAP_FIXED, memory) == memory)
-        return true;
-    (void)munmap(copy, n);
-    return false;
+    return pf_mapping_keep(memory, n);
 }
 
 static int kernel_wait(void *self, int fd, uint32_t timeout_ms)

@@ -2,9 +2,9 @@
 #ifndef PIPEFISH_V4L2_H
 #define PIPEFISH_V4L2_H
 
-#include "camera_v4l2/convert.h"
-#include "camera_v4l2/exposure.h"
-#include "camera_v4l2/timing.h"
+#include "camera_common/convert.h"
+#include "camera_common/exposure.h"
+#include "camera_common/timing.h"
 #include "common/failure.h"
 #include "pipefish/drivers/camera.h"
 
@@ -18,9 +18,7 @@ typedef struct pf_v4l2_io {
     int (*ioctl)(void *self, int fd, unsigned long request, void *argument); /* not interrupted; -1 and errno */
     void *(*map)(void *self, int fd, size_t n, int64_t offset);              /* NULL and errno */
     void (*unmap)(void *self, void *memory, size_t n);
-    /* Puts memory of our own, with the same bytes, where a mapping was: as long as one is left the device counts as
-     * open, and a camera that is plugged in again gets another name. Readers of other threads notice nothing. */
-    bool (*keep)(void *self, void *memory, size_t n);
+    bool (*keep)(void *self, void *memory, size_t n);     /* pf_mapping_keep */
     int (*wait)(void *self, int fd, uint32_t timeout_ms); /* 1 a frame is there; 0 none; -1 the queue has failed */
     uint64_t (*now)(void *self);
     void (*sleep)(void *self, uint32_t ms);
@@ -29,7 +27,7 @@ typedef struct pf_v4l2_io {
 extern const pf_v4l2_io pf_v4l2_kernel;
 
 /* As pf_v4l2_open, with other system calls; they are copied. */
-pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_v4l2_config *config, const pf_v4l2_io *io, char *error,
+pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_camera_config *config, const pf_v4l2_io *io, char *error,
                             size_t n);
 
 #define PF_V4L2_BUFFERS_MIN (PF_CAMERA_HELD_MAX + 1) /* with fewer nothing would be left to fill */

@@ -4,6 +4,10 @@
 
 #include "pipefish/base.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 typedef struct pf_failure {
     char text[512]; /* "" = nothing failed yet */
 } pf_failure;
@@ -13,5 +17,9 @@ pf_status pf_fail(pf_failure *failure, pf_status status, const char *format, ...
 
 /* Copies the text into a caller's buffer (NULL or n = 0: nothing is copied) and returns `status`. */
 pf_status pf_failure_copy(const pf_failure *failure, pf_status status, char *error, size_t n);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -234,17 +234,6 @@ static pf_status board_encoder(void *self, uint64_t time_ns, int64_t *count, uin
     return status;
 }
 
-static pf_status board_stopped(void *self, bool *is_stopped)
-{
-    board *b = self;
-    if (b->button[0].edges == NULL)
-        return PF_ERR_UNSUPPORTED;
-    pthread_mutex_lock(&b->mutex);
-    *is_stopped = b->is_stopped;
-    pthread_mutex_unlock(&b->mutex);
-    return PF_OK;
-}
-
 static void board_indicate(void *self, pf_indication indication)
 {
     board *b = self;
@@ -322,7 +311,6 @@ pf_status pf_gpio_board_open(pf_gpio *gpio, const pf_gpio_config *config, char *
     static const pf_gpio_ops ops = {.set_lamp = board_set_lamp,
                                     .lamp = board_lamp,
                                     .encoder = board_encoder,
-                                    .stopped = board_stopped,
                                     .indicate = board_indicate,
                                     .state = board_state,
                                     .close = board_close};

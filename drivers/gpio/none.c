@@ -25,13 +25,6 @@ static pf_status none_encoder(void *self, uint64_t time_ns, int64_t *count, uint
     return PF_ERR_UNSUPPORTED;
 }
 
-static pf_status none_stopped(void *self, bool *is_stopped)
-{
-    (void)self;
-    (void)is_stopped;
-    return PF_ERR_UNSUPPORTED;
-}
-
 static void none_indicate(void *self, pf_indication indication)
 {
     (void)self;
@@ -55,7 +48,6 @@ pf_status pf_gpio_none_open(pf_gpio *gpio)
         .set_lamp = none_set_lamp,
         .lamp = none_lamp,
         .encoder = none_encoder,
-        .stopped = none_stopped,
         .indicate = none_indicate,
         .state = none_state,
         .close = none_close,

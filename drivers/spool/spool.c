@@ -22,6 +22,14 @@ static const char schema[] = "CREATE TABLE object ("
                              "bytes BLOB NOT NULL);"
                              "CREATE TABLE value (key TEXT PRIMARY KEY, bytes BLOB NOT NULL) WITHOUT ROWID;";
 
+/* Beside the objects, so that taking a rank away does not write the object anew, and so that programs without ranks can
+ * go on with the file: to them it is a table that looks after itself. */
+static const char ranks[] = "CREATE TABLE IF NOT EXISTS evictable (row INTEGER PRIMARY KEY,"
+                            "importance INTEGER NOT NULL, number INTEGER NOT NULL);"
+                            "CREATE INDEX IF NOT EXISTS evictable_order ON evictable (importance, row);"
+                            "CREATE TRIGGER IF NOT EXISTS evictable_gone AFTER DELETE ON object BEGIN "
+                            "DELETE FROM evictable WHERE row = old.row; END;";
+
 typedef enum statement {
     SQL_BEGIN,
     SQL_COMMIT,
@@ -35,6 +43,9 @@ typedef enum statement {
     SQL_GET,
     SQL_SET,
     SQL_DELETE,
+    SQL_RANK,
+    SQL_VICTIMS,
+    SQL_KEEP_ALL,
     SQL_STATEMENTS,
 } statement;
 
@@ -51,6 +62,10 @@ static const char *const sql[SQL_STATEMENTS] = {
     [SQL_GET] = "SELECT bytes FROM value WHERE key = ?1",
     [SQL_SET] = "INSERT INTO value (key, bytes) VALUES (?1, ?2) ON CONFLICT (key) DO UPDATE SET bytes = excluded.bytes",
     [SQL_DELETE] = "DELETE FROM value WHERE key = ?1",
+    [SQL_RANK] = "INSERT OR REPLACE INTO evictable (row, importance, number) VALUES (?1, ?2, ?3)",
+    [SQL_VICTIMS] = ("SELECT e.row, e.number, length(o.bytes) FROM evictable e JOIN object o ON o.row = e.row "
+                     "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3"),
+    [SQL_KEEP_ALL] = "DELETE FROM evictable",
 };
 
 typedef struct spool {
@@ -68,6 +83,9 @@ typedef struct object {
     const uint8_t *name;
     const void *bytes;
     size_t n;
+    const pf_spool_rank *rank;
+    const pf_spool_victim *victims;
+    uint32_t victims_n;
 } object;
 
 static pf_status fail_sqlite(spool *s, const char *doing)
@@ -177,6 +195,8 @@ static pf_status open_database(spool *s)
             run_text(s, "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA journal_size_limit = 4194304;");
     if (status == PF_OK && is_empty)
         status = create(s);
+    if (status == PF_OK)
+        status = run_text(s, ranks);
     int64_t objects = 0, bytes = 0;
     if (status == PF_OK)
         status = ask(s, "SELECT count(*) FROM object", &objects);
@@ -192,9 +212,35 @@ static pf_status open_database(spool *s)
 
 /* ---- calls; each takes the mutex ---- */
 
-/* Stores an object inside the open transaction. *stored: it was not there before. */
-static pf_status insert(spool *s, const object *o, bool *stored)
+/* Removes what has to go inside the open transaction. */
+static pf_status evict(spool *s, const object *o, uint64_t *freed, uint32_t *gone)
 {
+    for (uint32_t i = 0; i < o->victims_n; i++) {
+        (void)sqlite3_bind_int64(s->statements[SQL_REMOVE], 1, (int64_t)o->victims[i].row);
+        if (!run(s, SQL_REMOVE))
+            return fail_call(s, "making room");
+        if (sqlite3_changes(s->db) > 0) {
+            *freed += o->victims[i].size;
+            ++*gone;
+        }
+    }
+    return PF_OK;
+}
+
+static pf_status set_rank(spool *s, int64_t row, const pf_spool_rank *rank)
+{
+    sqlite3_stmt *q = s->statements[SQL_RANK];
+    (void)sqlite3_bind_int64(q, 1, row);
+    (void)sqlite3_bind_int64(q, 2, rank->importance);
+    (void)sqlite3_bind_int64(q, 3, rank->number);
+    return run(s, SQL_RANK) ? PF_OK : fail_call(s, "storing");
+}
+
+/* Stores an object inside the open transaction, in which `freed` bytes have been removed. *stored: it was not there
+ * before. */
+static pf_status insert(spool *s, const object *o, uint64_t freed, bool *stored)
+{
+    const uint64_t bytes = s->stats.bytes - freed;
     sqlite3_stmt *has = s->statements[SQL_HAS], *put = s->statements[SQL_PUT];
     *stored = false;
     (void)sqlite3_bind_blob(has, 1, o->name, 32, SQLITE_STATIC);
@@ -205,10 +251,10 @@ static pf_status insert(spool *s, const object *o, bool *stored)
         return PF_OK;
     if (code != SQLITE_DONE)
         return fail_call(s, "storing");
-    if (s->quota != 0 && s->stats.bytes > s->quota - o->n) {
+    if (s->quota != 0 && bytes > s->quota - o->n) {
         s->stats.errors++;
         return pf_fail(&s->failure, PF_ERR_SPACE, "%s: quota: %" PRIu64 " bytes wait, %zu more are above %" PRIu64,
-                       s->path, s->stats.bytes, o->n, s->quota);
+                       s->path, bytes, o->n, s->quota);
     }
     (void)sqlite3_bind_int64(put, 1, o->kind);
     (void)sqlite3_bind_blob(put, 2, o->name, 32, SQLITE_STATIC);
@@ -219,7 +265,7 @@ static pf_status insert(spool *s, const object *o, bool *stored)
     if (!run(s, SQL_PUT))
         return fail_call(s, "storing");
     *stored = true;
-    return PF_OK;
+    return o->rank == NULL ? PF_OK : set_rank(s, sqlite3_last_insert_rowid(s->db), o->rank);
 }
 
 static pf_status set_value(spool *s, const char *key, const void *bytes, size_t n)
@@ -237,14 +283,23 @@ static pf_status set_value(spool *s, const char *key, const void *bytes, size_t 
 static pf_status store(spool *s, const object *o, const char *key, const void *value, size_t value_n)
 {
     bool stored = false;
+    uint64_t freed = 0;
+    uint32_t gone = 0;
     pthread_mutex_lock(&s->mutex);
     pf_status status = run(s, SQL_BEGIN) ? PF_OK : fail_call(s, "storing");
     if (status == PF_OK && o != NULL)
-        status = insert(s, o, &stored);
+        status = evict(s, o, &freed, &gone);
+    if (status == PF_OK && o != NULL)
+        status = insert(s, o, freed, &stored);
     if (status == PF_OK && key != NULL)
         status = set_value(s, key, value, value_n);
     if (status == PF_OK && !run(s, SQL_COMMIT))
         status = fail_call(s, "storing");
+    if (status == PF_OK) {
+        s->stats.objects -= gone;
+        s->stats.bytes -= freed;
+        s->stats.evicted += gone;
+    }
     if (status == PF_OK && stored) {
         s->stats.objects++;
         s->stats.bytes += o->n;
@@ -265,16 +320,61 @@ static pf_status fail_argument(spool *s, const char *text)
     return status;
 }
 
-static pf_status spool_put_and_set(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
-                                   const char *key, const void *value, size_t value_n)
+static pf_status spool_exchange(void *self, const pf_spool_victim *victims, uint32_t count, uint32_t kind,
+                                const uint8_t name[32], const void *bytes, size_t n, const pf_spool_rank *rank,
+                                const char *key, const void *value, size_t value_n)
 {
     spool *s = self;
-    object o = {kind, name, bytes, n};
+    object o = {kind, name, bytes, n, rank, victims, count};
     if (n == 0 || n > UINT32_MAX)
         return fail_argument(s, "an object must have 1..2^32 - 1 bytes");
     if (s->quota != 0 && n > s->quota)
         return fail_argument(s, "an object is larger than the whole quota");
     return store(s, &o, key, value, value_n);
+}
+
+static pf_status spool_put_and_set(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
+                                   const char *key, const void *value, size_t value_n)
+{
+    return spool_exchange(self, NULL, 0, kind, name, bytes, n, NULL, key, value, value_n);
+}
+
+static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, size_t n,
+                               pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX], uint32_t *count)
+{
+    spool *s = self;
+    pf_status status = PF_OK;
+    uint64_t freed = 0;
+    int code = SQLITE_ROW;
+    *count = 0;
+    pthread_mutex_lock(&s->mutex);
+    sqlite3_stmt *q = s->statements[SQL_VICTIMS];
+    (void)sqlite3_bind_int64(q, 1, (int64_t)after);
+    (void)sqlite3_bind_int64(q, 2, importance);
+    (void)sqlite3_bind_int64(q, 3, PF_SPOOL_VICTIMS_MAX);
+    while (freed < n && (code = sqlite3_step(q)) == SQLITE_ROW) {
+        pf_spool_victim *v = &victims[(*count)++];
+        *v = (pf_spool_victim){.row = (uint64_t)sqlite3_column_int64(q, 0),
+                               .number = (uint32_t)sqlite3_column_int64(q, 1),
+                               .size = (uint32_t)sqlite3_column_int64(q, 2)};
+        freed += v->size;
+    }
+    if (code != SQLITE_ROW && code != SQLITE_DONE)
+        status = fail_call(s, "making room");
+    else if (freed < n)
+        status = pf_fail(&s->failure, PF_ERR_SPACE, "%s: full, and nothing in it is less important", s->path);
+    sqlite3_reset(q);
+    pthread_mutex_unlock(&s->mutex);
+    return status;
+}
+
+static pf_status spool_keep_all(void *self)
+{
+    spool *s = self;
+    pthread_mutex_lock(&s->mutex);
+    pf_status status = run(s, SQL_KEEP_ALL) ? PF_OK : fail_call(s, "keeping what is there");
+    pthread_mutex_unlock(&s->mutex);
+    return status;
 }
 
 static pf_status spool_put(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n)
@@ -432,6 +532,9 @@ pf_status pf_spool_open(pf_spool *opened, const pf_spool_config *config, char *e
         .get = spool_get,
         .set = spool_set,
         .put_and_set = spool_put_and_set,
+        .victims = spool_victims,
+        .exchange = spool_exchange,
+        .keep_all = spool_keep_all,
         .stats = spool_get_stats,
         .error = spool_error,
         .close = spool_close,

@@ -216,8 +216,12 @@ def run_status(args: argparse.Namespace) -> Result:
         ("tracks", f"{status.tracks_live} live, {status.tracks_new} new, {status.tracks_lost} lost in the last frame"),
         ("scene", ", ".join(states_of(status.tracking)) or "nothing special"),
         ("lost so far", losses_text(losses_of(status.tracking)) or "none"),
-        ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped"),
-        ("spool", f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"),
+        ("keyframes", f"{status.keyframes} made, {status.keyframes_dropped} dropped, {status.spool.evicted} given up"),
+        (
+            "spool",
+            f"{status.spool.objects} waiting ({size_text(status.spool.bytes)})"
+            + (", in trouble: see the device's log" if status.spool.failing else ""),
+        ),
         (
             "link",
             f"round trip {link.rtt_us / 1000:.1f} ms, {link.crc_errors} damaged frames, "

@@ -175,6 +175,8 @@ static void set_telemetry(pipefish_v1_Telemetry *out, const pf_msg_telemetry *in
     out->has_lamp = in->has_lamp;
     out->lamp = in->lamp;
     out->emergency_stop = in->emergency_stop;
+    out->limit_front = in->limit_front;
+    out->limit_rear = in->limit_rear;
 }
 
 static pipefish_v1_Profile profile_message(const pf_msg_profile *in)
@@ -237,8 +239,9 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     out->stage =
         (pipefish_v1_Status_StageTimes){in->stage.capture,  in->stage.pyramid, in->stage.track,    in->stage.detect,
                                         in->stage.keyframe, in->stage.store,   in->stage.frame_max};
-    out->spool = (pipefish_v1_Status_Spool){in->spool.objects, in->spool.bytes, in->spool.stored,
-                                            in->spool.acknowledged, in->spool.errors};
+    out->spool =
+        (pipefish_v1_Status_Spool){in->spool.objects, in->spool.bytes,   in->spool.stored,    in->spool.acknowledged,
+                                   in->spool.errors,  in->spool.evicted, in->spool.is_failing};
     out->link = (pipefish_v1_Status_Link){.up = in->link_up,
                                           .bytes_out = in->link.bytes_out,
                                           .bytes_in = in->link.bytes_in,

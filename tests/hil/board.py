@@ -19,12 +19,23 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "build" / "board"
 PROGRAMS = ROOT / "build" / "arm64"
-BOOT_S, COMMAND_S = 25, 60
+PACKAGES = ROOT / "build" / "deb"
+BOOT_S, COMMAND_S = 120, 120
 DISK_BYTES = 256 << 20
 
 
 class BoardError(AssertionError):
     """The board did not do what it was told, with what it said."""
+
+
+def find_daemon(folder: Path) -> Path:
+    """The daemon of the arm64 package as dpkg lays it out, if that is made of the last build; else as it was built."""
+    built = PROGRAMS / "firmware/pipefishd"
+    packages = [p for p in PACKAGES.glob("pipefishd_*_arm64.deb") if p.stat().st_mtime >= built.stat().st_mtime]
+    if not packages:
+        return built
+    subprocess.run(["dpkg-deb", "-x", packages[-1], folder / "package"], check=True)
+    return folder / "package/usr/bin/pipefishd"
 
 
 class UsbSerial:
@@ -104,8 +115,8 @@ class Board:
         self.folder, self.port = folder, port
         self.share = folder / "share"
         self.share.mkdir(parents=True)
-        for program in ("firmware/pipefishd", "tests/hil/pipefish-world"):
-            shutil.copy(PROGRAMS / program, self.share)
+        shutil.copy(PROGRAMS / "tests/hil/pipefish-world", self.share)
+        shutil.copy(find_daemon(folder), self.share)
         self.disk = folder / "disk.img"
         with self.disk.open("wb") as disk:
             disk.truncate(DISK_BYTES)
@@ -145,6 +156,7 @@ class Board:
             ),
             *("-device", "qemu-xhci", "-chardev", f"socket,id=usb,path={self.folder}/usb.sock,server=on,wait=off"),
             *("-device", "usb-serial,chardev=usb"),
+            *("-device", "i6300esb"),  # a watchdog; with -no-reboot a reset ends QEMU
         ]
 
     def power_on(self) -> float:
@@ -213,6 +225,17 @@ class Board:
             self._qemu.kill()
             self._qemu.wait()
             self._qemu = None
+
+    def wait_for_reset(self, timeout: float) -> float:
+        """Until the board has reset itself, which leaves it off; the seconds that took."""
+        start = time.monotonic()
+        try:
+            code = self._qemu.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise BoardError("the board does not reset: " + self.console()) from error
+        self.power_cut()
+        assert code == 0, f"QEMU failed with code {code}"
+        return time.monotonic() - start
 
     def close(self) -> None:
         self.power_cut()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import json
 import os
 import signal
 import socket
@@ -23,7 +24,13 @@ from pipefish.survey import Survey
 PIPEFISH = Path(sys.executable).with_name("pipefish")
 HOST_DAEMON = ROOT / "build" / "release" / "firmware" / "pipefishd"
 FRAME = b"FRAME\n"
+# Settings that a replay on the host has no use for.
+BOARD_ONLY = (
+    *("gpio.", "camera.device", "camera.format", "camera.buffers"),
+    *("link.device", "link.baud", "link.trust", "link.address"),
+)
 SETTINGS = {
+    "camera.driver": "v4l2",
     "camera.profile": "{folder}/crawl.profile",
     "tracker.max_tracks": "80",
     "keyframe.parallax_deg": "3",
@@ -89,6 +96,7 @@ class Crawl:
         self.output = folder / "survey.mcap"
         self.daemon = 0
         self.starts = 0
+        self.environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "host")}
         self._receiver: subprocess.Popen[bytes] | None = None
         for suffix in ("y4m", "profile"):
             target = board.share / f"crawl.{suffix}"
@@ -101,11 +109,25 @@ class Crawl:
         lines = {**self.settings, **settings}
         return [f"{key}={value.format(folder=folder)}" for key, value in lines.items()]
 
+    def pair(self) -> str:
+        """Lets this host in over the network, as the board's owner does on its console; what to receive from."""
+        key = self._pipefish("pair", "--json")["host"]["key"]
+        trust = self.settings["link.trust"]
+        said = self.board.run(
+            ": > /run/empty.ini; /mnt/pipefishd --config /run/empty.ini --set camera.driver=v4l2 "
+            f'--set link.trust={trust} --pair "operator {key} hil"'
+        )
+        self._pipefish("pair", "--json", "--device-key", said.split()[-1], "--device-name", "board")
+        return f"tls://127.0.0.1:{self.board.port}"
+
+    def _pipefish(self, *arguments: str) -> dict:
+        done = subprocess.run([PIPEFISH, *arguments], env=self.environment, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)
+
     def start_daemon(self) -> None:
         """The arm64 daemon, its spool on the board's disk and its frame index in the shared folder."""
         self.board.run("mkdir -p /mnt/index; : > /run/empty.ini")
         settings = {
-            "camera.driver": "v4l2",
             "camera.index": "/mnt/index",
             "spool.path": "/data/spool.db",
             "daemon.status_file": "/run/status.json",
@@ -117,7 +139,7 @@ class Crawl:
         )
         self.starts += 1
 
-    def wait_for(self, text: str, timeout: float = 20) -> float:
+    def wait_for(self, text: str, timeout: float = 80) -> float:
         """Until the daemon's log of this start has `text`; the seconds that took."""
         start = time.monotonic()
         log = self.board.share / f"daemon{self.starts - 1}.log"
@@ -127,7 +149,7 @@ class Crawl:
             time.sleep(0.05)
         return time.monotonic() - start
 
-    def wait_until(self, condition, what: str, timeout: float = 30) -> float:
+    def wait_until(self, condition, what: str, timeout: float = 120) -> float:
         """Until condition(status) of the daemon's status file; the seconds that took."""
         start = time.monotonic()
         while not condition(self.board.status()):
@@ -150,14 +172,17 @@ class Crawl:
     def start_receiver(self, device: str) -> None:
         with (self.folder / "receive.log").open("ab") as log:
             self._receiver = subprocess.Popen(
-                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "60"], stdout=log, stderr=log
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "150"],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
             )
 
     def kill_receiver(self) -> None:
         self._receiver.send_signal(signal.SIGKILL)
         self._receiver.wait()
 
-    def finish(self, timeout: float = 60) -> Survey:
+    def finish(self, timeout: float = 180) -> Survey:
         """Waits for the receiver; the survey it got."""
         try:
             code = self._receiver.wait(timeout)
@@ -210,15 +235,13 @@ class Crawl:
         (folder / "empty.ini").touch()
         command = [HOST_DAEMON, "--config", folder / "empty.ini"]
         for argument in self._arguments(settings, str(self.board.share)):
-            if not argument.startswith(
-                ("gpio.", "link.device", "link.baud", "camera.device", "camera.format", "camera.buffers")
-            ):
+            if not argument.startswith(BOARD_ONLY):
                 command += ["--set", argument]
         with (folder / "daemon.log").open("wb") as log:
             daemon = subprocess.Popen(command, stderr=log)
         try:
             receive = [PIPEFISH, "receive", f"tcp://127.0.0.1:{port}", "-o", folder / "replay.mcap"]
-            subprocess.run(receive, check=True, capture_output=True, timeout=60)
+            subprocess.run(receive, check=True, capture_output=True, timeout=180)
             daemon.wait(30)
         finally:
             daemon.kill()

@@ -8,12 +8,17 @@ from __future__ import annotations
 import time
 
 from crawl import Result
+from usb_camera import ADDRESS, UsbCamera
 
 LOOPBACK = "modprobe v4l2loopback devices=1 exclusive_caps=0 max_buffers=32"
 RATE = 5
 SERIAL = {"link__transport": "serial", "link__device": "/dev/ttyUSB0", "link__baud": "3000000"}
 # v4l2loopback writes into buffers that are still in use, sooner the fewer there are.
 SIZE = {"camera__device": "/dev/video0", "camera__width": "320", "camera__height": "240", "camera__buffers": "32"}
+
+
+# The board's only port that the host reaches, TLS on it: the network of a real crawler.
+TLS = {"link__transport": "tls", "link__address": "0.0.0.0", "link__port": "7448", "link__trust": "/data/trust"}
 
 
 def usb(survey) -> str:
@@ -62,23 +67,37 @@ def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
     end(survey, note, "serial adapter unplugged", recovery)
 
 
-def test_a_killed_daemon_goes_on_with_its_survey(crawl, note):
-    survey = begin(crawl)
+def begin_tls(crawl):
+    """A survey over the network that is waiting for its camera, with a host that was let in."""
+    survey = crawl(**{**TLS, **SIZE})
+    survey.board.run(LOOPBACK)
+    device = survey.pair()
+    survey.start_daemon()
+    survey.wait_for("begins")
+    survey.start_receiver(device)
+    survey.wait_until(lambda s: s.get("link", {}).get("up"), "the host let in")
+    return survey
+
+
+def test_a_killed_daemon_goes_on_with_its_survey_over_tls(crawl, note):
+    survey = begin_tls(crawl)
     world = survey.show(0, 45, RATE, "/dev/video0")
     survey.wait_until(frames(20), "20 frames")
     survey.board.run(f"kill -9 {survey.daemon}")
     killed = time.monotonic()
     survey.start_daemon()
-    survey.wait_for("goes on", 30)
+    survey.wait_for("goes on")
     survey.wait_until(frames(3), "frames again")
     recovery = time.monotonic() - killed
     survey.board.wait(world)
-    end(survey, note, "daemon killed", recovery)
+    network = survey.board.status()["network"]
+    assert network["role"] == "operator" and network["sessions"] >= 1 and network["refused_handshake"] == 0, network
+    end(survey, note, "daemon killed, over TLS", recovery)
     assert len(survey.indices()) == 2
 
 
-def test_a_power_cut_loses_nothing_that_was_acknowledged(crawl, note):
-    survey = begin(crawl)
+def test_a_power_cut_loses_nothing_that_was_acknowledged_over_tls(crawl, note):
+    survey = begin_tls(crawl)
     survey.show(0, 25, RATE, "/dev/video0")
     survey.wait_until(lambda s: s.get("spool", {}).get("acknowledged", 0) >= 4, "acknowledged keyframes")
     survey.board.power_cut()
@@ -91,7 +110,7 @@ def test_a_power_cut_loses_nothing_that_was_acknowledged(crawl, note):
     survey.wait_until(frames(1), "frames again")
     recovery = time.monotonic() - start
     survey.board.wait(world)
-    end(survey, note, "power cut", recovery)
+    end(survey, note, "power cut, over TLS", recovery)
     assert len(survey.indices()) == 2
 
 
@@ -122,6 +141,23 @@ def test_a_network_that_goes_away_and_a_host_that_is_killed_lose_nothing(crawl, 
     read = [(k.encoder_count, turned[k.message.frame_sha256.hex()]) for k in survey.received.keyframes]
     # v4l2loopback may hand the first frame over late, stamped with that moment.
     assert all(got == made for got, made in read[1:]) and read[-1][0] > 300, read
+
+
+def test_the_watchdog_resets_a_board_whose_daemon_hangs_and_no_other(crawl):
+    watchdog = {"daemon__watchdog": "/dev/watchdog", "daemon__watchdog_s": "3", "daemon__drain_s": "0"}
+    survey = crawl(**{**SERIAL, **SIZE, **watchdog})
+    board = survey.board
+    board.run(f"{LOOPBACK}; modprobe i6300esb")
+    survey.start_daemon()
+    survey.wait_for("begins")
+    board.run("sleep 4")  # one that is well is let be
+    survey.stop_daemon()
+    board.wait(survey.daemon)
+    board.run("sleep 4")  # so is a board whose daemon ended of itself
+    survey.start_daemon()
+    survey.wait_for("begins")
+    board.run(f"kill -STOP {survey.daemon}")
+    board.wait_for_reset(60)
 
 
 GPIO = {
@@ -196,6 +232,7 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     assert read[-1][0] > 100
     assert received.keyframes[-1].telemetry["emergency_stop"]
     assert "emergency_stop" not in received.keyframes[0].telemetry
+    assert received.keyframes[-1].telemetry["limit_front"] and "limit_front" not in received.keyframes[0].telemetry
     assert received.keyframes[0].telemetry["lamp"] == 1 and received.keyframes[-1].telemetry["lamp"] == 0
     assert result.keyframes_out > 10
 
@@ -235,7 +272,7 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     for fault in FAULTS:
         before = board.status()["frames"]
         board.run("; ".join(f"v4l2-ctl -d0 -c {name}=1" for name in fault.split()))
-        survey.wait_until(frames(before + 5), f"frames after {fault}", 20)
+        survey.wait_until(frames(before + 5), f"frames after {fault}")
     board.run("rm /run/camera; v4l2-ctl -d0 -c disconnect=1")
     survey.wait_for("no camera")
     board.run(f"kill {world}", check=False)
@@ -248,3 +285,58 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     status = board.status()
     assert status["camera"]["damaged"] >= 1 and status["camera"]["restarts"] >= 1 and status["camera"]["reopens"] >= 1
     end(survey, note, "camera faults, unplugged", recovery, with_noise=True)
+
+
+VHCI = "/sys/devices/platform/vhci_hcd.0"
+
+
+def plug_usb_camera(board, port: int) -> None:
+    """Hands the camera's socket to the kernel, as usbip does: the shell that writes has it as its standard input."""
+    script = f"#!/bin/sh\\necho 0 0 {ADDRESS} > {VHCI}/attach\\n"
+    board.run(f"printf '{script}' > /run/attach; chmod +x /run/attach; nc 10.0.2.2 {port} -e /run/attach")
+
+
+def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
+    camera = {"camera__driver": "libcamera", "camera__exposure": "device", "tracker__reset_gap": "100000"}
+    size = {"camera__width": "320", "camera__height": "240", "camera__device": "1209:0001"}
+    survey = crawl(**{**SERIAL, **size, **camera}, status__interval_ms="100")
+    board = survey.board
+    board.run("/lib/systemd/systemd-udevd --daemon 2>/dev/null; modprobe vimc; modprobe vhci-hcd; modprobe uvcvideo")
+    board.run("modprobe vhci-node; udevadm trigger -s media -s video4linux; udevadm settle")
+    # The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours.
+    vimc = "camera.driver=libcamera camera.device=vimc camera.width=318 camera.height=240 spool.path=/run/spool.db"
+    extra = "daemon.status_file=/run/status.json status.interval_ms=100 daemon.drain_s=0"
+    flags = " ".join(f"--set {setting}" for setting in f"{vimc} {extra}".split())
+    pattern = board.spawn(f": > /run/vimc.ini; exec /mnt/pipefishd --config /run/vimc.ini {flags}", "vimc.log")
+    survey.wait_until(frames(10), "frames of vimc")
+    status = board.status()
+    assert status["tracks_live"] > 20 and status["camera"]["bad_stamps"] == 0, status
+    board.run(f"kill {pattern}; rm /run/status.json")
+    board.wait(pattern)
+    # A USB camera, plugged in after the daemon has started, unplugged, and silent for longer than a stream may be.
+    pixels = [survey.recording.frames[name] for name in survey.recording.order]
+    usb_camera = UsbCamera(pixels, 320, 240, 30)
+    try:
+        survey.start_receiver(usb(survey))
+        survey.start_daemon()
+        survey.wait_for("begins")
+        usb_camera.show(0, 15, RATE)
+        plug_usb_camera(board, usb_camera.port)
+        survey.wait_until(frames(8), "8 frames")
+        board.run(f"echo 0 > {VHCI}/detach")
+        survey.wait_for("no camera")
+        plug_usb_camera(board, usb_camera.port)
+        survey.wait_for("the camera is there")
+        usb_camera.wait(120)
+        survey.wait_until(lambda s: s["camera"]["restarts"] >= 1, "a restart of the silent stream")
+        before = board.status()["frames"]
+        start = time.monotonic()
+        usb_camera.show(15, 25, RATE)
+        survey.wait_until(frames(before + 1), "frames again")
+        recovery = time.monotonic() - start
+        usb_camera.wait(120)
+        result = end(survey, note, "libcamera: unplugged, stalled", recovery)
+    finally:
+        usb_camera.close()
+    # The camera's clock is the host's: a board that is emulated slowly drops frames, and counts them.
+    assert result.frames_in > 8 and result.keyframes_out > 4

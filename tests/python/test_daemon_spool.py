@@ -26,7 +26,7 @@ def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
     assert "spool.quota_mb = 0.05: an object of this camera may have" in done.stderr
 
 
-def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path: Path, crawler: Crawler):
+def test_a_full_spool_makes_a_live_survey_give_up_the_least_important_and_name_them(tmp_path: Path, crawler: Crawler):
     write_recording(tmp_path / "survey.y4m", 40, rate=20)
     store = Store(crawler.port)
     crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
@@ -37,7 +37,12 @@ def test_a_full_spool_makes_a_live_survey_drop_keyframes_and_name_them(tmp_path:
     assert lost
     assert lost & got == set()
     assert lost | got == set(range(end_message.keyframes))
-    assert crawler.status()["keyframes_dropped"] == len(lost)
+    status = crawler.status()
+    assert status["keyframes_dropped"] + status["spool"]["evicted"] == len(lost)
+    assert status["spool"]["evicted"] >= 3
+    # What is left is spread over the survey: the even ones are kept longest, and the first one always.
+    assert 0 in got and max(got) - min(got) > len(got) * 2
+    assert len([i for i in lost if i % 2]) > len(lost) / 2
 
 
 # ---- kill -9

@@ -5,6 +5,7 @@
 #include "link_world.h"
 #include "unity.h"
 
+#include <inttypes.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -203,6 +204,62 @@ static void test_resume_does_not_resend_what_arrived(void)
     TEST_ASSERT_EQUAL_UINT32(1, w.apps[1].offers); /* and nobody was asked again */
 }
 
+/* ---- everything at once ---- */
+
+/* 1..most, as likely between 1 and 2 as between most / 2 and most. */
+static uint32_t random_scale(uint32_t most)
+{
+    uint32_t octaves = 0, value;
+    while (most >> octaves > 1)
+        octaves++;
+    value = (1u << (uint32_t)world_random(&w, octaves)) + (uint32_t)world_random(&w, most / 2);
+    value >>= (uint32_t)world_random(&w, octaves);
+    return value < 1 ? 1 : value > most ? most : value;
+}
+
+/* A session with faults of every kind, each present in half of them: frames lost (up to 30 %), bits flipped in one byte
+ * of 1,000,000 to 1,000, bursts lost, frames twice and in another order, outages of up to 6 s and either end started
+ * anew.
+ */
+static void run_session(uint64_t seed)
+{
+    begin_random(seed, &(pf_sim_faults){0});
+    pf_sim_faults f = {0};
+    uint64_t kinds = world_random(&w, 64);
+    if (kinds & 1)
+        f.frame_loss_ppm = (uint32_t)world_random(&w, 300001);
+    if (kinds & 2)
+        f.corrupt_ppm = random_scale(1000);
+    if (kinds & 4) {
+        f.drop_ppm = random_scale(100);
+        f.drop_burst = random_scale(400);
+    }
+    if (kinds & 8)
+        f.duplicate_ppm = (uint32_t)world_random(&w, 100000);
+    if (kinds & 16)
+        f.reorder_ppm = (uint32_t)world_random(&w, 100000);
+    pf_sim_line_set_faults(w.line, &f);
+    for (uint32_t outages = kinds & 32 ? 1 + (uint32_t)world_random(&w, 3) : 0; outages > 0; outages--) {
+        world_pass(&w, world_random(&w, 1500) * WORLD_MS);
+        pf_sim_line_connect(w.line, false);
+        world_pass(&w, world_random(&w, 6000) * WORLD_MS);
+        if (world_random(&w, 3) == 0)
+            world_restart(&w, (uint32_t)world_random(&w, 2));
+        pf_sim_line_connect(w.line, true);
+    }
+    expect_done(seed, 600000 * WORLD_MS);
+}
+
+static uint64_t first_session = 1000,
+                sessions = 60; /* PIPEFISH_TEST_SESSIONS="first count" runs these and nothing else */
+
+static void test_sessions_with_faults_of_every_kind(void)
+{
+    for (uint64_t i = 0; i < sessions; i++)
+        run_session(first_session + i);
+    printf("sessions: %llu\n", (unsigned long long)sessions);
+}
+
 /* ---- answers ---- */
 
 static void test_receiver_refuses_and_asks_again(void)
@@ -276,13 +333,19 @@ int main(void)
 {
     const char *text = getenv("PIPEFISH_TEST_SEED");
     base = text ? strtoull(text, NULL, 10) : 0;
+    const char *only = getenv("PIPEFISH_TEST_SESSIONS");
     UNITY_BEGIN();
+    if (only != NULL && sscanf(only, "%" SCNu64 " %" SCNu64, &first_session, &sessions) == 2) {
+        RUN_TEST(test_sessions_with_faults_of_every_kind);
+        return UNITY_END();
+    }
     RUN_TEST(test_clean_line_delivers_everything_and_repeats_nothing);
     RUN_TEST(test_frames_lost_up_to_30_percent);
     RUN_TEST(test_bytes_corrupted_and_dropped_in_bursts);
     RUN_TEST(test_duplicated_and_reordered_frames);
     RUN_TEST(test_random_cuts_with_reset_of_one_or_both_ends);
     RUN_TEST(test_random_restarts_of_either_end);
+    RUN_TEST(test_sessions_with_faults_of_every_kind);
     RUN_TEST(test_silence_brings_the_link_down_and_up_again);
     RUN_TEST(test_peer_that_reset_alone_is_taken_back_without_a_new_session);
     RUN_TEST(test_resume_does_not_resend_what_arrived);

@@ -62,7 +62,7 @@ static pf_msg_status sample_status(void)
                        .keyframes_dropped = 8,
                        .fps = 29.5,
                        .stage = {1, 2, 3, 4, 5, 6, 7},
-                       .spool = {11, 12, 13, 14, 16},
+                       .spool = {11, 12, 13, 14, 16, 17, true},
                        .link_up = true,
                        .telemetry = sample_telemetry(),
                        .uptime_ns = 99,
@@ -488,7 +488,9 @@ static void test_largest_status_fits_a_control_message(void)
     size_t n = 0;
     pf_msg_status s;
     pf_msg_reply reply = {.id = UINT32_MAX, .error = "", .status = &s};
-    memset(&s, 0xFF, sizeof s);
+    memset(&s, 0x7F, sizeof s); /* counters of 63 bits: 292 years of nanoseconds */
+    s.spool.is_failing = true;
+    s.telemetry.limit_front = s.telemetry.limit_rear = true;
     s.state = "surveying";
     s.link_up = s.has_clock = s.telemetry.has_encoder = s.telemetry.has_attitude = s.telemetry.has_exposure = true;
     s.telemetry.has_gain = s.telemetry.has_lamp = s.telemetry.emergency_stop = true;

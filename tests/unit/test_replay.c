@@ -523,12 +523,13 @@ static void test_gpio_none(void)
     double level;
     int64_t count;
     uint32_t missed;
-    bool is_stopped;
+    pf_gpio_state state;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_gpio_none_open(&gpio));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->set_lamp(gpio.self, 0.5));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->lamp(gpio.self, &level));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->encoder(gpio.self, 0, &count, &missed));
-    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, gpio.ops->stopped(gpio.self, &is_stopped));
+    gpio.ops->state(gpio.self, &state);
+    TEST_ASSERT_FALSE(state.has_stop || state.is_stopped || state.limits != 0);
     gpio.ops->close(gpio.self);
 }
 

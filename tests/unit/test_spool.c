@@ -512,6 +512,178 @@ static void test_full_medium(void)
     }
 }
 
+/* ---- what has to go */
+
+static pf_status put_ranked(uint64_t id, uint32_t importance, const pf_spool_victim *victims, uint32_t count)
+{
+    const pf_spool_rank rank = {importance, (uint32_t)id};
+    size_t n = make_object(id);
+    return spool.ops->exchange(spool.self, victims, count, 2, object_name, object_bytes, n, &rank, "last", &id,
+                               sizeof id);
+}
+
+/* Proves: victims are the least important, of equals the oldest, as few as are enough, none of those without a rank,
+ * above the given importance or up to the given row; an exchange is one transaction, also when it fails; ranks outlive
+ * reopening and go with their objects; a file of a program without ranks gets them. */
+static void test_victims_are_the_least_important_then_the_oldest(void)
+{
+    static const uint32_t importance[] = {3, 1, 0, 1, 0}; /* of ids 1..5; 6 has none */
+    pf_spool_victim v[PF_SPOOL_VICTIMS_MAX];
+    uint32_t count;
+    uint64_t bytes = 0;
+    open_spool("ranks.db", 0);
+    close_spool();
+    run_sql(temporary_path("ranks.db"), "DROP TRIGGER evictable_gone; DROP TABLE evictable");
+    for (uint64_t id = 1; id <= 6; id++)
+        bytes += make_object(id);
+    open_spool("ranks.db", bytes);
+    for (uint64_t id = 1; id <= 5; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put_ranked(id, importance[id - 1], NULL, 0));
+    TEST_ASSERT_EQUAL_INT(PF_OK, put(6));
+    close_spool();
+    open_spool("ranks.db", bytes);
+    static const uint32_t order[] = {3, 5, 2, 4, 1};
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->victims(spool.self, 0, 9, (size_t)bytes, v, &count));
+    size_t all = (size_t)(bytes - make_object(6));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->victims(spool.self, 0, 9, all, v, &count));
+    TEST_ASSERT_EQUAL_UINT32(5, count);
+    for (uint32_t i = 0; i < 5; i++)
+        TEST_ASSERT_EQUAL_UINT32(order[i], v[i].number);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->victims(spool.self, 3, 9, 1, v, &count)); /* ids 1..3 are rows 1..3 */
+    TEST_ASSERT_EQUAL_UINT32(1, count);
+    TEST_ASSERT_EQUAL_UINT32(5, v[0].number);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->victims(spool.self, 0, 0, 1, v, &count));
+    TEST_ASSERT_EQUAL_UINT32(3, v[0].number);
+    /* One that would not fit even so: nothing has gone. */
+    static const uint8_t big[OBJECT_MAX];
+    pf_sha256(big, sizeof big, object_name);
+    if (sizeof big > make_object(3)) {
+        pf_sha256(big, sizeof big, object_name);
+        TEST_ASSERT_EQUAL_INT(
+            PF_ERR_SPACE, spool.ops->exchange(spool.self, v, 1, 2, object_name, big, sizeof big, NULL, "last", "", 0));
+        TEST_ASSERT_EQUAL_UINT64(6, stats().objects);
+        TEST_ASSERT_EQUAL_UINT64(bytes, stats().bytes);
+    }
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->victims(spool.self, 0, 2, make_object(7), v, &count));
+    TEST_ASSERT_EQUAL_INT(PF_OK, put_ranked(7, 2, v, count));
+    TEST_ASSERT_EQUAL_UINT64(count, stats().evicted);
+    TEST_ASSERT_EQUAL_UINT64(7 - count, stats().objects);
+    TEST_ASSERT_TRUE(stats().bytes <= bytes);
+    close_spool();
+    open_spool("ranks.db", bytes);
+    TEST_ASSERT_EQUAL_UINT64(7 - count, stats().objects);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, 1));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->victims(spool.self, 0, 9, 1, v, &count));
+    TEST_ASSERT_TRUE(v[0].number != 1 && v[0].number != 3);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->keep_all(spool.self));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->victims(spool.self, 0, 9, 1, v, &count));
+}
+
+/* ---- a medium that refuses: SQLite's own way to put other system calls in place */
+
+static int refuse_with;  /* errno of every write; 0 = none fails */
+static uint64_t allowed; /* writes before that */
+
+static bool refuses(void)
+{
+    if (refuse_with == 0 || (allowed > 0 && allowed--))
+        return false;
+    errno = refuse_with;
+    return true;
+}
+
+static ssize_t write_or_not(int fd, const void *bytes, size_t n)
+{
+    return refuses() ? -1 : write(fd, bytes, n);
+}
+
+static ssize_t pwrite_or_not(int fd, const void *bytes, size_t n, off_t at)
+{
+    return refuses() ? -1 : pwrite(fd, bytes, n, at);
+}
+
+static int fallocate_or_not(int fd, off_t at, off_t n)
+{
+    return refuses() ? errno : posix_fallocate(fd, at, n);
+}
+
+static int ftruncate_or_not(int fd, off_t n)
+{
+    return refuses() ? -1 : ftruncate(fd, n);
+}
+
+static void hook(const char *name, sqlite3_syscall_ptr call)
+{
+    sqlite3_vfs *vfs = sqlite3_vfs_find(NULL);
+    (void)vfs->xSetSystemCall(vfs, name, call);
+}
+
+/* Proves: on a medium that is full, read-only or broken from any write on, nothing that was reported as stored is lost,
+ * nothing that was reported as removed comes back, each failure is said and counted, and all goes on once it takes
+ * writes again; also when the program ends meanwhile. */
+static void test_a_medium_that_refuses_writes_loses_nothing(void)
+{
+    static const int errors[] = {ENOSPC, EROFS, EIO};
+    hook("write", (sqlite3_syscall_ptr)write_or_not);
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_or_not);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_or_not);
+    hook("fallocate", (sqlite3_syscall_ptr)fallocate_or_not);
+    hook("ftruncate", (sqlite3_syscall_ptr)ftruncate_or_not);
+    uint64_t refused = 0;
+    for (uint64_t round = 0; round < 3 * 40; round++) {
+        char name[32];
+        bool is_there[40] = {false};
+        uint64_t errors_before, row = 0, n = 0;
+        pf_spool_item item;
+        (void)snprintf(name, sizeof name, "refuse%u.db", (unsigned)round);
+        open_spool(name, 0);
+        refuse_with = 0;
+        for (uint64_t id = 1; id <= 8; id++)
+            is_there[id] = put(id) == PF_OK;
+        errors_before = stats().errors;
+        allowed = round / 3 * 3;
+        refuse_with = errors[round % 3];
+        for (uint64_t id = 9; id <= 24; id++) {
+            pf_status status = put(id);
+            is_there[id] = status == PF_OK;
+            TEST_ASSERT_TRUE(status == PF_OK || status == PF_ERR_SPACE || status == PF_ERR_IO);
+            if (status != PF_OK)
+                TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), name));
+            refused += status != PF_OK;
+            if (id % 4 == 0 && spool.ops->next(spool.self, 0, &item) == PF_OK) {
+                uint64_t oldest = check_item(&item);
+                if (spool.ops->remove(spool.self, item.row) == PF_OK)
+                    is_there[oldest] = false;
+            }
+        }
+        TEST_ASSERT_TRUE(stats().errors >= errors_before + (is_there[24] ? 0 : 1));
+        if (round % 2 == 0) { /* it ends while nothing can be written */
+            close_spool();
+            refuse_with = 0;
+            open_spool(name, 0);
+        }
+        refuse_with = 0;
+        for (uint64_t id = 30; id < 34; id++) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+            is_there[id] = true;
+        }
+        close_spool();
+        open_spool(name, 0);
+        for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
+            uint64_t id = check_item(&item);
+            TEST_ASSERT_TRUE_MESSAGE(is_there[id], "removed, or refused, and there");
+            is_there[id] = false;
+        }
+        for (uint64_t id = 0; id < 40; id++)
+            TEST_ASSERT_FALSE_MESSAGE(is_there[id], "reported as stored, and lost");
+        TEST_ASSERT_EQUAL_UINT64(n, stats().objects);
+        close_spool();
+    }
+    TEST_ASSERT_TRUE(refused > 500);
+    for (size_t i = 0; i < 5; i++)
+        hook(((const char *[]){"write", "pwrite", "pwrite64", "fallocate", "ftruncate"})[i], NULL);
+}
+
 int main(void)
 {
     temporary_make();
@@ -526,6 +698,8 @@ int main(void)
     RUN_TEST(test_second_opener_is_refused);
     RUN_TEST(test_damaged_spool_never_gives_wrong_bytes);
     RUN_TEST(test_full_medium);
+    RUN_TEST(test_victims_are_the_least_important_then_the_oldest);
+    RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);
     temporary_remove();
     return UNITY_END();
 }

@@ -1,6 +1,7 @@
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/link.h"
 #include "store.h"
+#include "temporary.h"
 #include "unity.h"
 
 #include <poll.h>
@@ -30,11 +31,15 @@ static bool fails(int *count)
     return *count > 0 && (*count)--;
 }
 
-static pf_status put_and_set(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
-                             const char *key, const void *value, size_t value_n)
+static pf_status exchange(void *self, const pf_spool_victim *victims, uint32_t count, uint32_t kind,
+                          const uint8_t name[32], const void *bytes, size_t n, const pf_spool_rank *rank,
+                          const char *key, const void *value, size_t value_n)
 {
     pf_status status = PF_OK;
     (void)self;
+    (void)victims;
+    (void)count;
+    (void)rank;
     (void)key;
     (void)pthread_mutex_lock(&fake.mutex);
     if (fake.is_full) {
@@ -101,6 +106,24 @@ static pf_status remove_object(void *self, uint64_t row)
     return status;
 }
 
+static pf_status victims(void *self, uint64_t after, uint32_t importance, size_t n,
+                         pf_spool_victim found[PF_SPOOL_VICTIMS_MAX], uint32_t *count)
+{
+    (void)self;
+    (void)after;
+    (void)importance;
+    (void)n;
+    (void)found;
+    *count = 0;
+    return PF_ERR_SPACE;
+}
+
+static pf_status keep_all(void *self)
+{
+    (void)self;
+    return PF_OK;
+}
+
 static void get_stats(void *self, pf_spool_stats *stats)
 {
     (void)self;
@@ -120,7 +143,9 @@ static const char *get_error(void *self)
 static const pf_spool_ops ops = {.next = next,
                                  .read = read_object,
                                  .remove = remove_object,
-                                 .put_and_set = put_and_set,
+                                 .victims = victims,
+                                 .exchange = exchange,
+                                 .keep_all = keep_all,
                                  .stats = get_stats,
                                  .error = get_error};
 static pf_store *store;
@@ -304,13 +329,113 @@ static void test_flush_and_quit_count_what_is_lost(void)
     pf_store_close(store);
 }
 
+/* ---- eviction, with the real spool */
+
+enum { MADE = 100, ROOM = 20, EVENT = 33 };
+
+/* The keyframes that a host would get from a spool, in order; the object in `slot` last. */
+static uint32_t list_spool(const pf_spool *real, uint8_t *indices)
+{
+    pf_spool_item item = {.row = 0};
+    uint32_t count = 0;
+    while (real->ops->next(real->self, item.row, &item) == PF_OK) {
+        uint8_t bytes[BYTES_MAX];
+        size_t n;
+        TEST_ASSERT_EQUAL_INT(PF_OK, real->ops->read(real->self, item.row, bytes, sizeof bytes, &n));
+        indices[count++] = bytes[1];
+    }
+    return count;
+}
+
+static bool is_lost(const pf_survey *survey, uint32_t index)
+{
+    for (uint32_t i = 0; i < survey->lost_ranges; i++)
+        if (index >= survey->lost_first[i] && index - survey->lost_first[i] < survey->lost_count[i])
+            return true;
+    return false;
+}
+
+/* Proves: a live survey that outgrows its quota keeps the keyframes at which something happened and, of the others,
+ * those that are spread over all of it, none of those that are being sent gone; every keyframe is in the spool or named
+ * as lost, never both, in the same transaction. Once the survey is over, what is left of it is not touched by the next.
+ */
+static void test_a_full_spool_gives_up_the_least_important(void)
+{
+    pf_spool real;
+    pf_survey survey = {.boots = 1};
+    const pf_spool_config quota = {temporary_path("evict.db"), ROOM * 100};
+    pf_store_config config = {.jobs = 4, .slots = 2, .capacity = BYTES_MAX, .wake_fd = wake_fd};
+    char error[256];
+    uint8_t there[MADE], value[PF_SURVEY_BYTES], expected[PF_SURVEY_BYTES];
+    size_t value_n;
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_spool_open(&real, &quota, error, sizeof error));
+    TEST_ASSERT_TRUE_MESSAGE(pf_store_open(&store, &real, &survey, &config, error, sizeof error), error);
+    for (uint32_t i = 0; i < MADE; i++) {
+        pf_job *job = pf_store_take(store);
+        TEST_ASSERT_NOT_NULL(job);
+        job->kind = PF_OBJECT_KEYFRAME;
+        job->index = i;
+        job->is_event = i == 0 || i == EVENT;
+        job->n = 100;
+        memset(job->bytes, 0x10, 100);
+        job->bytes[1] = (uint8_t)i;
+        pf_store_give(store, job);
+        pf_store_settle(store);
+        if (i == 1) { /* two are on their way to the host from now on */
+            TEST_ASSERT_EQUAL_UINT64(1, wait_for_slot()->item.row);
+            TEST_ASSERT_EQUAL_UINT64(2, wait_for_slot()->item.row);
+        }
+    }
+    pf_store_get_survey(store, &survey);
+    const pf_store_stats s = stats();
+    close_store();
+    uint32_t n = list_spool(&real, there), at = 0, most_gap = 0;
+    TEST_ASSERT_EQUAL_UINT32(ROOM, n);
+    TEST_ASSERT_EQUAL_UINT64(MADE - ROOM, s.spool.evicted + s.keyframes_dropped);
+    TEST_ASSERT_TRUE(s.spool.evicted >= ROOM);
+    for (uint32_t i = 0; i < MADE; i++) {
+        bool is_there = at < n && there[at] == i;
+        TEST_ASSERT_TRUE_MESSAGE(is_there != is_lost(&survey, i), "in the spool, or named as lost");
+        if (i <= 1 || i == EVENT)
+            TEST_ASSERT_TRUE_MESSAGE(is_there, "an event, or on its way");
+        if (is_there && at > 0 && (uint32_t)(there[at] - there[at - 1]) > most_gap)
+            most_gap = there[at] - there[at - 1];
+        at += is_there;
+    }
+    TEST_ASSERT_TRUE_MESSAGE(most_gap <= 8, "100 keyframes in the room of 20: spread, not cut off");
+    TEST_ASSERT_EQUAL_INT(PF_OK, real.ops->get(real.self, PF_SURVEY_KEY, value, sizeof value, &value_n));
+    if (s.keyframes_dropped == 0) /* else the last ones were lost without a transaction */
+        TEST_ASSERT_EQUAL_size_t(pf_survey_pack(&survey, expected), value_n);
+    /* Another survey: nothing of the first is its to give up. */
+    survey = (pf_survey){.boots = 1};
+    TEST_ASSERT_TRUE(pf_store_open(&store, &real, &survey, &config, error, sizeof error));
+    give(PF_OBJECT_KEYFRAME, 64, "");
+    pf_job *job = pf_store_take(store);
+    job->kind = PF_OBJECT_KEYFRAME;
+    job->index = 128;
+    job->n = 100;
+    memset(job->bytes, 0x20, 100);
+    pf_store_give(store, job);
+    pf_store_settle(store);
+    TEST_ASSERT_EQUAL_UINT64(0, stats().spool.evicted - s.spool.evicted);
+    TEST_ASSERT_TRUE(stats().keyframes_dropped >= 1);
+    TEST_ASSERT_NOT_NULL(strstr(stats().trouble, "less important"));
+    close_store();
+    TEST_ASSERT_EQUAL_UINT32(ROOM, list_spool(&real, there));
+    real.ops->close(real.self);
+}
+
 int main(void)
 {
+    temporary_make();
     UNITY_BEGIN();
     RUN_TEST(test_a_break_outlives_the_keyframe_that_carried_it);
     RUN_TEST(test_a_break_that_waits_for_room_is_told_once);
     RUN_TEST(test_a_failing_disk_is_tried_again);
     RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
     RUN_TEST(test_flush_and_quit_count_what_is_lost);
-    return UNITY_END();
+    RUN_TEST(test_a_full_spool_gives_up_the_least_important);
+    int failures = UNITY_END();
+    temporary_remove();
+    return failures;
 }

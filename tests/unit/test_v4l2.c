@@ -306,7 +306,7 @@ void tearDown(void)
 
 static pf_status open_with(uint32_t width, uint32_t height, const char *format, double rate)
 {
-    pf_v4l2_config config = {
+    pf_camera_config config = {
         .device = "/dev/video0", .width = width, .height = height, .format = format, .frame_rate = rate};
     return pf_v4l2_open_with(&camera, &config, &io, error, sizeof error);
 }
@@ -390,7 +390,7 @@ static void test_what_the_camera_cannot_do_is_said_with_what_it_can(void)
     TEST_ASSERT_NOT_NULL(strstr(error, "66 x 48"));
     TEST_ASSERT_NOT_NULL(strstr(error, "YUYV GREY"));
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, open_with(W, H, "NV12", 0));
-    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, H, "RGB3", 0));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, H, "RGB4", 0));
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, 0, "", 0));
     k.is_plugged = false;
     TEST_ASSERT_EQUAL_INT(PF_ERR_IO, open_with(0, 0, "", 0)); /* nobody knows what to wait for */

@@ -1,9 +1,9 @@
 /* The V4L2 driver's parts that need no device. Proves: grey values of each format; numbers and times that only rise,
  * whatever the kernel says; when a silent stream is restarted, within what time; that the exposure settles on a lit
  * wall and stays. Does not prove: that a real camera follows its controls. */
-#include "camera_v4l2/convert.h"
-#include "camera_v4l2/exposure.h"
-#include "camera_v4l2/timing.h"
+#include "camera_common/convert.h"
+#include "camera_common/exposure.h"
+#include "camera_common/timing.h"
 #include "unity.h"
 
 #include <linux/videodev2.h>
@@ -53,6 +53,10 @@ static void test_every_raw_format_gives_its_grey(void)
                 case PF_LAYOUT_PACKED_12:
                     row[x / 2 * 3 + x % 2] = (uint8_t)v;
                     break;
+                case PF_LAYOUT_RGB:
+                case PF_LAYOUT_BGR:
+                    memset(row + 3 * x, (int)v, 3);
+                    break;
                 case PF_LAYOUT_JPEG:
                     break;
                 }
@@ -65,8 +69,18 @@ static void test_every_raw_format_gives_its_grey(void)
         TEST_ASSERT_EQUAL_PTR(f, pf_pixel_format_named(f->name));
         TEST_ASSERT_EQUAL_PTR(f, pf_pixel_format_find(f->fourcc));
     }
-    TEST_ASSERT_NULL(pf_pixel_format_find(V4L2_PIX_FMT_RGB24));
+    TEST_ASSERT_NULL(pf_pixel_format_find(V4L2_PIX_FMT_RGB32));
     TEST_ASSERT_NULL(pf_pixel_format_named("grey"));
+}
+
+static void test_colours_are_weighed_whichever_way_round(void)
+{
+    const uint8_t rgb[3] = {255, 0, 0}, bgr[3] = {0, 0, 255};
+    uint8_t grey;
+    pf_pixels_to_grey(pf_pixel_format_named("RGB3"), rgb, 1, 1, 3, &grey);
+    TEST_ASSERT_EQUAL_UINT8(77, grey); /* 0.299 of 255 */
+    pf_pixels_to_grey(pf_pixel_format_named("BGR3"), bgr, 1, 1, 3, &grey);
+    TEST_ASSERT_EQUAL_UINT8(77, grey);
 }
 
 static void test_values_beyond_the_format_are_white_not_black(void)
@@ -342,6 +356,7 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_every_raw_format_gives_its_grey);
+    RUN_TEST(test_colours_are_weighed_whichever_way_round);
     RUN_TEST(test_values_beyond_the_format_are_white_not_black);
     RUN_TEST(test_a_frame_that_is_too_short_does_not_fit);
     RUN_TEST(test_gaps_are_the_kernels_and_wrap_with_them);

@@ -31,6 +31,7 @@ typedef struct pf_msg_telemetry { /* a reading counts only if its has_ flag is s
     uint32_t exposure_us;
     float gain, lamp;
     bool emergency_stop;
+    bool limit_front, limit_rear; /* pressed now */
 } pf_msg_telemetry;
 
 typedef struct pf_msg_tracking {
@@ -85,6 +86,8 @@ typedef struct pf_msg_stages { /* microseconds */
 
 typedef struct pf_msg_spool {
     uint64_t objects, bytes, stored, acknowledged, errors;
+    uint32_t evicted;
+    bool is_failing; /* something cannot be stored or removed now */
 } pf_msg_spool;
 
 typedef struct pf_msg_network {

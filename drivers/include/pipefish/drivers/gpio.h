@@ -23,7 +23,7 @@ enum { PF_LIMIT_FRONT = 1, PF_LIMIT_REAR = 2 };
 
 /* Everything but lamp and count, for whoever reports it. */
 typedef struct pf_gpio_state {
-    bool has_stop, is_stopped;  /* latched */
+    bool has_stop, is_stopped;  /* latched: until the driver is opened again with the button released */
     uint32_t limits;            /* PF_LIMIT_ bits of the switches that are pressed */
     uint32_t missed;            /* encoder edges known to be lost */
     uint32_t repeated, illegal; /* encoder: see pf_quadrature */
@@ -40,9 +40,6 @@ typedef struct pf_gpio_ops {
     /* The count at a moment of the monotonic clock, of the last second, and edges known to be lost since opening.
      * PF_OK, PF_ERR_UNSUPPORTED, PF_ERR_IO (its chip or device has gone). */
     pf_status (*encoder)(void *self, uint64_t time_ns, int64_t *count, uint32_t *missed);
-
-    /* Latched emergency stop: until the driver is opened again with the button released. PF_OK, PF_ERR_UNSUPPORTED. */
-    pf_status (*stopped)(void *self, bool *is_stopped);
 
     void (*indicate)(void *self, pf_indication indication);
     void (*state)(void *self, pf_gpio_state *state);

@@ -17,9 +17,23 @@ typedef struct pf_spool_item {
 } pf_spool_item;
 
 typedef struct pf_spool_stats {
-    uint64_t objects, bytes;               /* waiting now */
-    uint64_t stored, acknowledged, errors; /* since opening */
+    uint64_t objects, bytes;                        /* waiting now */
+    uint64_t stored, acknowledged, evicted, errors; /* since opening */
 } pf_spool_stats;
+
+/* Of an object that may have to make room for others; those stored without one never have to. */
+typedef struct pf_spool_rank {
+    uint32_t importance; /* the least important go first, of equals the oldest */
+    uint32_t number;     /* the caller's own name for it */
+} pf_spool_rank;
+
+typedef struct pf_spool_victim {
+    uint64_t row;
+    uint32_t number;
+    uint32_t size;
+} pf_spool_victim;
+
+#define PF_SPOOL_VICTIMS_MAX 32u
 
 typedef struct pf_spool_ops {
     /* Stores durably: on PF_OK the object outlives a power cut. The same name twice is stored once (PF_OK).
@@ -43,6 +57,20 @@ typedef struct pf_spool_ops {
     pf_status (*set)(void *self, const char *key, const void *bytes, size_t n);
     pf_status (*put_and_set)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
                              const char *key, const void *value, size_t value_n);
+
+    /* What would have to go so that at least n bytes become free: of the objects with a rank after row `after`, none
+     * more important than `importance`. PF_OK; PF_ERR_SPACE (all of them, or as many as fit into victims, are not
+     * enough); PF_ERR_IO. */
+    pf_status (*victims)(void *self, uint64_t after, uint32_t importance, size_t n,
+                         pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX], uint32_t *count);
+
+    /* As put_and_set; in the same transaction the victims go. rank: NULL = the object never has to. */
+    pf_status (*exchange)(void *self, const pf_spool_victim *victims, uint32_t count, uint32_t kind,
+                          const uint8_t name[32], const void *bytes, size_t n, const pf_spool_rank *rank,
+                          const char *key, const void *value, size_t value_n);
+
+    /* Takes the ranks of all objects away: nothing that is stored now has to go any more. PF_OK, PF_ERR_IO. */
+    pf_status (*keep_all)(void *self);
 
     void (*stats)(void *self, pf_spool_stats *stats);
     const char *(*error)(void *self); /* last failure in words; valid until this thread asks again */

@@ -1,0 +1,190 @@
+"""Link, spool and daemon for long: what takes hours, in pieces that are kept.
+
+sessions    10,000 seeded sessions of two links over lines with faults of every kind at once (test_link_channel.c says
+            which): every object once, whole and identical, or the session has failed
+soak        1,000,000 frames replayed through pipefishd to a host that takes everything: memory flat, nothing dropped,
+            lost or twice. Frames of 96 x 80 pixels, so that it is the daemon's housekeeping that is tried
+
+A session's or a soak piece's figures are kept in build/accept/link/ and taken from there while the program is the same:
+what was interrupted goes on where it stopped. Pieces that would begin after --minutes are left out: the row then tells
+the count so far, and does not hold.
+
+    python tests/accept_link.py                   prints one JSON list of {name, value, bound, holds}
+    python tests/accept_link.py sessions --minutes 10
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from accept_rows import Row, at_most, exactly, print_rows
+
+from pipefish.files import write_atomically
+from pipefish.survey import Survey
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "build/accept/link"
+CHANNEL = ROOT / "build/debug/tests/unit/test_link_channel"
+DAEMON = ROOT / "build/release/firmware/pipefishd"
+SESSIONS, BATCH = 10_000, 100
+SOAK, PIECE, LOOP, WIDTH, HEIGHT = 1_000_000, 50_000, 500, 96, 80
+SETTINGS = {
+    "camera.driver": "replay",
+    "camera.speed": "fast",
+    "tracker.max_tracks": "40",
+    "keyframe.step_mm": "1000",
+    "keyframe.min_common": "1",
+    "keyframe.min_interval": "100",
+    "status.interval_ms": "200",
+    "link.transport": "tcp",
+}
+
+
+def pieces(name: str, program: Path, count: int, minutes: float, measure) -> Iterator[dict]:
+    """The figures of pieces 0..count-1, kept ones first asked; ends early when time is over."""
+    digest = hashlib.sha256(program.read_bytes()).hexdigest()[:16]
+    folder = FOLDER / f"{name}-{digest}"
+    folder.mkdir(parents=True, exist_ok=True)
+    end = time.monotonic() + 60 * minutes
+    for i in range(count):
+        kept = folder / f"{i}.json"
+        if not kept.exists():
+            if time.monotonic() > end:
+                continue
+            write_atomically(kept, json.dumps(measure(i)).encode())
+        yield json.loads(kept.read_text())
+
+
+# ---- sessions
+
+
+def run_sessions(batch: int) -> dict:
+    """One batch of seeds: how many ran, and whether all of them delivered."""
+    done = subprocess.run(
+        [CHANNEL],
+        env={"PIPEFISH_TEST_SESSIONS": f"{100_000 + batch * BATCH} {BATCH}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    good = done.returncode == 0 and f"sessions: {BATCH}" in done.stdout
+    return {"sessions": BATCH, "failed": 0 if good else 1, "said": "" if good else done.stdout[-500:]}
+
+
+def check_sessions(minutes: float) -> list[Row]:
+    done = list(pieces("sessions", CHANNEL, SESSIONS // BATCH, minutes, run_sessions))
+    for piece in done:
+        if piece["failed"]:
+            print(piece["said"], file=sys.stderr)
+    ran, failed = sum(p["sessions"] for p in done), sum(p["failed"] for p in done)
+    return [
+        exactly("link.sessions", ran, SESSIONS),
+        exactly("link.sessions_batches_failed", failed, 0),
+    ]
+
+
+# ---- soak
+
+
+def write_loop(path: Path) -> None:
+    """A texture that goes round: the tracker always has work."""
+    rng = np.random.default_rng(1)
+    pattern = np.kron(rng.integers(40, 216, (HEIGHT // 4, LOOP // 4)), np.ones((4, 4))).astype(np.uint8)
+    with path.open("wb") as out:
+        out.write(f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F30:1 Ip A1:1 Cmono\n".encode())
+        for i in range(LOOP):
+            frame = np.ascontiguousarray(np.roll(pattern, -i, axis=1)[:, :WIDTH])
+            out.write(b"FRAME\n" + frame.tobytes())
+
+
+def resident_kb(process: int) -> int:
+    words = Path(f"/proc/{process}/statm").read_text().split()
+    return int(words[1]) * 4
+
+
+def run_soak(piece: int) -> dict:
+    """One daemon, one receiver, PIECE frames: memory a tenth into it and its most later, and what was lost."""
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(1) as pool:
+        folder = Path(name)
+        write_loop(folder / "loop.y4m")
+        (folder / "empty.ini").touch()
+        settings = {
+            **SETTINGS,
+            "camera.path": folder / "loop.y4m",
+            "camera.loops": PIECE // LOOP,
+            "spool.path": folder / "spool.db",
+            "daemon.status_file": folder / "status.json",
+            "survey.name": f"soak {piece}",
+            "link.port": (port := 20000 + piece % 1000),
+        }
+        flags = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+        with (folder / "log").open("wb") as log:
+            daemon = subprocess.Popen([DAEMON, "--config", folder / "empty.ini", *flags], stderr=log)
+        survey = folder / "soak.mcap"
+        receive = [sys.executable, "-m", "pipefish", "receive", f"tcp://127.0.0.1:{port}", "-o", survey]
+        receiver = pool.submit(subprocess.run, receive, capture_output=True, text=True, check=False)
+        early, most = 0, 0
+        while daemon.poll() is None:
+            time.sleep(0.2)
+            try:
+                status = json.loads((folder / "status.json").read_text())
+                now = resident_kb(daemon.pid)
+            except (OSError, ValueError):
+                continue
+            if status["frames"] > PIECE // 10:
+                early, most = early or now, max(most, now)
+        if receiver.result().returncode != 0:
+            raise SystemExit(f"soak: {receiver.result().stderr}{(folder / 'log').read_text()[-1000:]}")
+        status = json.loads((folder / "status.json").read_text())
+        got = Survey.open(survey)
+        indices = [k.index for k in got.keyframes]
+        return {
+            "frames": status["frames"],
+            "growth_kb": most - early,
+            "dropped": status["frames_dropped"]
+            - (PIECE // LOOP - 1) * 6,  # between two rounds six numbers are left out
+            "keyframes": len(indices),
+            "wrong": int(indices != list(range(got.end.keyframes)) or status["keyframes_dropped"] > 0),
+        }
+
+
+def check_soak(minutes: float) -> list[Row]:
+    done = list(pieces("soak", DAEMON, SOAK // PIECE, minutes, run_soak))
+    frames = sum(p["frames"] for p in done)
+    rows = [exactly("soak.frames", frames, SOAK)]
+    if done:
+        # The spool's page cache (2 MB at most) grows once when the host lags: what leaks grows in every piece.
+        growth = sorted(p["growth_kb"] for p in done)
+        rows += [
+            at_most("soak.growth_kb_median", growth[len(growth) // 2], 512),
+            at_most("soak.growth_kb_most", growth[-1], 2560),
+            exactly("soak.frames_dropped", sum(p["dropped"] for p in done), 0),
+            exactly("soak.surveys_wrong", sum(p["wrong"] for p in done), 0),
+        ]
+    return rows
+
+
+CHECKS = {"sessions": check_sessions, "soak": check_soak}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("only", nargs="?", default="")
+    parser.add_argument("--minutes", type=float, default=600)
+    args = parser.parse_args()
+    rows = [r for name, check in CHECKS.items() if args.only in name for r in check(args.minutes)]
+    print_rows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,415 @@
+/* The spool's recovery from whatever a power cut or a worn medium has left of its file and its log. The files live in
+ * memory (a file system of SQLite's own kind), so an input costs no disk. The input's first byte chooses what lies
+ * there: a spool as kill -9 leaves it, with its log, or one that was closed; a valid header before bytes of the input's
+ * own; whether the log's checksums are repaired, so that damage behind them is reached. The rest are changes and cuts.
+ * Invariants: opening ends, well or with an error in words; an object that is handed out has the bytes of its name, and
+ * rows ascend; what is stored in undamaged files without an error is there after opening again, and they lose
+ * nothing. */
+#include "pipefish/drivers/sha256.h"
+#include "pipefish/drivers/spool.h"
+
+#include <sqlite3.h>
+#include <stdlib.h>
+#include <string.h>
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+enum { FILES = 8, CAPACITY = 1 << 19, OBJECTS = 6, OBJECT_MAX = 6000, WALK_MAX = 64 };
+enum { DATABASE = 0, LOG = 1, FIRST_TEMPORARY = 2 };
+enum { CLOSED = 1, REPAIRED = 2, RAW = 4 };
+
+typedef struct image {
+    uint8_t bytes[CAPACITY];
+    size_t n;
+    bool is_there;
+} image;
+
+static image disk[FILES], crashed[2], closed;
+static uint8_t names[OBJECTS][32];
+
+static void require(bool holds)
+{
+    if (!holds)
+        abort();
+}
+
+/* ---- a file system in memory: SQLite's interface */
+
+typedef struct file {
+    sqlite3_file base;
+    image *image;
+} file;
+
+static int close_file(sqlite3_file *f)
+{
+    image *i = ((file *)f)->image;
+    if (i >= &disk[FIRST_TEMPORARY])
+        i->is_there = false;
+    return SQLITE_OK;
+}
+
+static int read_file(sqlite3_file *f, void *to, int n, sqlite3_int64 at)
+{
+    const image *i = ((file *)f)->image;
+    size_t have = (size_t)at < i->n ? i->n - (size_t)at : 0, take = have < (size_t)n ? have : (size_t)n;
+    memset(to, 0, (size_t)n);
+    memcpy(to, i->bytes + (take ? at : 0), take);
+    return take == (size_t)n ? SQLITE_OK : SQLITE_IOERR_SHORT_READ;
+}
+
+static int write_file(sqlite3_file *f, const void *from, int n, sqlite3_int64 at)
+{
+    image *i = ((file *)f)->image;
+    if (at + n > CAPACITY)
+        return SQLITE_FULL;
+    if ((size_t)at > i->n)
+        memset(i->bytes + i->n, 0, (size_t)at - i->n);
+    memcpy(i->bytes + at, from, (size_t)n);
+    if ((size_t)(at + n) > i->n)
+        i->n = (size_t)(at + n);
+    return SQLITE_OK;
+}
+
+static int cut_file(sqlite3_file *f, sqlite3_int64 n)
+{
+    image *i = ((file *)f)->image;
+    if ((size_t)n < i->n)
+        i->n = (size_t)n;
+    return SQLITE_OK;
+}
+
+static int sync_file(sqlite3_file *f, int flags)
+{
+    (void)f;
+    (void)flags;
+    return SQLITE_OK;
+}
+
+static int size_of_file(sqlite3_file *f, sqlite3_int64 *n)
+{
+    *n = (sqlite3_int64)((file *)f)->image->n;
+    return SQLITE_OK;
+}
+
+static int lock_file(sqlite3_file *f, int how)
+{
+    (void)f;
+    (void)how;
+    return SQLITE_OK;
+}
+
+static int is_locked(sqlite3_file *f, int *is)
+{
+    (void)f;
+    *is = 0;
+    return SQLITE_OK;
+}
+
+static int control_file(sqlite3_file *f, int what, void *argument)
+{
+    (void)f;
+    (void)what;
+    (void)argument;
+    return SQLITE_NOTFOUND;
+}
+
+static int sector_size(sqlite3_file *f)
+{
+    (void)f;
+    return 4096;
+}
+
+static int characteristics(sqlite3_file *f)
+{
+    (void)f;
+    return 0;
+}
+
+static const sqlite3_io_methods methods = {.iVersion = 1,
+                                           .xClose = close_file,
+                                           .xRead = read_file,
+                                           .xWrite = write_file,
+                                           .xTruncate = cut_file,
+                                           .xSync = sync_file,
+                                           .xFileSize = size_of_file,
+                                           .xLock = lock_file,
+                                           .xUnlock = lock_file,
+                                           .xCheckReservedLock = is_locked,
+                                           .xFileControl = control_file,
+                                           .xSectorSize = sector_size,
+                                           .xDeviceCharacteristics = characteristics};
+
+static image *find_image(const char *path)
+{
+    size_t n = path != NULL ? strlen(path) : 0;
+    if (n >= 4 && strcmp(path + n - 4, "-wal") == 0)
+        return &disk[LOG];
+    return n > 0 && strstr(path, "-journal") == NULL ? &disk[DATABASE] : NULL;
+}
+
+static int open_file(sqlite3_vfs *vfs, const char *path, sqlite3_file *f, int flags, int *out)
+{
+    image *i = find_image(path);
+    (void)vfs;
+    for (uint32_t k = FIRST_TEMPORARY; i == NULL && k < FILES; k++)
+        i = disk[k].is_there ? NULL : &disk[k];
+    f->pMethods = NULL;
+    if (i == NULL)
+        return SQLITE_CANTOPEN;
+    if (!i->is_there)
+        i->n = 0;
+    i->is_there = true;
+    ((file *)f)->image = i;
+    f->pMethods = &methods;
+    if (out != NULL)
+        *out = flags;
+    return SQLITE_OK;
+}
+
+static int delete_file(sqlite3_vfs *vfs, const char *path, int sync)
+{
+    image *i = find_image(path);
+    (void)vfs;
+    (void)sync;
+    if (i != NULL)
+        i->is_there = false;
+    return SQLITE_OK;
+}
+
+static int access_file(sqlite3_vfs *vfs, const char *path, int flags, int *is)
+{
+    const image *i = find_image(path);
+    (void)vfs;
+    (void)flags;
+    *is = i != NULL && i->is_there;
+    return SQLITE_OK;
+}
+
+static int full_path(sqlite3_vfs *vfs, const char *path, int n, char *out)
+{
+    (void)vfs;
+    (void)sqlite3_snprintf(n, out, "%s", path);
+    return SQLITE_OK;
+}
+
+static int random_bytes(sqlite3_vfs *vfs, int n, char *out)
+{
+    (void)vfs;
+    memset(out, 7, (size_t)n);
+    return n;
+}
+
+static int sleep_a_while(sqlite3_vfs *vfs, int us)
+{
+    (void)vfs;
+    return us;
+}
+
+static int tell_time(sqlite3_vfs *vfs, double *now)
+{
+    (void)vfs;
+    *now = 2460000.5;
+    return SQLITE_OK;
+}
+
+static sqlite3_vfs memory = {.iVersion = 1,
+                             .szOsFile = sizeof(file),
+                             .mxPathname = 256,
+                             .zName = "memory",
+                             .xOpen = open_file,
+                             .xDelete = delete_file,
+                             .xAccess = access_file,
+                             .xFullPathname = full_path,
+                             .xRandomness = random_bytes,
+                             .xSleep = sleep_a_while,
+                             .xCurrentTime = tell_time};
+
+/* ---- spools */
+
+static bool open_spool(pf_spool *spool)
+{
+    const pf_spool_config config = {.path = "/spool.db", .quota = CAPACITY / 4};
+    char error[512] = "";
+    pf_status status = pf_spool_open(spool, &config, error, sizeof error);
+    require(status == PF_OK || status == PF_ERR_FORMAT || status == PF_ERR_VERSION || status == PF_ERR_IO ||
+            status == PF_ERR_SPACE);
+    require((status == PF_OK) == (error[0] == '\0'));
+    return status == PF_OK;
+}
+
+static size_t make_object(uint32_t id, uint8_t *bytes, uint8_t name[32])
+{
+    size_t n = 200 + 900 * (size_t)(id % OBJECTS);
+    for (size_t i = 0; i < n; i++)
+        bytes[i] = (uint8_t)(id * 31 + i * 7);
+    require(pf_sha256(bytes, n, name) == PF_OK);
+    return n;
+}
+
+static pf_status put(const pf_spool *spool, uint32_t id, uint8_t name[32])
+{
+    static uint8_t bytes[OBJECT_MAX];
+    const pf_spool_rank rank = {id % 3, id};
+    size_t n = make_object(id, bytes, name);
+    return spool->ops->exchange(spool->self, NULL, 0, 2, name, bytes, n, id % 2 ? &rank : NULL, "survey", &id,
+                                sizeof id);
+}
+
+/* How many objects come out, each checked; whether `name` is among them. */
+static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
+{
+    static uint8_t bytes[OBJECT_MAX];
+    uint8_t hash[32];
+    pf_spool_item item = {.row = 0};
+    uint32_t intact = 0;
+    uint64_t row = 0;
+    *is_there = false;
+    for (uint32_t i = 0; i < WALK_MAX && spool->ops->next(spool->self, row, &item) == PF_OK; i++) {
+        size_t n = 0;
+        require(item.row > row);
+        row = item.row;
+        if (spool->ops->read(spool->self, row, bytes, sizeof bytes, &n) != PF_OK)
+            continue;
+        require(n <= sizeof bytes && pf_sha256(bytes, n, hash) == PF_OK && memcmp(hash, item.name, 32) == 0);
+        intact++;
+        *is_there = *is_there || memcmp(hash, name, 32) == 0;
+    }
+    return intact;
+}
+
+static void begin(void)
+{
+    pf_spool spool;
+    require(sqlite3_vfs_register(&memory, 1) == SQLITE_OK);
+    require(open_spool(&spool));
+    for (uint32_t id = 0; id < OBJECTS; id++)
+        require(put(&spool, id, names[id]) == PF_OK);
+    require(spool.ops->remove(spool.self, 1) == PF_OK);
+    crashed[DATABASE] = disk[DATABASE];
+    crashed[LOG] = disk[LOG];
+    spool.ops->close(spool.self);
+    closed = disk[DATABASE];
+}
+
+/* ---- what the input does to them */
+
+static uint32_t get_be(const uint8_t *b)
+{
+    return (uint32_t)b[0] << 24 | (uint32_t)b[1] << 16 | (uint32_t)b[2] << 8 | b[3];
+}
+
+static void put_be(uint8_t *b, uint32_t v)
+{
+    for (int i = 0; i < 4; i++)
+        b[i] = (uint8_t)(v >> (24 - 8 * i));
+}
+
+/* SQLite's checksum of a log, of little-endian words. */
+static void sum(uint32_t s[2], const uint8_t *b, size_t n)
+{
+    for (size_t i = 0; i + 8 <= n; i += 8) {
+        uint32_t x[2];
+        memcpy(x, b + i, sizeof x);
+        s[0] += x[0] + s[1];
+        s[1] += x[1] + s[0];
+    }
+}
+
+/* Makes the log's checksums and salts right for whatever is in its frames. */
+static void repair_log(image *log)
+{
+    uint8_t *b = log->bytes;
+    uint32_t page = 4096, s[2] = {0, 0};
+    if (log->n < 32)
+        return;
+    put_be(b, 0x377F0682);
+    put_be(b + 4, 3007000);
+    put_be(b + 8, page);
+    sum(s, b, 24);
+    put_be(b + 24, s[0]);
+    put_be(b + 28, s[1]);
+    for (size_t at = 32; at + 24 + page <= log->n; at += 24 + page) {
+        memcpy(b + at + 8, b + 16, 8);
+        sum(s, b + at, 8);
+        sum(s, b + at + 24, page);
+        put_be(b + at + 16, s[0]);
+        put_be(b + at + 20, s[1]);
+        require(get_be(b + at + 16) == s[0]);
+    }
+}
+
+/* Changes of six bytes: which file and what, where (24 bits), value, how many. Returns whether anything was changed. */
+static bool damage(const uint8_t *data, size_t size)
+{
+    bool has_changed = false;
+    for (; size >= 6; data += 6, size -= 6) {
+        image *i = &disk[data[0] & 1];
+        size_t at = (size_t)data[1] | (size_t)data[2] << 8 | (size_t)data[3] << 16;
+        if (!i->is_there || i->n == 0)
+            continue;
+        at %= i->n;
+        if (data[0] & 2) /* the cell pointers and headers of pages are where it hurts */
+            at = at / 4096 * 4096 + at % 64;
+        if ((data[0] & 0xF0) == 0xF0)
+            i->n = at; /* cut short */
+        else
+            for (size_t k = 0; k <= data[5] % 8u && at + k < i->n; k++)
+                i->bytes[at + k] = (uint8_t)(data[0] & 4 ? i->bytes[at + k] ^ data[4] : data[4]);
+        has_changed = true;
+    }
+    return has_changed;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    pf_spool spool;
+    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
+    uint8_t name[32] = {0}, value[64];
+    uint32_t count;
+    size_t n;
+    bool is_there, is_whole = true;
+    if (!closed.is_there)
+        begin();
+    if (size < 1)
+        return 0;
+
+    for (uint32_t i = 0; i < FILES; i++)
+        disk[i].is_there = false;
+    const uint8_t how = data[0];
+    const image *from = how & CLOSED ? &closed : &crashed[DATABASE];
+    memcpy(disk[DATABASE].bytes, from->bytes, from->n);
+    disk[DATABASE].n = from->n;
+    disk[DATABASE].is_there = true;
+    if (!(how & CLOSED)) {
+        memcpy(disk[LOG].bytes, crashed[LOG].bytes, crashed[LOG].n);
+        disk[LOG].n = crashed[LOG].n;
+        disk[LOG].is_there = true;
+    }
+    if (how & RAW) {
+        size_t length = size - 1 < CAPACITY - 100 ? size - 1 : CAPACITY - 100;
+        memcpy(disk[DATABASE].bytes + 100, data + 1, length);
+        is_whole = length == 0;
+    } else {
+        is_whole = !damage(data + 1, size - 1);
+    }
+    if (how & REPAIRED && disk[LOG].is_there)
+        repair_log(&disk[LOG]);
+    if (!open_spool(&spool)) {
+        require(!is_whole);
+        return 0;
+    }
+    uint32_t intact = walk(&spool, name, &is_there);
+    require(!is_whole || intact == OBJECTS - 1);
+    (void)spool.ops->get(spool.self, "survey", value, sizeof value, &n);
+    (void)spool.ops->victims(spool.self, 0, 9, 1000, victims, &count);
+    (void)spool.ops->remove(spool.self, 2);
+    pf_status status = put(&spool, 100 + how % 7u, name);
+    require(!is_whole || status == PF_OK);
+    spool.ops->close(spool.self);
+    if (open_spool(&spool)) {
+        (void)walk(&spool, name, &is_there);
+        require(is_there || !is_whole);
+        spool.ops->close(spool.self);
+    }
+    return 0;
+}
