@@ -2,6 +2,8 @@
 // _engine.recognise. pipefish/grouping.py and recognition.py are what people use.
 #include "group/recognise.hpp"
 
+#include "bind/matches.hpp"
+
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -20,9 +22,6 @@ namespace
 
 using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Marked = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Rows2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Maps = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
-using Values = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Labels = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Triples = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
@@ -31,24 +30,6 @@ template <typename T> nb::ndarray<nb::numpy, T> array(std::initializer_list<size
     T *raw = data.release();
     nb::capsule owner(raw, [](void *p) noexcept { delete[] static_cast<T *>(p); });
     return nb::ndarray<nb::numpy, T>(raw, shape.size(), shape.begin(), owner);
-}
-
-std::vector<match::Match> matches_of(const Rows2 &xy1, const Rows2 &xy2, const Maps &affine, const Values &zncc)
-{
-    const size_t n = xy1.shape(0);
-    if (xy2.shape(0) != n || affine.shape(0) != n || zncc.shape(0) != n)
-        throw std::invalid_argument("xy1, xy2, affine and zncc: must be as long as each other");
-    std::vector<match::Match> out(n);
-    for (size_t k = 0; k < n; k++) {
-        match::Match &m = out[k];
-        m.x = static_cast<int>(xy1(k, 0));
-        m.y = static_cast<int>(xy1(k, 1));
-        m.centre = {static_cast<float>(xy2(k, 0)), static_cast<float>(xy2(k, 1))};
-        for (size_t i = 0; i < 4; i++)
-            m.a(static_cast<int>(i / 2), static_cast<int>(i % 2)) = static_cast<float>(affine(k, i / 2, i % 2));
-        m.zncc = static_cast<float>(zncc(k));
-    }
-    return out;
 }
 
 nb::tuple to_python(const Groups &g)
