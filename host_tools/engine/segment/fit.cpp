@@ -55,19 +55,18 @@ void add_ties(const Side &side, double weight, Normal &normal)
 // The way there and back, as far as this side's field can change it.
 void add_round_trips(const Side &side, const Side &other, Normal &normal)
 {
-    constexpr double weight = kRoundTrip * kRoundTripStep;
     const double here = unit_here(side), there = unit_there(side);
-    for (size_t k = 0; k < side.ties.size(); k += kRoundTripStep) {
-        const Vector2d at = side.ties[k].at, to = side.warp.to(at.x(), at.y());
+    for (const Tie &t : side.ties) {
+        const Vector2d at = t.at, to = side.warp.to(at.x(), at.y());
         const Vector2d e = at - other.warp.to(to.x(), to.y());
         const Matrix2d j = other.warp.slope(to.x(), to.y());
-        const double w = weight * huber_weight(e.norm() / here) / (here * here);
+        const double w = kRoundTrip * t.weight * huber_weight(e.norm() / here) / (here * here);
         normal.add(side.warp.lattice.at(at.x(), at.y()), w * j.transpose() * j, w * j.transpose() * e);
     }
-    for (size_t k = 0; k < other.ties.size(); k += kRoundTripStep) {
-        const Vector2d at = other.ties[k].at, to = other.warp.to(at.x(), at.y());
+    for (const Tie &t : other.ties) {
+        const Vector2d at = t.at, to = other.warp.to(at.x(), at.y());
         const Vector2d e = at - side.warp.to(to.x(), to.y());
-        const double w = weight * huber_weight(e.norm() / there) / (there * there);
+        const double w = kRoundTrip * t.weight * huber_weight(e.norm() / there) / (there * there);
         normal.add(side.warp.lattice.at(to.x(), to.y()), w * Matrix2d::Identity(), w * e);
     }
 }
@@ -122,8 +121,8 @@ void add_pixels(const Side &side, const Evidence &seen, const LabelImage &labels
         there.push_back(&side.plane_there(c));
     }
     for_pixels(side, seen, labels, k, [&](int x, int y) {
-        const double weight = seen.fits(y, x) * seen.informed(y, x);
-        if (weight < 1e-3)
+        const double weight = 2.0 * seen.fits(y, x) * seen.informed(y, x);
+        if ((x + y) % 2 != 0 || weight < 1e-3) // every other pixel tells enough, and counts for two
             return;
         Matrix2d q = Matrix2d::Zero();
         Vector2d b = Vector2d::Zero();

@@ -31,14 +31,30 @@ cv::Mat_<uint8_t> carry(const Side &side, Evidence &out)
     const double least = 0.1 * side.scale * side.scale;
     out.flow.create(box.size());
     cv::Mat_<uint8_t> valid(box.size(), uint8_t{0});
-    for (int y = 0; y < box.height; y++)
+    const Lattice &lattice = side.warp.lattice;
+    std::vector<Lattice::Spot> column;
+    for (int x = 0; x < box.width; x++)
+        column.push_back(lattice.at(box.x + x, box.y));
+    std::vector<Vector2d> row(static_cast<size_t>(lattice.nx)); // of the field along a row of pixels
+    for (int y = 0; y < box.height; y++) {
+        const Lattice::Spot across = lattice.at(box.x, box.y + y);
+        for (size_t i = 0; i < row.size(); i++) {
+            row[i].setZero();
+            for (size_t j = 0; j < 4; j++)
+                row[i] += across.wy[j] * side.warp.d.segment<2>(static_cast<Eigen::Index>(
+                                             2 * (across.first + j * static_cast<size_t>(lattice.nx) + i)));
+        }
         for (int x = 0; x < box.width; x++) {
             if (!side.reach(y, x))
                 continue;
-            const Vector2d to = side.warp.to(box.x + x, box.y + y);
+            const Lattice::Spot &along = column[static_cast<size_t>(x)];
+            Vector2d to(box.x + x, box.y + y);
+            for (size_t i = 0; i < 4; i++)
+                to += along.wx[i] * row[along.first + i];
             out.flow(y, x) = {static_cast<float>(to.x()), static_cast<float>(to.y())};
             valid(y, x) = to.x() >= 1 && to.y() >= 1 && to.x() < there.width - 2.01 && to.y() < there.height - 2.01;
         }
+    }
     for (int y = 0; y + 1 < box.height; y++)
         for (int x = 0; x + 1 < box.width; x++)
             if (side.reach(y, x) && side.reach(y, x + 1) && side.reach(y + 1, x)) {
@@ -197,10 +213,9 @@ double round_trip_energy(const Side &one, const Side &other)
 {
     double sum = 0;
     for (const auto &[a, b] : {std::pair(&one, &other), std::pair(&other, &one)})
-        for (size_t k = 0; k < a->ties.size(); k += kRoundTripStep) {
-            const Vector2d to = a->warp.to(a->ties[k].at.x(), a->ties[k].at.y());
-            sum += kRoundTrip * kRoundTripStep *
-                   huber((b->warp.to(to.x(), to.y()) - a->ties[k].at).norm() / unit_here(*a));
+        for (const Tie &t : a->ties) {
+            const Vector2d to = a->warp.to(t.at.x(), t.at.y());
+            sum += kRoundTrip * t.weight * huber((b->warp.to(to.x(), to.y()) - t.at).norm() / unit_here(*a));
         }
     return sum;
 }

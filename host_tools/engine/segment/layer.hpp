@@ -12,17 +12,17 @@ struct Options {
     int rounds = 6;     // of refinement
     double edge = 3;    // cost of a boundary, nats a pixel along the grid
     double lonely = 1;  // cost of a pixel whose place in the other picture is not the same layer's, nats
-    double layer = 50;  // cost of a layer, nats
+    double layer = 200; // cost of a layer, nats
     double bend = 1;    // stiffness of displacement: nats for a second difference of a pixel between grid points
     double light = 200; // stiffness of gain and offset: nats for a difference of 1 between grid points, halved
-    double reach = 60;  // pixels beyond its matches in which a layer may be
+    double reach = 40;  // pixels beyond its matches in which a layer may be
     int least = 400;    // pixels of a layer that is reported
     int threads = 1;
 };
 
 inline constexpr double kUnit = 1000; // costs are in thousandths of a nat, whole numbers
 
-// A match seen from one picture.
+// A match seen from one picture; it stands for `weight` matches.
 struct Tie {
     Vector2d at, to;
     double weight;
@@ -92,9 +92,8 @@ inline double unit_there(const Side &side)
     return std::max(1.0, side.scale);
 }
 
-inline constexpr double kRoundTrip = 0.5;   // weight of a round trip, of a match's own
-inline constexpr size_t kRoundTripStep = 4; // one tie of so many is looked at, and counts as many
-double huber(double distance);              // cost of a distance in units
-double huber_weight(double distance);       // its slope over the distance
+inline constexpr double kRoundTrip = 0.5; // weight of a round trip, of a tie's own
+double huber(double distance);            // cost of a distance in units
+double huber_weight(double distance);     // its slope over the distance
 
 } // namespace pipefish::segment

@@ -61,6 +61,29 @@ void smooth(std::vector<double> &histogram, size_t stride)
     }
 }
 
+// How dense a pixel's colour is among those of its surroundings, 16 pixels 3 and 5 away: a flat region explains itself.
+double local_density(const std::deque<match::ScaleStack> &planes, int x, int y)
+{
+    constexpr double sigma = 0.012, scale = 1 / (2 * sigma * sigma), peak = 0.3989422804 / sigma;
+    constexpr int ring[8][2] = {{3, 0}, {2, 2}, {0, 3}, {-2, 2}, {-3, 0}, {-2, -2}, {0, -3}, {2, -2}};
+    const int width = planes[0].width(), height = planes[0].height();
+    double sum = 0, count = 0;
+    for (const int far : {3, 5})
+        for (const auto &[dx, dy] : ring) {
+            const int i = x + dx * far / 3, j = y + dy * far / 3;
+            if (i < 0 || j < 0 || i >= width || j >= height)
+                continue;
+            double difference = 0;
+            for (const match::ScaleStack &p : planes) {
+                const double d = p.image()(y, x) - p.image()(j, i);
+                difference += d * d;
+            }
+            sum += std::exp(-scale * difference);
+            count++;
+        }
+    return sum / count * std::pow(peak, static_cast<double>(planes.size()));
+}
+
 } // namespace
 
 Picture::Picture(const std::vector<Image> &planes) : rarity_(planes.at(0).size())
@@ -76,13 +99,14 @@ Picture::Picture(const std::vector<Image> &planes) : rarity_(planes.at(0).size()
             cells(planes_, x, y, [&](size_t cell, double weight) { histogram[cell] += weight; });
     for (size_t c = 0, stride = 1; c < planes.size(); c++, stride *= kBins)
         smooth(histogram, stride);
-    // A hundredth of all colours may be any.
+    // One of a hundred colours may be any, half of the others are as nearby, half as anywhere in the picture.
     const auto pixels = static_cast<double>(rarity_.total()), cell_count = static_cast<double>(count);
     for (int y = 0; y < rarity_.rows; y++)
         for (int x = 0; x < rarity_.cols; x++) {
             double density = 0;
             cells(planes_, x, y, [&](size_t cell, double weight) { density += weight * histogram[cell]; });
-            rarity_(y, x) = static_cast<float>(-std::log(0.01 + 0.99 * density * cell_count / pixels));
+            rarity_(y, x) = static_cast<float>(
+                -std::log(0.01 + 0.495 * (density * cell_count / pixels + local_density(planes_, x, y))));
         }
 }
 

@@ -21,7 +21,8 @@ public:
     const match::ScaleStack &plane(size_t channel) const { return planes_[channel]; }
     // The share of a plane in the grey picture.
     double grey(size_t channel) const;
-    // -log of the density of a pixel's colour among those of the picture: what the background explains it by.
+    // -log of the density of a pixel's colour among those of the picture and of its surroundings: what the background
+    // explains it by.
     const Image &rarity() const { return rarity_; }
 
     // Appends the edges between neighbouring pixels, eight of them; nodes are numbered from `first`. An edge costs

@@ -42,7 +42,7 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
     note("merge");
     for (int round = 0; round < options.rounds && state.layers() > 0; round++) {
         const double before = trace.back().energy;
-        if (round == 2)
+        if (round == 1)
             state.trust_pictures();
         state.relabel(round == 0 ? 2 : 3);
         note("labels");
@@ -50,9 +50,11 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
         note("remove");
         state.refine(3);
         note("fields");
-        state.merge();
-        note("merge");
-        if (round > 2 && before - trace.back().energy < 1e-3 * std::abs(before))
+        if (round < 2) {
+            state.merge();
+            note("merge");
+        }
+        if (round > 1 && before - trace.back().energy < 2e-3 * std::abs(before))
             break;
     }
     if (state.layers() > 0)

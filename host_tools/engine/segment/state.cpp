@@ -17,13 +17,16 @@ int32_t units(double nats)
     return static_cast<int32_t>(std::lround(kUnit * nats));
 }
 
-// Matches of a group, or of groups that are one layer.
+// Matches of a group, one of four: they overlap that much.
 std::vector<Tie> ties_of(const std::vector<match::Match> &matches, const group::Groups &groups, int group)
 {
+    constexpr int step = 4;
     std::vector<Tie> out;
+    int count = 0;
     for (size_t k = 0; k < matches.size(); k++)
-        if (groups.label[k] == group)
-            out.push_back({Vector2d(matches[k].x, matches[k].y), matches[k].centre.cast<double>(), matches[k].zncc});
+        if (groups.label[k] == group && count++ % step == 0)
+            out.push_back({Vector2d(matches[k].x, matches[k].y), matches[k].centre.cast<double>(),
+                           step * static_cast<double>(matches[k].zncc)});
     return out;
 }
 
@@ -61,17 +64,19 @@ State::State(const std::vector<Image> (&planes)[2], const std::vector<match::Mat
     }
 }
 
+double State::cut(const LabelImage (&labels)[2]) const
+{
+    const auto first = static_cast<int>(labels[0].total());
+    const auto at = [&](int node) { return node < first ? labels[0].data[node] : labels[1].data[node - first]; };
+    int64_t sum = 0;
+    for (const Problem::Edge &e : edges_)
+        sum += at(e.i) != at(e.j) ? e.cost : 0;
+    return static_cast<double>(sum) / kUnit;
+}
+
 double State::energy() const
 {
-    const auto width = static_cast<size_t>(labels_[0].total());
-    const auto at = [&](int node) {
-        const auto p = static_cast<size_t>(node);
-        return p < width ? labels_[0].data[p] : labels_[1].data[p - width];
-    };
-    int64_t cut = 0;
-    for (const Problem::Edge &e : edges_)
-        cut += at(e.i) != at(e.j) ? e.cost : 0;
-    double sum = static_cast<double>(cut) / kUnit;
+    double sum = cut(labels_);
     for (size_t k = 0; k < layers_.size(); k++)
         sum += layer_energy(layers_[k], given(static_cast<int>(k) + 1), options_) + options_.layer;
     return sum;
@@ -132,18 +137,6 @@ void State::relabel(int cycles)
     std::copy(middle, labels.end(), labels_[1].begin());
 }
 
-int64_t State::boundary(int a, int b) const
-{
-    const auto width = static_cast<int>(labels_[0].total());
-    const auto at = [&](int node) { return node < width ? labels_[0].data[node] : labels_[1].data[node - width]; };
-    int64_t sum = 0;
-    for (const Problem::Edge &e : edges_) {
-        const int p = at(e.i), q = at(e.j);
-        sum += (p == a && q == b) || (p == b && q == a) ? e.cost : 0;
-    }
-    return sum;
-}
-
 bool State::within_reach(const Layer &a, const Layer &b) const
 {
     for (size_t s = 0; s < 2; s++) {
@@ -164,7 +157,10 @@ bool State::try_merge(size_t a, size_t b)
     if (!within_reach(layers_[a], layers_[b]))
         return false;
     const Given of_a = given(static_cast<int>(a) + 1), of_b = given(static_cast<int>(b) + 1);
-    const double saved = options_.layer + static_cast<double>(boundary(of_a.k, of_b.k)) / kUnit;
+    LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
+    for (LabelImage &l : labels)
+        replace(l, of_b.k, of_a.k);
+    const double saved = options_.layer + cut(labels_) - cut(labels);
     std::vector<Tie> ties = layers_[a].side[0].ties;
     ties.insert(ties.end(), layers_[b].side[0].ties.begin(), layers_[b].side[0].ties.end());
     Layer both = layer_of(pictures_, ties, options_);
@@ -175,9 +171,6 @@ bool State::try_merge(size_t a, size_t b)
     if (shape > 0)
         return false;
     const double before = layer_energy(layers_[a], of_a, options_) + layer_energy(layers_[b], of_b, options_) + saved;
-    LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
-    for (LabelImage &l : labels)
-        replace(l, of_b.k, of_a.k);
     const Given by{labels, of_a.k, ties_};
     refine_one(both, by, 1);
     refine_one(both, by, 2);
@@ -207,18 +200,37 @@ void State::merge()
             b = try_merge(a, b) ? a + 1 : b + 1;
 }
 
+// Gives the pixels of a layer to another where that can be, else to the background, if that is cheaper.
+bool State::try_remove(int label, int heir)
+{
+    const size_t own = static_cast<size_t>(label) - 1, other = static_cast<size_t>(heir) - 1;
+    LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
+    for (size_t s = 0; s < 2; s++) {
+        if (heir > 0) {
+            const cv::Rect &box = layers_[other].side[s].box();
+            const cv::Mat_<uint8_t> mine(labels_[s](box) == label);
+            labels[s](box).setTo(heir, mine & (layers_[other].seen[s].cost < Problem::kNever));
+        }
+        replace(labels[s], label, 0);
+    }
+    double gain = layer_energy(layers_[own], given(label), options_) + options_.layer + cut(labels_) - cut(labels);
+    if (heir > 0)
+        gain += layer_energy(layers_[other], given(heir), options_) -
+                layer_energy(layers_[other], {labels, heir, ties_}, options_);
+    if (gain < 0)
+        return false;
+    for (size_t s = 0; s < 2; s++)
+        labels_[s] = labels[s];
+    erase(own);
+    return true;
+}
+
 void State::remove()
 {
-    for (size_t k = layers_.size(); k-- > 0;) {
-        const int label = static_cast<int>(k) + 1;
-        const double own = layer_energy(layers_[k], given(label), options_) + options_.layer +
-                           static_cast<double>(boundary(label, 0)) / kUnit;
-        if (own <= 0)
-            continue;
-        for (LabelImage &labels : labels_)
-            replace(labels, label, 0);
-        erase(k);
-    }
+    for (int label = static_cast<int>(layers_.size()); label > 0; label--)
+        for (int heir = 0; heir <= static_cast<int>(layers_.size()); heir++)
+            if (heir != label && try_remove(label, heir))
+                break;
 }
 
 } // namespace pipefish::segment

@@ -28,6 +28,8 @@ private:
     Problem problem() const;
     int64_t boundary(int a, int b) const; // what edges between labels a and b cost
     bool within_reach(const Layer &a, const Layer &b) const;
+    double cut(const LabelImage (&labels)[2]) const; // what all boundaries cost, nats
+    bool try_remove(int label, int heir);
     bool try_merge(size_t a, size_t b);
     void erase(size_t layer); // its labels have gone
 
