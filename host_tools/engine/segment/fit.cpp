@@ -332,7 +332,7 @@ void refine_sigma(Layer &layer, const Given &given, const Options &options)
         improve(layer, s, given, options, [&](double share) {
             Side side = old;
             for (size_t c = 0; c < sum.size(); c++) {
-                const double best = std::clamp(std::sqrt(sum[c] / weight), 0.004, 0.15);
+                const double best = std::clamp(std::sqrt(sum[c] / weight), kLeastNoise, 0.15);
                 side.sigma[c] *= std::pow(best / old.sigma[c], share);
             }
             return side;

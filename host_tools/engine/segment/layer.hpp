@@ -8,15 +8,15 @@ namespace pipefish::segment
 {
 
 struct Options {
-    int layers = 12;    // the most to start from
-    int rounds = 6;     // of refinement
-    double edge = 3;    // cost of a boundary, nats a pixel along the grid
-    double lonely = 1;  // cost of a pixel whose place in the other picture is not the same layer's, nats
-    double layer = 200; // cost of a layer, nats
-    double bend = 1;    // stiffness of displacement: nats for a second difference of a pixel between grid points
-    double light = 200; // stiffness of gain and offset: nats for a difference of 1 between grid points, halved
-    double reach = 40;  // pixels beyond its matches in which a layer may be
-    int least = 400;    // pixels of a layer that is reported
+    int layers = 12;     // the most to start from
+    int rounds = 6;      // of refinement
+    double edge = 3;     // cost of a boundary, nats a pixel along the grid
+    double lonely = 1;   // cost of a pixel whose place in the other picture is not the same layer's, nats
+    double layer = 1000; // cost of a layer, nats
+    double bend = 1;     // stiffness of displacement: nats for a second difference of a pixel between grid points
+    double light = 200;  // stiffness of gain and offset: nats for a difference of 1 between grid points, halved
+    double reach = 40;   // pixels beyond its matches in which a layer may be
+    int least = 400;     // pixels of a layer that is reported
     int threads = 1;
 };
 

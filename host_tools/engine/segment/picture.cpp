@@ -64,7 +64,9 @@ void smooth(std::vector<double> &histogram, size_t stride)
 // How dense a pixel's colour is among those of its surroundings, 16 pixels 3 and 5 away: a flat region explains itself.
 double local_density(const std::deque<match::ScaleStack> &planes, int x, int y)
 {
-    constexpr double sigma = 0.012, scale = 1 / (2 * sigma * sigma), peak = 0.3989422804 / sigma;
+    // As wide as makes it neutral: where all is flat, a layer's pixel and the background's are equally likely.
+    const double sigma = kLeastNoise * std::pow(0.5, 1.0 / static_cast<double>(planes.size()));
+    const double scale = 1 / (2 * sigma * sigma), peak = 0.3989422804 / sigma;
     constexpr int ring[8][2] = {{3, 0}, {2, 2}, {0, 3}, {-2, 2}, {-3, 0}, {-2, -2}, {0, -3}, {2, -2}};
     const int width = planes[0].width(), height = planes[0].height();
     double sum = 0, count = 0;

@@ -11,6 +11,10 @@ namespace pipefish::segment
 
 using match::Image;
 
+// Least deviation of a layer's colours from one picture to the other, of 1: what a smooth field cannot follow is more
+// than a camera's noise.
+inline constexpr double kLeastNoise = 0.02;
+
 class Picture
 {
 public:

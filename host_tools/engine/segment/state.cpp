@@ -164,7 +164,7 @@ bool State::try_merge(size_t a, size_t b)
     std::vector<Tie> ties = layers_[a].side[0].ties;
     ties.insert(ties.end(), layers_[b].side[0].ties.begin(), layers_[b].side[0].ties.end());
     Layer both = layer_of(pictures_, ties, options_);
-    double shape = -saved - 4 * options_.layer; // what refinement may still win
+    double shape = -saved - options_.layer; // what refinement may still win
     for (size_t s = 0; s < 2; s++)
         shape += shape_energy(both.side[s], options_, ties_) - shape_energy(layers_[a].side[s], options_, ties_) -
                  shape_energy(layers_[b].side[s], options_, ties_);
@@ -173,7 +173,7 @@ bool State::try_merge(size_t a, size_t b)
     const double before = layer_energy(layers_[a], of_a, options_) + layer_energy(layers_[b], of_b, options_) + saved;
     const Given by{labels, of_a.k, ties_};
     refine_one(both, by, 1);
-    refine_one(both, by, 2);
+    refine_one(both, by, 4);
     if (layer_energy(both, by, options_) > before)
         return false;
     both.groups = layers_[a].groups;
