@@ -38,7 +38,7 @@ Side side_of(const Picture &here, const Picture &there, std::vector<Tie> ties, d
     const auto points = static_cast<Eigen::Index>(side.light.points());
     side.gain.assign(here.channels(), Eigen::VectorXd::Ones(points));
     side.offset.assign(here.channels(), Eigen::VectorXd::Zero(points));
-    side.sigma.assign(here.channels(), 0.05);
+    side.sigma.assign(here.channels(), 0.08); // wide at first: what is a pixel off still pulls
     return side;
 }
 

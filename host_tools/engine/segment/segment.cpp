@@ -36,7 +36,7 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
         progress(static_cast<double>(trace.size()) / steps);
     };
     note("start");
-    state.refine(1);
+    state.refine(4);
     note("fields");
     state.merge();
     note("merge");
