@@ -97,6 +97,11 @@ def check_selfcal() -> list[dict]:
     return rows_of("accept_selfcal.py")
 
 
+def check_segment() -> list[dict]:
+    """Motion segmentation over made-up, simulated and real pairs."""
+    return rows_of("accept_segment.py", "--pictures", BUILD / "accept/segment")
+
+
 def check_recon() -> list[dict]:
     """Reconstruction and tube against theory, and in rendered pipes."""
     return rows_of("accept_recon.py")
@@ -179,6 +184,7 @@ CHECKS: dict[str, Callable[[], list[dict]]] = {
     "calib": check_calib,
     "recognise": check_recognise,
     "selfcal": check_selfcal,
+    "segment": check_segment,
     "recon": check_recon,
     "link_seeds": check_link_seeds,
     "profile_store": check_profile_store,

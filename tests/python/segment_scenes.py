@@ -219,3 +219,54 @@ def boundary_score(found: np.ndarray, truth: np.ndarray, reach: int = 2) -> floa
     a, b = edges(found), edges(truth)
     right, seen = (a & near(b)).sum() / max(a.sum(), 1), (b & near(a)).sum() / max(b.sum(), 1)
     return float(2 * right * seen / max(right + seen, 1e-9))
+
+
+def label_agreement(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of pixels with the same label, the labels of `a` renamed to those of `b` that cover most of them."""
+    names = paired(b, a)
+    renamed = np.array([0, *(names[k] if names[k] else 255 for k in sorted(names))])[a]
+    return float((renamed == b).mean())
+
+
+def _nearest(xy: np.ndarray, field: np.ndarray) -> np.ndarray:
+    x, y = np.clip(np.rint(np.nan_to_num(xy)).astype(int), 0, np.array(field.shape[1::-1]) - 1).T
+    return field[y, x]
+
+
+def round_trips(s: Segmentation) -> np.ndarray:
+    """Pixels from where a labelled pixel of picture 1 is to where it comes back from picture 2; infinite if nowhere."""
+    out = []
+    for k, layer in enumerate(s.layers, 1):
+        y, x = np.nonzero(s.labels1 == k)
+        there = layer.flow1[y, x].astype(float)
+        # flow2 between its pixels: at the nearest one, and on by its slope.
+        cell = np.rint(there)
+        dy, dx = (np.nan_to_num(g) for g in np.gradient(layer.flow2, axis=(0, 1)))
+        back = _nearest(there, layer.flow2).astype(float)
+        back += (there - cell)[:, :1] * _nearest(there, dx) + (there - cell)[:, 1:] * _nearest(there, dy)
+        distance = np.hypot(*(back - np.stack([x, y], axis=1)).T)
+        out.append(np.where(np.isnan(distance), np.inf, distance))
+    return np.concatenate(out)
+
+
+def points_in_layers(s: Segmentation, rows: np.ndarray) -> dict:
+    """How labelled pairs of points (x1 y1 1 x2 y2 1 label, 0 is an outlier) lie in layers.
+
+    A pair is in a layer when both its points have its label. recall: share of a motion's pairs in its best layer;
+    purity: share of that motion among the right pairs there; outliers: share of wrong pairs that are in a layer and
+    less than 10 pixels from where it has them; same_layer: without the 10 pixels."""
+    one, two, truth = rows[:, :2], rows[:, 3:5], rows[:, -1].astype(int)
+    label = _nearest(one, s.labels1).astype(int)
+    label[label != _nearest(two, s.labels2)] = 0
+    near = np.zeros(len(rows), bool)
+    for k, layer in enumerate(s.layers, 1):
+        near |= (label == k) & (np.hypot(*(_nearest(one, layer.flow1) - two).T) < 10)
+    motions = []
+    for k in range(1, truth.max() + 1):
+        counts = np.bincount(label[truth == k], minlength=len(s.layers) + 1)
+        counts[0] = 0
+        best = int(counts.argmax())
+        right = ((label == best) & (truth > 0)).sum()
+        motions.append({"recall": counts[best] / (truth == k).sum(), "purity": counts[best] / max(right, 1)})
+    wrong = truth == 0
+    return {"motions": motions, "outliers": near[wrong].mean(), "same_layer": (label[wrong] > 0).mean()}
