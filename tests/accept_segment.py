@@ -171,7 +171,7 @@ def simulated(seed: int) -> Row:
     s = pf.segment_motion(*made.images, threads=2)
     seconds = time.process_time() - start
     moved, visible, _ = made.flow(0)
-    back, seen, _ = made.flow(1)
+    _, seen, _ = made.flow(1)
     labels = (np.where(visible, made.labels(0), 0), np.where(seen, made.labels(1), 0))
     row, names = judged(s, labels)
     errors = [
