@@ -29,7 +29,7 @@ public:
 
     // Finds the minimum; one() tells where it is. Of several minima always the same one. May be called once.
     int64_t solve();
-    bool one(int i) const { return value_[static_cast<size_t>(i)] == 1; }
+    bool one(int i) const { return one_[static_cast<size_t>(i)]; }
 
 private:
     struct Pair {
@@ -38,13 +38,10 @@ private:
     };
     struct Arcs;
 
-    void settle(const Arcs &arcs);
-    int64_t flow(const Arcs &arcs);
-
     int64_t constant_ = 0;
     std::vector<int64_t> term_; // paid where the variable is 1, less what is paid where it is 0
     std::vector<Pair> pairs_;
-    std::vector<int8_t> value_; // 0, 1, or -1 while it is open
+    std::vector<bool> one_;
 };
 
 } // namespace pipefish::segment
