@@ -79,6 +79,11 @@ def check_selfcal() -> list[Row]:
     return rows_of("accept_selfcal.py")
 
 
+def check_segment() -> list[Row]:
+    """Motion segmentation over made-up, simulated and real pairs."""
+    return rows_of("accept_segment.py", "--pictures", BUILD / "accept/segment")
+
+
 def check_recon() -> list[Row]:
     """Reconstruction and tube against theory, and in rendered pipes."""
     return rows_of("accept_recon.py")
@@ -170,6 +175,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "calib": check_calib,
     "recognise": check_recognise,
     "selfcal": check_selfcal,
+    "segment": check_segment,
     "recon": check_recon,
     "link_seeds": check_link_seeds,
     "link": check_link,

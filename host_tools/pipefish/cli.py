@@ -551,12 +551,14 @@ def build_parser() -> argparse.ArgumentParser:
     from pipefish.cli_dense import add_dense
     from pipefish.cli_match import add_match
     from pipefish.cli_recognise import add_recognise
+    from pipefish.cli_segment import add_segment
     from pipefish.cli_selfcal import add_selfcal
     from pipefish.cli_tube import add_tube
 
     add_tube(commands)
     add_match(commands)
     add_recognise(commands)
+    add_segment(commands)
     add_dense(commands)
     add_selfcal(commands)
 

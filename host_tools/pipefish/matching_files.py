@@ -18,20 +18,25 @@ from .matching import Matches, Seeds, grey
 COLUMNS = ("x1", "y1", "x2", "y2", "a11", "a12", "a21", "a22", "zncc")
 
 
-def read_grey(path: str | os.PathLike[str]) -> NDArray[np.float32]:
-    """A picture as (H,W) float32 of 0..1. Raises FormatError, OSError."""
+def read_pixels(path: str | os.PathLike[str]) -> NDArray[np.generic]:
+    """A picture as (H,W,3) uint8, or (H,W) uint16 where it is that. Raises FormatError, OSError."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as opened:
             deep = opened.mode.startswith("I;16")
-            pixels = np.asarray(opened) if deep else np.asarray(opened.convert("RGB"))
+            return np.asarray(opened) if deep else np.asarray(opened.convert("RGB"))
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
         raise FormatError(path, None, f"not a picture: {error}") from None
     except OSError as error:
         if error.errno is None:  # Pillow's own, for a damaged file
             raise FormatError(path, None, f"not a whole picture: {error}") from None
         raise
+
+
+def read_grey(path: str | os.PathLike[str]) -> NDArray[np.float32]:
+    """A picture as (H,W) float32 of 0..1. Raises FormatError, OSError."""
+    pixels = read_pixels(path)
     try:
         return grey(pixels, "picture")
     except ValueError as error:

@@ -1,6 +1,7 @@
 // Grouping and recognition for Python: _engine.group_matches, _engine.group_outlines, _engine.Prepared,
 // _engine.recognise. pipefish/grouping.py and recognition.py are what people use.
 #include "bind/arrays.hpp"
+#include "bind/matches.hpp"
 #include "group/recognise.hpp"
 
 #include <nanobind/nanobind.h>
@@ -21,29 +22,8 @@ namespace
 
 using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Marked = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Rows2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Maps = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
-using Values = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Labels = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Triples = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-
-std::vector<match::Match> matches_of(const Rows2 &xy1, const Rows2 &xy2, const Maps &affine, const Values &zncc)
-{
-    const size_t n = xy1.shape(0);
-    if (xy2.shape(0) != n || affine.shape(0) != n || zncc.shape(0) != n)
-        throw std::invalid_argument("xy1, xy2, affine and zncc: must be as long as each other");
-    std::vector<match::Match> out(n);
-    for (size_t k = 0; k < n; k++) {
-        match::Match &m = out[k];
-        m.x = static_cast<int>(xy1(k, 0));
-        m.y = static_cast<int>(xy1(k, 1));
-        m.centre = {static_cast<float>(xy2(k, 0)), static_cast<float>(xy2(k, 1))};
-        for (size_t i = 0; i < 4; i++)
-            m.a(static_cast<int>(i / 2), static_cast<int>(i % 2)) = static_cast<float>(affine(k, i / 2, i % 2));
-        m.zncc = static_cast<float>(zncc(k));
-    }
-    return out;
-}
 
 nb::tuple to_python(const Groups &g)
 {

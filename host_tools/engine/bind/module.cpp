@@ -10,6 +10,7 @@ void bind_detect(nb::module_ &m);
 void bind_group(nb::module_ &m);
 void bind_link(nb::module_ &m);
 void bind_match(nb::module_ &m);
+void bind_segment(nb::module_ &m);
 void bind_selfcal(nb::module_ &m);
 void bind_sfm(nb::module_ &m);
 void bind_sim(nb::module_ &m);
@@ -27,6 +28,7 @@ NB_MODULE(_engine, m)
     bind_group(m);
     bind_link(m);
     bind_match(m);
+    bind_segment(m);
     bind_selfcal(m);
     bind_sfm(m);
     bind_sim(m);

@@ -1,0 +1,44 @@
+// Labels and layers together: their energy, and what changes their number.
+#pragma once
+
+#include "segment/fit.hpp"
+#include "segment/segment.hpp"
+
+namespace pipefish::segment
+{
+
+class State
+{
+public:
+    State(const std::vector<Image> (&planes)[2], const std::vector<match::Match> &matches, const group::Groups &groups,
+          const Options &options);
+
+    double energy() const;
+    void refine(int steps);                // fields and noise of all layers
+    void relabel(int cycles);              // alpha-expansion
+    void merge();                          // pairs that are cheaper as one
+    void remove();                         // layers that are dearer than the background
+    void trust_pictures() { ties_ = 0.2; } // matches have served: from now on they count for less
+    size_t layers() const { return layers_.size(); }
+    Result result() const;
+
+private:
+    Given given(int k) const { return {labels_, k, ties_}; }
+    void refine_one(Layer &layer, const Given &by, int steps) const;
+    Problem problem() const;
+    int64_t boundary(int a, int b) const; // what edges between labels a and b cost
+    bool within_reach(const Layer &a, const Layer &b) const;
+    double cut(const LabelImage (&labels)[2]) const; // what all boundaries cost, nats
+    bool try_remove(int label, int heir);
+    bool try_merge(size_t a, size_t b);
+    void erase(size_t layer); // its labels have gone
+
+    Options options_;
+    Picture pictures_[2];
+    std::vector<Problem::Edge> edges_;
+    std::vector<Layer> layers_; // layer k - 1 has label k
+    LabelImage labels_[2];
+    double ties_ = 1;
+};
+
+} // namespace pipefish::segment

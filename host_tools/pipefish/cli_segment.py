@@ -1,0 +1,59 @@
+"""The command `pipefish segment`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from pipefish.cli import Result, add_command, positive, table
+
+
+def run_segment(args: argparse.Namespace) -> Result:
+    """Segments two pictures into layers and writes them."""
+    from pipefish.matching import match_quasi_dense
+    from pipefish.matching_files import read_pixels
+    from pipefish.progress import Progress
+    from pipefish.segmentation import planes, segment_motion
+    from pipefish.segmentation_files import document, write_segmentation
+
+    one, two = read_pixels(args.first), read_pixels(args.second)
+    with Progress("matching and segmenting", total=1.0, quiet=args.json) as bar:
+        bar.update(0, "matching")
+        m = match_quasi_dense(one, two, threads=args.threads)
+        s = segment_motion(
+            one,
+            two,
+            m,
+            layers=args.layers,
+            threads=args.threads,
+            progress=lambda share: bar.update(0.3 + 0.7 * share, "refining"),
+        )
+    files = write_segmentation(args.output, planes(one, args.first), planes(two, args.second), s)
+    rows: list[tuple[str, object]] = [("status", s.status), ("matches", len(m))]
+    for k, layer in enumerate(s.layers, 1):
+        share = 100 * layer.area1 / s.labels1.size, 100 * layer.area2 / s.labels2.size
+        text = f"{share[0]:.1f} and {share[1]:.1f} % of the pictures, correlation {layer.zncc1:.2f}"
+        if max(layer.ambiguous1, layer.ambiguous2) > 0.1:
+            text += ", ambiguous: another layer claims the same"
+        rows.append((f"layer {k}", text))
+    rows.append(("written", f"{len(files)} files in {args.output}"))
+    return document(s) | {"matches": len(m), "files": files}, table(rows)
+
+
+def add_segment(commands: Any) -> None:
+    """Adds `segment` to the command line."""
+    p = add_command(
+        commands,
+        "segment",
+        run_segment,
+        "Find what two pictures have in common, as layers that move, bend and are lit each in its own way. Writes the "
+        "labels of both pictures' pixels, each layer's fields of motion and of light, and a picture of it all.",
+        "pipefish segment first.png second.png -o out/\n  pipefish segment first.png second.png --threads 2 -o out/",
+    )
+    p.add_argument("first", metavar="A", help="picture")
+    p.add_argument("second", metavar="B", help="picture of the same things, moved")
+    p.add_argument("-o", "--output", required=True, metavar="FOLDER", help="for what is written")
+    p.add_argument(
+        "--layers", type=positive, default=12, metavar="N", help="the most groups of matches to start from [12]"
+    )
+    p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

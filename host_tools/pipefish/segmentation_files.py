@@ -1,0 +1,159 @@
+"""Files and pictures of motion segmentation: what `pipefish segment` writes."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .files import write_atomically
+from .matching_files import png
+from .segmentation import Floats32, Layer, Segmentation
+
+COLOURS = np.array(
+    [(0, 0, 0), (230, 60, 50), (60, 170, 255), (70, 210, 80), (255, 190, 30), (200, 100, 255), (40, 220, 210)],
+    np.uint8,
+)
+MESH = 16  # pixels between the lines of a mesh
+LINE = (20, 20, 20)
+Bytes = NDArray[np.uint8]
+
+
+def colour_of(label: NDArray[np.integer]) -> Bytes:
+    """(...,3) of labels; 0 is black, colours come again from the seventh layer on."""
+    last = len(COLOURS) - 1
+    return COLOURS[np.where(label > 0, (label.astype(int) - 1) % last + 1, 0)]
+
+
+def _bytes(image: Floats32) -> Bytes:
+    """(H,W,3) uint8 of (H,W,C) floats; what is not a number is black."""
+    wide = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+    return (255 * np.clip(np.nan_to_num(wide), 0, 1) + 0.5).astype(np.uint8)
+
+
+def _rows(planes: Floats32) -> Floats32:
+    return np.moveaxis(planes, 0, -1)
+
+
+def _side(layer: Layer, name: str, picture: int) -> Any:
+    return getattr(layer, f"{name}{picture}")
+
+
+def draw_labels(labels: Bytes) -> bytes:
+    """PNG whose values are the labels, with a palette of their colours."""
+    from PIL import Image
+
+    picture = Image.fromarray(labels)
+    picture.putpalette(colour_of(np.arange(256)).ravel().tolist())
+    out = io.BytesIO()
+    picture.save(out, "PNG")
+    return out.getvalue()
+
+
+def draw_cut(image: Floats32, labels: Bytes) -> Bytes:
+    """(H,W,3): the layers of a picture cut out, on white, each with an outline in its colour."""
+    out = _bytes(image)
+    out[labels == 0] = 255
+    edge = np.zeros(labels.shape, bool)
+    for axis in (0, 1):
+        for step in (-1, 1):
+            edge |= np.roll(labels, step, axis) != labels
+    edge &= labels > 0
+    out[edge] = colour_of(labels)[edge]
+    return out
+
+
+def draw_fields(s: Segmentation, picture: int) -> Bytes:
+    """(H,W,3) of picture 1 or 2: how each layer's light makes grey of the other picture look here, over the grey of the
+    background, and the regular mesh of the other picture as the layer's geometry has it here."""
+    from PIL import Image, ImageDraw
+
+    labels = s.labels1 if picture == 1 else s.labels2
+    canvas = np.full((*labels.shape, 3), 128, np.uint8)
+    for k, layer in enumerate(s.layers, 1):
+        on = labels == k
+        canvas[on] = _bytes(0.5 * _side(layer, "gain", picture) + _side(layer, "offset", picture))[on]
+    drawn = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(drawn)
+    for k, layer in enumerate(s.layers, 1):
+        _draw_mesh(
+            draw, _side(layer, "flow", 3 - picture), (s.labels2 if picture == 1 else s.labels1) == k, labels == k
+        )
+    return np.asarray(drawn)
+
+
+def _draw_mesh(draw: Any, flow: Floats32, there: NDArray[np.bool_], here: NDArray[np.bool_]) -> None:
+    """Lines of the other picture's rows and columns, carried here by `flow`; where both pictures have the layer."""
+    height, width = there.shape
+    lines = [(np.full(width, y), np.arange(width)) for y in range(MESH // 2, height, MESH)]
+    lines += [(np.arange(height), np.full(height, x)) for x in range(MESH // 2, width, MESH)]
+    for y, x in lines:
+        at = flow[y, x]
+        on = there[y, x] & np.isfinite(at).all(axis=1)
+        i, j = np.clip(np.rint(np.nan_to_num(at[:, ::-1])).astype(int), 0, np.array(here.shape) - 1).T
+        on &= here[i, j]
+        for piece in np.split(np.flatnonzero(on), np.flatnonzero(np.diff(np.flatnonzero(on)) > 1) + 1):
+            if len(piece) > 1:
+                draw.line([tuple(map(float, p)) for p in at[piece]], fill=LINE)
+
+
+def draw_overview(one: Floats32, two: Floats32, s: Segmentation) -> Bytes:
+    """(H,W,3): a row for each picture, the picture, its layers cut out, and their fields."""
+    rows = []
+    for picture, planes, labels in ((1, one, s.labels1), (2, two, s.labels2)):
+        parts = [_bytes(_rows(planes)), draw_cut(_rows(planes), labels), draw_fields(s, picture)]
+        gap = np.full((labels.shape[0], 6, 3), 255, np.uint8)
+        rows.append(np.concatenate([parts[0], gap, parts[1], gap, parts[2]], axis=1))
+    width = max(row.shape[1] for row in rows)
+    padded = [np.pad(r, ((0, 6), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
+    return np.concatenate(padded)
+
+
+def document(s: Segmentation) -> dict[str, Any]:
+    """For JSON: status, layers, energies."""
+    names = ("area", "sigma", "zncc", "folds", "low_evidence", "ambiguous")
+    layers = [
+        {"label": k, "groups": layer.groups}
+        | {f"{name}{p}": round(_side(layer, name, p), 5) for name in names for p in (1, 2)}
+        for k, layer in enumerate(s.layers, 1)
+    ]
+    trace = [{"step": step, "energy": round(energy, 3), "layers": layers} for step, energy, layers in s.trace]
+    return {"status": s.status, "layers": layers, "trace": trace}
+
+
+def _arrays(**arrays: NDArray[Any]) -> bytes:
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)
+    return out.getvalue()
+
+
+def write_segmentation(folder: str | os.PathLike[str], one: Floats32, two: Floats32, s: Segmentation) -> list[str]:
+    """Writes a segmentation of pictures (C,H,W): labels1.png, labels2.png, segmentation.png (all at a glance),
+    layers.json, and of each layer k: layer_k_flow.npz (flow1, flow2), layer_k_light.npz (gain and offset of both),
+    layer_k_warped1.png (picture 2 brought into picture 1, relit) and layer_k_residual1.png (the difference, four times,
+    around grey), the same of picture 2. Returns the names. Raises OSError."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    contents = {
+        "labels1.png": draw_labels(s.labels1),
+        "labels2.png": draw_labels(s.labels2),
+        "segmentation.png": png(draw_overview(one, two, s)),
+        "layers.json": json.dumps(document(s), indent=1).encode(),
+    }
+    for k, layer in enumerate(s.layers, 1):
+        contents[f"layer_{k}_flow.npz"] = _arrays(flow1=layer.flow1, flow2=layer.flow2)
+        light = {f"{name}{p}": _side(layer, name, p) for name in ("gain", "offset") for p in (1, 2)}
+        contents[f"layer_{k}_light.npz"] = _arrays(**light)
+        for p, planes, labels in ((1, one, s.labels1), (2, two, s.labels2)):
+            warped = np.where((labels == k)[..., None], _side(layer, "warped", p), np.nan)
+            residual = np.where(np.isnan(warped), 0.5, 0.5 + 4 * (_rows(planes) - warped)).astype(np.float32)
+            contents[f"layer_{k}_warped{p}.png"] = png(_bytes(warped))
+            contents[f"layer_{k}_residual{p}.png"] = png(_bytes(residual))
+    for name, data in contents.items():
+        write_atomically(folder / name, data)
+    return [str(folder / name) for name in contents]

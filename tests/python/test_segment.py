@@ -1,0 +1,219 @@
+"""Motion segmentation: the labels' minimisation, layers and fields on pictures whose truth is known, files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import pipefish as pf
+from pipefish import _engine
+from pipefish.cli import main
+from segment_scenes import (
+    Pair,
+    boundary_score,
+    flow_errors,
+    gain_rms,
+    label_agreement,
+    make_pair,
+    overlap,
+    paired,
+    points_in_layers,
+    round_trips,
+)
+
+SIZE = {"width": 240, "height": 180}
+
+
+def labelling(rng: np.random.Generator) -> tuple:
+    """A random problem as those of segmentation, small: two images of 2 x 4 pixels, three labels."""
+    n = 16
+    cost = rng.integers(0, 60, (3, n)).astype(np.int32)
+    cost[1:][rng.random((2, n)) < 0.15] = 1_000_000
+    edges = []
+    for image in (0, 8):
+        for y in range(2):
+            for x in range(4):
+                p = image + 4 * y + x
+                edges += [(p, p + 1)] if x < 3 else []
+                edges += [(p, p + 4)] if y < 1 else []
+                edges += [(p, p + 5)] if x < 3 and y < 1 else []
+    ends = np.array(edges, np.int32)
+    weight = rng.integers(0, 40, len(ends)).astype(np.int32)
+    partner = np.full((3, n), -1, np.int32)
+    partner[1:, :8], partner[1:, 8:] = rng.integers(8, 16, (2, 8)), rng.integers(0, 8, (2, 8))
+    partner[1:][rng.random((2, n)) < 0.2] = -1
+    labels = rng.integers(0, 3, n)
+    labels[cost[labels, np.arange(n)] >= 1_000_000] = 0
+    return cost, ends, weight, partner, int(rng.integers(0, 30)), labels.astype(np.uint8)
+
+
+def energies(cost, ends, weight, partner, lonely, labels) -> np.ndarray:
+    """(M,) of labels (M,N), by the definition."""
+    n = np.arange(labels.shape[1])
+    out = cost[labels, n].sum(axis=1, dtype=np.int64)
+    out += ((labels[:, ends[:, 0]] != labels[:, ends[:, 1]]) * weight).sum(axis=1)
+    to = partner[labels, n]
+    alone = (labels > 0) & (to >= 0) & (np.take_along_axis(labels, np.maximum(to, 0), axis=1) != labels)
+    return out + lonely * alone.sum(axis=1)
+
+
+def expansion_errors(problems: int, seed: int) -> int:
+    """How many single expansions of random problems end above the least energy of all 2^16 choices."""
+    rng = np.random.default_rng(seed)
+    choice = (np.arange(1 << 16)[:, None] >> np.arange(16)) & 1
+    wrong = 0
+    for _ in range(problems):
+        *problem, labels = labelling(rng)
+        alpha = int(rng.integers(0, 3))
+        free = np.flatnonzero((labels != alpha) & (problem[0][alpha] < 1_000_000))
+        every = np.repeat(labels[None], 1 << len(free), axis=0)
+        every[:, free] = np.where(choice[: 1 << len(free), : len(free)] > 0, alpha, every[:, free])
+        best = energies(*problem, every).min()
+        got, energy = _engine.segment_expand(*problem, alpha, labels)
+        wrong += energy != best or energies(*problem, got[None])[0] != best
+    return wrong
+
+
+def test_an_expansion_finds_the_best_of_all_choices():
+    """The cut against brute force, couplings between the images and forbidden labels among the costs."""
+    assert expansion_errors(1000, seed=1) == 0
+
+
+def test_expanding_all_labels_never_raises_the_energy():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        *problem, labels = labelling(rng)
+        before = energies(*problem, labels[None])[0]
+        got, energy = _engine.segment_expand(*problem, -1, labels)
+        assert energy == energies(*problem, got[None])[0] <= before
+        assert all(_engine.segment_expand(*problem, alpha, got)[1] == energy for alpha in range(3))
+
+
+@cache
+def scene(**kind) -> Pair:
+    return make_pair(**SIZE, **kind)
+
+
+@cache
+def segmented(light: float = 200.0, **kind) -> pf.Segmentation:
+    return pf.segment_motion(*scene(**kind).images, light=light)
+
+
+def test_bent_and_relit_patches_are_found_in_both_pictures():
+    """Outlines, motion and light, before unrelated backgrounds."""
+    pair, s = scene(seed=1), segmented(seed=1)
+    names = paired(s.labels1, pair.labels[0])
+    assert s.status == "ok" and len(s.layers) == 2 and sorted(names.values()) == [1, 2]
+    assert overlap(s.labels1, pair.labels[0], names) >= 0.92 and overlap(s.labels2, pair.labels[1], names) >= 0.92
+    errors = flow_errors(s, pair, names)
+    assert np.median(errors) <= 0.5 and np.quantile(errors, 0.95) <= 2
+    assert gain_rms(s, pair, names) <= 0.05
+
+
+def test_the_energy_never_rises():
+    for s in (segmented(seed=1), segmented(seed=3, covered=True)):
+        energy = np.array([step[1] for step in s.trace])
+        assert len(energy) > 8 and (np.diff(energy) <= 1e-6 * np.abs(energy[1:])).all()
+
+
+def test_the_way_there_and_back_ends_where_it_began():
+    distances = round_trips(segmented(seed=1))
+    assert len(distances) > 5000 and (distances <= 1).mean() >= 0.95
+
+
+def test_pictures_exchanged_give_the_same_layers():
+    s = segmented(seed=1)
+    back = pf.segment_motion(*scene(seed=1).images[::-1])
+    assert label_agreement(s.labels1, back.labels2) >= 0.97
+    assert label_agreement(s.labels2, back.labels1) >= 0.97
+
+
+def test_threads_do_not_change_the_result():
+    pair, s = scene(seed=1), segmented(seed=1)
+    other = pf.segment_motion(*pair.images, threads=3)
+    assert (other.labels1 == s.labels1).all() and (other.labels2 == s.labels2).all() and other.trace == s.trace
+    assert all(np.array_equal(a.flow1, b.flow1, equal_nan=True) for a, b in zip(s.layers, other.layers, strict=True))
+
+
+def test_light_that_may_not_vary_over_a_layer_loses_much_of_it():
+    """So the field of light is needed, and is what makes the first test pass."""
+    pair, s = scene(seed=1), segmented(light=1e6, seed=1)
+    names = paired(s.labels1, pair.labels[0])
+    assert overlap(s.labels1, pair.labels[0], names) <= 0.85
+
+
+def test_pictures_with_nothing_in_common_have_no_layers():
+    s = segmented(seed=2, patches=0)
+    assert s.status == "no common motion" and not s.layers
+    assert not s.labels1.any() and not s.labels2.any()
+
+
+def test_a_layer_that_covers_another_ends_at_its_outline():
+    pair, s = scene(seed=3, covered=True), segmented(seed=3, covered=True)
+    assert boundary_score(s.labels1, pair.labels[0]) >= 0.8 and boundary_score(s.labels2, pair.labels[1]) >= 0.8
+
+
+def test_layers_may_be_much_smaller_in_one_picture():
+    pair, s = scene(seed=4, scale=0.4), segmented(seed=4, scale=0.4)
+    names = paired(s.labels1, pair.labels[0])
+    assert overlap(s.labels1, pair.labels[0], names) >= 0.9
+    assert np.median(flow_errors(s, pair, names)) <= 0.5
+
+
+def test_grey_pictures_do_too():
+    pair = scene(seed=1)
+    s = pf.segment_motion(*(image.mean(axis=2) for image in pair.images))
+    names = paired(s.labels1, pair.labels[0])
+    assert overlap(s.labels1, pair.labels[0], names) >= 0.85 and s.layers[0].gain1.shape[2] == 1
+
+
+def test_real_motions_come_apart(real_data: Callable[[str], Path]):
+    """A bread and a cube that were moved each by itself, at half the size: the points of each in a layer of its own."""
+    folder = real_data("motion") / "breadcube"
+    halves = []
+    for k in (1, 2):
+        whole = np.asarray(Image.open(folder / f"breadcube{k}.png").convert("RGB")).astype(float)
+        halves.append(whole.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3)) / 255)
+    points = np.loadtxt(folder / "breadcube.txt")
+    points[:, [0, 1, 3, 4]] = (points[:, [0, 1, 3, 4]] - 0.5) / 2
+    found = points_in_layers(pf.segment_motion(*halves), points)
+    assert all(m["recall"] >= 0.8 and m["purity"] >= 0.9 for m in found["motions"])
+    assert found["outliers"] <= 0.15
+
+
+def test_the_command_writes_labels_fields_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pair = scene(seed=1)
+    for k, image in enumerate(pair.images):
+        Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(tmp_path / f"{k}.png")
+    out = tmp_path / "out"
+    assert main(["segment", str(tmp_path / "0.png"), str(tmp_path / "1.png"), "-o", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["status"] == "ok" and len(told["layers"]) == 2 and all(Path(f).exists() for f in told["files"])
+    labels = np.asarray(Image.open(out / "labels1.png"))
+    assert [(labels == k).sum() for k in (1, 2)] == [layer["area1"] for layer in told["layers"]]
+    assert json.loads((out / "layers.json").read_text())["trace"] == told["trace"]
+    with np.load(out / "layer_1_flow.npz") as flow, np.load(out / "layer_1_light.npz") as light:
+        assert np.isfinite(flow["flow1"][labels == 1]).mean() > 0.99
+        assert flow["flow2"].shape == (180, 240, 2) and light["gain1"].shape == (180, 240, 3)
+    assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 2 * 186)
+
+
+def test_bad_arguments_are_named():
+    image, other = np.zeros((64, 64)), np.zeros((64, 64, 3))
+    m = pf.match_quasi_dense(image, image)
+    for call, name in (
+        (lambda: pf.segment_motion(image, other), "colour"),
+        (lambda: pf.segment_motion(image, np.zeros((64, 65)), m), "m:"),
+        (lambda: pf.segment_motion(image, image, layers=0), "layers"),
+        (lambda: pf.segment_motion(image, image, threads=0), "threads"),
+        (lambda: pf.segment_motion(image, image, light=0), "light"),
+        (lambda: pf.segment_motion(image - 1, image), "image1"),
+    ):
+        with pytest.raises(pf.ArgumentError, match=name):
+            call()
