@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x70F89F03u
+#define GOLDEN 0x7902C6A7u
 
 void setUp(void) {}
 void tearDown(void) {}
