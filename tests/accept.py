@@ -129,7 +129,7 @@ def check_daemon_kills() -> list[dict]:
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 
 
-GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "e880a0e1"
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "3b781c87"
 
 
 def check_golden_replay() -> list[dict]:

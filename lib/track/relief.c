@@ -111,7 +111,7 @@ void pf_relief_make(const pf_klt *klt, pf_anchor *anchor, const int64_t plane[3]
     if (!klt->lens.ray || !klt->radius_q16)
         return;
     const pf_walk walk = walk_along(anchor->x - (klt->circle.x >> 16), anchor->y - (klt->circle.y >> 16));
-    int16_t flat[PATCH_MAX];
+    int16_t flat[PATCH_MAX] = {0};
     int32_t sum[PATCH_MAX] = {0};
     flatten(klt, plane, flat);
     sum_along(&walk, klt->window, 1, flat, sum);
