@@ -7,6 +7,8 @@
  *
  * The integral is the mean of both ways along the radius, with forgetting over 9 px: so it is nowhere far from ground,
  * and its constant does not matter. */
+#include <string.h>
+
 #include "track_private.h"
 
 #define FORGET 27 /* parts of 256 a pixel */
@@ -105,17 +107,16 @@ static void measure(const pf_klt *klt, pf_anchor *anchor, const int8_t *relief)
     anchor->relief_square = square > 0 ? (int32_t)square : 0;
 }
 
-void pf_relief_make(const pf_klt *klt, pf_anchor *anchor, const int64_t plane[3], int8_t *relief)
+void pf_relief_make(pf_klt *klt, pf_anchor *anchor, const int64_t plane[3], int8_t *relief)
 {
     anchor->relief_square = 0;
     if (!klt->lens.ray || !klt->radius_q16)
         return;
     const pf_walk walk = walk_along(anchor->x - (klt->circle.x >> 16), anchor->y - (klt->circle.y >> 16));
-    int16_t flat[PATCH_MAX] = {0};
-    int32_t sum[PATCH_MAX] = {0};
-    flatten(klt, plane, flat);
-    sum_along(&walk, klt->window, 1, flat, sum);
-    sum_along(&walk, klt->window, -1, flat, sum);
-    store(klt, sum, relief);
+    flatten(klt, plane, klt->c);
+    memset(klt->sum, 0, sizeof klt->sum);
+    sum_along(&walk, klt->window, 1, klt->c, klt->sum);
+    sum_along(&walk, klt->window, -1, klt->c, klt->sum);
+    store(klt, klt->sum, relief);
     measure(klt, anchor, relief);
 }

@@ -34,6 +34,7 @@ typedef struct pf_klt {
     int16_t t[PATCH_MAX], gx[PATCH_MAX], gy[PATCH_MAX];
     int16_t xgx[PATCH_MAX], xgy[PATCH_MAX];
     int16_t c[PATCH_MAX];
+    int32_t sum[PATCH_MAX]; /* of relief.c */
     uint8_t edge[(WINDOW_MAX + 3) * EDGE_ROW];
 } pf_klt;
 
@@ -141,8 +142,8 @@ bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t 
 
 /* The companion of the template in klt (.t, its gradients and `plane`, its sums times 1, x, y) around (x, y): what
  * comes up under a pattern of slopes as the light comes to stand square on them. Fills `relief` and the anchor's fields
- * of that name; `sum_j` are set. Zero without a lens and a circle. */
-void pf_relief_make(const pf_klt *klt, pf_anchor *anchor, const int64_t plane[3], int8_t *relief);
+ * of that name; `sum_j` are set, .c and .sum are scratch. Zero without a lens and a circle. */
+void pf_relief_make(pf_klt *klt, pf_anchor *anchor, const int64_t plane[3], int8_t *relief);
 
 /* --- bearings (rotation.c) --- */
 
