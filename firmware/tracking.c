@@ -16,8 +16,10 @@ struct pf_tracking {
     const pf_camera_fixed *camera; /* NULL = no profile: no prediction, no parallax */
     const pf_camera_rays *bearings;
     pf_predictor predictor;
-    void *motion_workspace; /* of the predictor */
-    pf_ray_q30 *rays;       /* of the whole table: live and just lost tracks */
+    pf_wall wall;
+    void *motion_workspace, *wall_workspace;
+    uint16_t *astray; /* rows of tracks that have walked off the wall */
+    pf_ray_q30 *rays; /* of the whole table: live and just lost tracks */
     pf_expected *expected;
     pf_keyframe_config choice;
     pf_keyframe_state choice_state;
@@ -50,6 +52,7 @@ static void forget_motion(pf_tracking *p)
     const double radius = c->survey.nominal_diameter_mm / 2e3;
     const uint32_t tracks = c->tracker.max_tracks;
     (void)pf_predictor_init(&p->predictor, tracks, p->motion_workspace, PF_PREDICTOR_BYTES(tracks));
+    (void)pf_wall_init(&p->wall, tracks, p->wall_workspace, PF_WALL_BYTES(tracks));
     if (radius > 0 && c->encoder.metres_per_count != 0)
         pf_predictor_assume(&p->predictor, (int32_t)lround(c->encoder.metres_per_count / radius * 1073741824.0 / 8));
 }
@@ -106,6 +109,7 @@ static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size
                            .circle_radius_q16 = (uint32_t)lround(radius * 65536.0),
                            .no_static_mask = !c->tracker.static_mask,
                            .polar = c->tracker.cells == PF_CELLS_POLAR,
+                           .has_wall = p->camera != NULL && c->tracker.prediction,
                            .lens = p->camera != NULL ? pf_track_lens_of(p->bearings, p->camera) : (pf_track_lens){0},
                            .mask = mask->data ? mask : NULL};
     size_t size = pf_tracker_workspace_size(&t);
@@ -121,10 +125,13 @@ static bool open_tracker(pf_tracking *p, const pf_image *mask, char *error, size
     p->workspace = aligned_alloc(16, (size + 15) / 16 * 16);
     p->choice_workspace = aligned_alloc(16, (PF_KEYFRAME_BYTES(t.max_tracks) + 15) / 16 * 16);
     p->motion_workspace = aligned_alloc(16, (PF_PREDICTOR_BYTES(t.max_tracks) + 15) / 16 * 16);
+    p->wall_workspace = aligned_alloc(16, (PF_WALL_BYTES(t.max_tracks) + 15) / 16 * 16);
+    p->astray = calloc(t.max_tracks, sizeof *p->astray);
     p->rays = calloc(2 * (size_t)t.max_tracks, sizeof *p->rays);
     p->expected = calloc(2 * (size_t)t.max_tracks, sizeof *p->expected);
     if (p->workspace == NULL || p->choice_workspace == NULL || p->motion_workspace == NULL || p->rays == NULL ||
-        p->expected == NULL || pf_tracker_init(&p->tracker, &t, p->workspace, size) != PF_OK ||
+        p->expected == NULL || p->wall_workspace == NULL || p->astray == NULL ||
+        pf_tracker_init(&p->tracker, &t, p->workspace, size) != PF_OK ||
         pf_keyframe_init(&p->choice_state, t.max_tracks, p->choice_workspace, PF_KEYFRAME_BYTES(t.max_tracks)) !=
             PF_OK) {
         (void)snprintf(error, n, "no memory for the tracker");
@@ -203,6 +210,8 @@ void pf_tracking_close(pf_tracking *p)
         return;
     free(p->expected);
     free(p->rays);
+    free(p->astray);
+    free(p->wall_workspace);
     free(p->motion_workspace);
     free(p->choice_workspace);
     free(p->workspace);
@@ -306,11 +315,15 @@ void pf_tracking_shot(void *tracking, void *item)
         expect(p, &hints);
     (void)pf_tracker_frame(p->tracker, &shot->frame.image, pf_now, shot->stage_ns);
     const pf_track *tracks = pf_tracker_tracks(p->tracker, &n);
-    shot->stats = *pf_tracker_last_stats(p->tracker);
     if (p->camera != NULL)
         pf_track_bearings(p->bearings, tracks, n, p->rays);
-    if (predicts)
+    if (predicts) {
+        const uint32_t astray =
+            pf_wall_check(&p->wall, tracks, p->rays, n, pf_track_project, p->camera, PF_WALL_MOST_Q16, p->astray);
+        pf_tracker_give_up(p->tracker, p->astray, astray);
         pf_predictor_learn(&p->predictor, tracks, p->rays, n, &hints);
+    }
+    shot->stats = *pf_tracker_last_stats(p->tracker);
     const uint32_t scene = update_scene(p, shot);
     shot->cause =
         pf_keyframe_decide(&p->choice_state, &p->choice, tracks, p->rays, n,

@@ -17,14 +17,17 @@
  * that the texture does not determine where they were, and every entry of the inverse below 2^10. */
 #define RIDGE      1024
 #define RIDGE_WARP 16384
-/* The warp is expected to be that at which a fit begins, but for 2 % each (0.02 of slope): (2 sigma^2 / 0.02^2) in the
- * unit of the normal matrix, Q6, with noise of sigma 2 in both patches. Texture that determines the warp has a hundred
- * times that; where there is little of it, an arbitrary warp would move the point by tenths of a pixel a frame. */
+/* The warp is expected to be that of a tube's wall (with a lens) or that at which a fit begins, but for 2 % each (0.02
+ * of slope): (2 sigma^2 / 0.02^2) in the unit of the normal matrix, Q6, with noise of sigma 2 in both patches. Texture
+ * that determines the warp has a hundred times that; where there is little of it, an arbitrary warp would move the
+ * point by tenths of a pixel a frame. */
 #define PRIOR        1280000
 #define SEARCH_REACH 2 /* steps */
 #define SEARCH_STEP  (2 << 16)
 #define EXCESS_MOST  (16 << 8)
 #define COV_MOST     ((int64_t)1 << 40)
+#define LEAST_VAR    512  /* of a template: less is nothing */
+#define RELIEF_LEAST 4096 /* of a companion's square: so the ratios below stay below 2^26 */
 
 static int32_t magnitude(int32_t v)
 {
@@ -101,6 +104,44 @@ static int64_t plane_part(const pf_klt *klt, const int64_t a[3], const int64_t b
     return a[0] * b[0] / n + a[1] * b[1] / xx + a[2] * b[2] / xx;
 }
 
+/* How much of the companion is in a fit. */
+typedef struct pf_relief {
+    const int8_t *image; /* NULL: none */
+    int64_t ratio_q16;   /* of the template in it */
+    int64_t square;      /* of what is off the template too; with what holds it back */
+    int64_t j[6];        /* that times the images */
+} pf_relief;
+
+/* Takes the template (`st` its product with the companion, `var` and `jt` its sums, off the plane) out of it. What
+ * holds it back, a quarter of its square, is that as a rule there is little of it. */
+static void pare_relief(const pf_anchor *anchor, int64_t st, int64_t var, const int64_t jt[6], pf_relief *out)
+{
+    out->ratio_q16 = st * 65536 / (var > LEAST_VAR ? var : LEAST_VAR);
+    out->square = anchor->relief_square - ((st * out->ratio_q16) >> 16) + anchor->relief_square / 4 + RELIEF_LEAST;
+    for (int32_t i = 0; i < 6; i++)
+        out->j[i] = anchor->relief_j[i] - ((jt[i] * out->ratio_q16) >> 16);
+}
+
+static int64_t relief_part(const pf_klt *klt, const pf_anchor *anchor, const int64_t sum[3])
+{
+    const int64_t own[3] = {anchor->relief_sum[0], anchor->relief_sum[1], anchor->relief_sum[2]};
+    return plane_part(klt, own, sum);
+}
+
+/* The normal matrix once the companion is eliminated as well. */
+static void without_relief(const pf_klt *klt, const pf_anchor *anchor, const int8_t *image, pf_normal_sums *s,
+                           int64_t var)
+{
+    pf_relief relief;
+    const int64_t st = PF_KERNEL(relief)(image, klt->t, klt->window, klt->groups) - relief_part(klt, anchor, s->t);
+    pare_relief(anchor, st, var, s->jt, &relief);
+    for (int32_t a = 0; a < 6; a++)
+        for (int32_t b = a; b < 6; b++) {
+            s->h[a][b] -= (relief.j[a] * (relief.j[b] * 256 / relief.square)) >> 8;
+            s->h[b][a] = s->h[a][b];
+        }
+}
+
 void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anchor *anchor, uint8_t *pixels)
 {
     const int32_t ix = (at.x + 32768) >> 16, iy = (at.y + 32768) >> 16, w = row_bytes(klt), half = klt->half;
@@ -124,6 +165,8 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
             anchor->sum_j[a][b] = (int32_t)s.j[a][b];
     for (int32_t a = 0; a < 6; a++)
         s.jt[a] -= plane_part(klt, s.j[a], s.t);
+    int8_t *relief = (int8_t *)(pixels + pf_relief_at((uint32_t)klt->window));
+    pf_relief_make(klt, anchor, s.t, relief);
     for (int32_t a = 0; a < 6; a++)
         for (int32_t b = a; b < 6; b++) {
             /* Q8 of the ratio: it times dot_jt stays below 2^62 */
@@ -131,6 +174,8 @@ void pf_anchor_take(pf_klt *klt, const pf_image *image, pf_point_q16 at, pf_anch
             s.h[a][b] -= plane_part(klt, s.j[a], s.j[b]) + ((s.jt[a] * ratio) >> 8);
             s.h[b][a] = s.h[a][b];
         }
+    if (anchor->relief_square > 0)
+        without_relief(klt, anchor, relief, &s, var_t);
     for (int32_t a = 0; a < 6; a++)
         if (s.h[a][a] < 0)
             s.h[a][a] = 0;
@@ -159,11 +204,15 @@ static bool sample_warped(pf_klt *klt, const pf_image *image, pf_point_q16 centr
 typedef struct pf_rhs {
     int64_t b[6], gain_q14;
     int64_t cov, var; /* with the template, and of the patch */
+    int64_t relief;   /* what of var is the companion's */
 } pf_rhs;
 
 /* What of the template changes with the smoothing. */
 typedef struct pf_reference {
     int64_t sum[3], var, b[6];
+    pf_relief relief;
+    bool has_warp; /* the wall's: with a lens */
+    int32_t warp[4];
 } pf_reference;
 
 /* Sums of the patch c and their parts off the plane. */
@@ -202,8 +251,11 @@ static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *
     images.smooth[1] = (int16_t)(y / 9);
     PF_KERNEL(unpack)(pixels, klt->whole, klt->window, klt->groups, &images);
     pf_bow bow;
-    if (klt->lens.ray && pf_bow_between(&klt->lens, klt->half, anchor->x, anchor->y, centre, &bow))
+    out->has_warp = klt->lens.ray && pf_bow_between(&klt->lens, klt->half, anchor->x, anchor->y, centre, &bow);
+    if (out->has_warp) {
         PF_KERNEL(bend)(bow.c, klt->window, klt->groups, &images);
+        memcpy(out->warp, bow.warp, sizeof bow.warp);
+    }
     pf_affine_sums s;
     pf_rhs rhs;
     PF_KERNEL(affine)(klt->t, &images, klt->window, klt->groups, &s);
@@ -213,6 +265,12 @@ static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *
         out->b[i] = rhs.b[i];
     for (int32_t i = 0; i < 3; i++)
         out->sum[i] = s.c[i];
+    out->relief.image = NULL;
+    if (anchor->relief_square == 0)
+        return;
+    out->relief.image = (const int8_t *)(pixels + pf_relief_at((uint32_t)klt->window));
+    const int64_t st = PF_KERNEL(relief)(out->relief.image, klt->t, klt->window, klt->groups);
+    pare_relief(anchor, st - relief_part(klt, anchor, s.c), out->var, out->b, &out->relief);
 }
 
 static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, const pf_reference *t, pf_rhs *out)
@@ -226,6 +284,15 @@ static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, const pf_refer
     const int64_t gain_q16 = out->cov * 65536 / t->var;
     for (int32_t i = 0; i < 6; i++)
         out->b[i] -= (t->b[i] * gain_q16) >> 16;
+    out->relief = 0;
+    if (!t->relief.image)
+        return;
+    const int64_t of = PF_KERNEL(relief)(t->relief.image, klt->c, klt->window, klt->groups) -
+                       relief_part(klt, anchor, s.c) - ((out->cov * t->relief.ratio_q16) >> 16);
+    const int64_t share_q16 = of * 65536 / t->relief.square;
+    for (int32_t i = 0; i < 6; i++)
+        out->b[i] -= (t->relief.j[i] * share_q16) >> 16;
+    out->relief = (of * share_q16) >> 16;
 }
 
 /* The step d: Q16 pixels, Q16 warp. */
@@ -270,11 +337,23 @@ static pf_point_q16 warped_offset(const pf_anchor *anchor)
  * front of something. */
 static int32_t excess(const pf_klt *klt, const pf_rhs *rhs)
 {
-    const int64_t left = rhs->var - rhs->cov * rhs->gain_q14 / GAIN_ONE;
+    const int64_t left = rhs->var - rhs->relief - rhs->cov * rhs->gain_q14 / GAIN_ONE;
     const int64_t gain2 = rhs->gain_q14 * rhs->gain_q14 / GAIN_ONE;
     const int64_t noise = (int64_t)klt->window * klt->window * klt->noise_var_q8 * (GAIN_ONE + gain2) / GAIN_ONE;
     const int64_t ratio = noise > 0 ? left * 256 / noise : EXCESS_MOST;
     return ratio < 256 ? 256 : ratio > EXCESS_MOST ? EXCESS_MOST : (int32_t)ratio;
+}
+
+/* How far warp a is from g, in g's coordinates: gone[2..5]. Unchanged where g has no inverse of use. */
+static void warp_between(const int32_t g[4], const int32_t a[4], int32_t gone[6])
+{
+    const int64_t det = ((int64_t)g[0] * g[3] - (int64_t)g[1] * g[2]) >> 16;
+    if (det < 4096)
+        return;
+    for (int32_t k = 0; k < 2; k++) {
+        gone[2 + k] = pf_clamp_i64(((int64_t)g[3] * a[k] - (int64_t)g[1] * a[2 + k]) / det - (k ? 0 : 65536), 65536);
+        gone[4 + k] = pf_clamp_i64(((int64_t)g[0] * a[2 + k] - (int64_t)g[2] * a[k]) / det - (k ? 65536 : 0), 65536);
+    }
 }
 
 pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, const uint8_t *pixels, pf_point_q16 *at)
@@ -282,10 +361,12 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     pf_fit fit = {PF_TRACK_OK, 0, GAIN_ONE};
     const pf_point_q16 before = warped_offset(anchor);
     pf_point_q16 centre = {at->x - before.x, at->y - before.y};
-    pf_rhs rhs = {{0}, GAIN_ONE, 0, 0};
+    pf_rhs rhs = {{0}, GAIN_ONE, 0, 0, 0};
     pf_reference reference;
     take_reference(klt, anchor, pixels, centre, &reference);
-    int32_t moved = 0, gone[6] = {0}; /* from the warp at the beginning */
+    int32_t moved = 0, gone[6] = {0}; /* from the wall's warp; without a lens from that at the beginning */
+    if (reference.has_warp)
+        warp_between(reference.warp, anchor->a, gone);
     for (int32_t i = 0; i < klt->iterations; i++) {
         if (!sample_warped(klt, image, centre, anchor->a)) {
             fit.reason = PF_TRACK_LEFT;
@@ -316,7 +397,7 @@ pf_fit pf_anchor_fit(pf_klt *klt, const pf_image *image, pf_anchor *anchor, cons
     }
     const pf_point_q16 after = warped_offset(anchor);
     *at = (pf_point_q16){centre.x + after.x, centre.y + after.y};
-    fit.zncc_q15 = pf_likeness(klt, rhs.cov, reference.var, rhs.var, (int64_t)klt->window * klt->window);
+    fit.zncc_q15 = pf_likeness(klt, rhs.cov, reference.var, rhs.var - rhs.relief, (int64_t)klt->window * klt->window);
     fit.gain_q14 = (int32_t)rhs.gain_q14;
     anchor->excess_q8 = excess(klt, &rhs);
     if (moved > NOT_SETTLED)

@@ -70,6 +70,8 @@ static bool bend_of(const pf_point_q16 p[PLACES], int32_t half, pf_bow *bow)
     const int32_t most = ((1 << 24) - (1 << 12)) / (3 * half * half);
     if (det < least)
         return false;
+    for (int32_t k = 0; k < 4; k++)
+        bow->warp[k] = pf_clamp_i64(a[k / 2][k % 2] / (2 * half), WARP_MOST);
     for (int32_t k = 0; k < 3; k++) { /* 2^57 at most */
         bow->c[k] = pf_clamp_i64((a[1][1] * bend[k][0] - a[0][1] * bend[k][1]) * 256 / det / half, most);
         bow->c[3 + k] = pf_clamp_i64((a[0][0] * bend[k][1] - a[1][0] * bend[k][0]) * 256 / det / half, most);

@@ -8,6 +8,7 @@
 #define RENEW        (65536 / 5)
 #define PULL_MAX     (3 << 16) /* the template may move a track by 3 px from where half resolution put it */
 #define DRIFT_SLACK  3277      /* the template may look 0.1 less similar than the previous patch */
+#define WALL_SLACK   6554      /* 0.2 */
 #define CERTAIN      (2 << 16) /* a track found this near its start is next sought from half resolution on */
 #define GUESS_MOST   (4096 << 16)
 #define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
@@ -183,6 +184,18 @@ static pf_track_reason believe(const pf_tracker *t, const pf_fit *fit, pf_point_
     return PF_TRACK_OK;
 }
 
+/* Where the wall is looked after, a patch may look less alike and lie farther from where the way back leads: at the rim
+ * of clay and plastic most of what was lost for that was in its place. */
+static int32_t least_likeness(const pf_tracker *t)
+{
+    return (int32_t)t->config.min_zncc_q15 - (t->config.has_wall ? WALL_SLACK : 0);
+}
+
+static int64_t most_apart(const pf_tracker *t)
+{
+    return (int64_t)t->config.fb_q16 * (t->config.has_wall ? 2 : 1);
+}
+
 /* Brings a track and its slot up to date: found at `fine`. */
 static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 fine, const pf_fit *anchored,
                    int32_t quality)
@@ -232,14 +245,14 @@ static pf_track_reason attempt(pf_tracker *t, pf_track *track, uint16_t slot, pf
     if (anchored.reason == PF_TRACK_OK)
         fit = pf_klt_track(&t->klt, to, from, fine, &back, 0, 0);
     pf_track_reason reason = fit.reason;
-    if (reason == PF_TRACK_OK && fit.zncc_q15 < (int32_t)t->config.min_zncc_q15)
+    if (reason == PF_TRACK_OK && fit.zncc_q15 < least_likeness(t))
         reason = PF_TRACK_RESIDUAL;
-    if (reason == PF_TRACK_OK && farther(back, old, t->config.fb_q16))
+    if (reason == PF_TRACK_OK && farther(back, old, most_apart(t)))
         reason = PF_TRACK_BACKWARD;
     if (reason == PF_TRACK_OK && farther(fine, at, PULL_MAX))
         reason = PF_TRACK_DRIFT;
     if (reason == PF_TRACK_OK)
-        reason = believe(t, &anchored, fine, (int32_t)t->config.min_zncc_q15 - DRIFT_SLACK, s->clipped);
+        reason = believe(t, &anchored, fine, least_likeness(t) - DRIFT_SLACK, s->clipped);
     if (reason == PF_TRACK_OK) {
         s->sure = !farther(fine, guess, CERTAIN);
         accept(t, track, slot, fine, &anchored, fit.zncc_q15);
@@ -282,8 +295,8 @@ static pf_track_reason attempt_warped(pf_tracker *t, pf_track *track, uint16_t s
     pf_track_reason reason = first.reason;
     if (reason == PF_TRACK_OK) {
         const pf_fit second = fit_warped(t, slot, &saved, warp, &two);
-        reason = believe(t, &second, two, (int32_t)t->config.min_zncc_q15, t->slots[slot].clipped);
-        if (reason == PF_TRACK_OK && farther(one, two, t->config.fb_q16))
+        reason = believe(t, &second, two, least_likeness(t), t->slots[slot].clipped);
+        if (reason == PF_TRACK_OK && farther(one, two, most_apart(t)))
             reason = PF_TRACK_DIVERGED;
         if (reason == PF_TRACK_OK) {
             t->slots[slot].sure = false;
@@ -388,6 +401,18 @@ static void drop_stuck(pf_tracker *t)
         }
 }
 
+void pf_tracker_give_up(pf_tracker *tracker, const uint16_t *rows, uint32_t n)
+{
+    for (uint32_t i = 0; i < n; i++) {
+        if (rows[i] >= tracker->n || tracker->table[rows[i]].status == PF_TRACK_LOST)
+            continue;
+        tracker->stats.live--;
+        if (tracker->table[rows[i]].status == PF_TRACK_TRACKED)
+            tracker->stats.tracked--;
+        lose(tracker, rows[i], PF_TRACK_DRIFT);
+    }
+}
+
 /* Whether another start may help: it cannot where the patch itself is the reason. */
 static bool worth_another(pf_track_reason reason)
 {
@@ -463,10 +488,10 @@ static pf_track_reason seek(pf_tracker *t, pf_track *track, uint16_t slot, const
     return may_try(t) ? attempt(t, track, slot, near, top, 0, &other) : reason;
 }
 
-static bool is_vague(const pf_track *track, const pf_slot *slot)
+static bool is_vague(const pf_tracker *t, const pf_track *track, const pf_slot *slot)
 {
     const uint64_t now = (uint64_t)track->cov_xx_q20 + track->cov_yy_q20;
-    return now > VAGUE || (now > WORN && now > WORSE * slot->first_cov);
+    return t->config.has_wall ? now > 2u * VAGUE : now > VAGUE || (now > WORN && now > WORSE * slot->first_cov);
 }
 
 /* Finds one track. What is expected of it is first put right by how far its neighbours were from where they were
@@ -483,7 +508,7 @@ static pf_track_reason follow(pf_tracker *t, pf_track *track, uint16_t slot)
         e->at = (pf_point_q16){pf_guess_clamp((int64_t)given.x + miss.x, t->config.width),
                                pf_guess_clamp((int64_t)given.y + miss.y, t->config.height)};
     pf_track_reason reason = seek(t, track, slot, has_near ? &around : NULL);
-    if (reason == PF_TRACK_OK && is_vague(track, s))
+    if (reason == PF_TRACK_OK && is_vague(t, track, s))
         reason = PF_TRACK_DRIFT;
     e->at.x = PF_NO_GUESS;
     s->miss = (pf_point_q16){0, 0};

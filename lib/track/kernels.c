@@ -153,6 +153,15 @@ void pf_c_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_norma
     }
 }
 
+int64_t pf_c_relief(const int8_t *relief, const int16_t *c, int32_t window, int32_t groups)
+{
+    int32_t sum = 0; /* 127 * 2040 * 961 at most */
+    for (int32_t r = 0; r < window; r++)
+        for (int32_t i = 0; i < 8 * groups; i++)
+            sum += relief[r * 8 * groups + i] * c[r * PATCH_ROW + i];
+    return sum;
+}
+
 void pf_c_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
 {
     const uint8_t *above = p - stride, *below = p + stride;

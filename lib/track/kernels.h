@@ -141,6 +141,8 @@ typedef struct pf_tensor_row {
     void set##_warp(const pf_warp *warp, const int16_t *mask, int32_t window, int32_t groups, int16_t *out);           \
     void set##_affine(const int16_t *c, const pf_gradients *g, int32_t window, int32_t groups, pf_affine_sums *sums);  \
     void set##_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_normal_sums *sums);                    \
+    /* The sum of a patch times a companion, |.| <= 127, in rows of whole groups. */                                   \
+    int64_t set##_relief(const int8_t *relief, const int16_t *c, int32_t window, int32_t groups);                      \
     /* Of the doubled gradients at p[0..n), n rounded up to whole groups of 8. */                                      \
     void set##_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out);                                 \
     /* Sums over 3 x 3 of three rows of such: sum[k][i] over row[j][k][i .. i + 2], i < n. Returns a bound of twice    \

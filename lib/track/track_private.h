@@ -34,6 +34,7 @@ typedef struct pf_klt {
     int16_t t[PATCH_MAX], gx[PATCH_MAX], gy[PATCH_MAX];
     int16_t xgx[PATCH_MAX], xgy[PATCH_MAX];
     int16_t c[PATCH_MAX];
+    int32_t sum[PATCH_MAX]; /* of relief.c */
     uint8_t edge[(WINDOW_MAX + 3) * EDGE_ROW];
 } pf_klt;
 
@@ -54,7 +55,10 @@ typedef struct pf_anchor {
     int32_t scale[6];    /* log2 of each parameter's scale */
     int32_t sum_j[6][3]; /* sums of the steepest-descent images times 1, x, y */
     int32_t excess_q8;   /* of the last fit: what was left over what noise leaves, at least 1, at most 16 */
-    int64_t carried[3];  /* covariance (xx, xy, yy) with which it was put there, Q20 px^2: zero at first sight */
+    int32_t relief_sum[3],
+        relief_j[6];       /* of the companion (relief.c): times 1, x, y; times the images, off the plane */
+    int32_t relief_square; /* its square, off the plane; 0: there is none */
+    int64_t carried[3];    /* covariance (xx, xy, yy) with which it was put there, Q20 px^2: zero at first sight */
 } pf_anchor;
 
 uint32_t pf_isqrt64(uint64_t n);
@@ -81,10 +85,16 @@ int32_t pf_likeness(const pf_klt *klt, int64_t cov, int64_t var_a, int64_t var_b
 /* Sets the parameters but the circle, which is the caller's. `noise_q8`: sigma. */
 void pf_klt_init(pf_klt *klt, uint32_t window, uint32_t iterations, uint32_t min_eigen, uint32_t noise_q8);
 
-/* Bytes of a template's pixels. */
+/* Where in a template's bytes its companion begins: rows of whole groups of 8. Vectors read 8 pixels at a time. */
+static inline uint32_t pf_relief_at(uint32_t window)
+{
+    return (window + 2u) * (window + 2u) + 8u;
+}
+
+/* Bytes of a template's pixels and of its companion. */
 static inline uint32_t pf_anchor_bytes(uint32_t window)
 {
-    return (window + 2u) * (window + 2u) + 8u; /* vectors read 8 pixels at a time */
+    return pf_relief_at(window) + window * ((window + 7u) / 8u * 8u);
 }
 
 /* Whether the window around `at`, with one pixel of border, lies inside the image and the circle. */
@@ -121,11 +131,19 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
  * (c[0] xx + c[1] xy + c[2] yy, c[3] xx + c[4] xy + c[5] yy), Q24 per pixel; displacements stay below a pixel. */
 typedef struct pf_bow {
     int32_t c[6];
+    int32_t warp[4]; /* the affine part a itself, Q16.16, row-major */
 } pf_bow;
 
 /* The bow of the patch around the whole pixel (x, y) once it is seen around `to`, the tube along the optical axis, the
  * camera driven along it or turned about it. False, and no bow, where the lens does not tell. */
 bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t y, pf_point_q16 to, pf_bow *bow);
+
+/* --- relief (relief.c) --- */
+
+/* The companion of the template in klt (.t, its gradients and `plane`, its sums times 1, x, y) around (x, y): what
+ * comes up under a pattern of slopes as the light comes to stand square on them. Fills `relief` and the anchor's fields
+ * of that name; `sum_j` are set, .c and .sum are scratch. Zero without a lens and a circle. */
+void pf_relief_make(pf_klt *klt, pf_anchor *anchor, const int64_t plane[3], int8_t *relief);
 
 /* --- bearings (rotation.c) --- */
 

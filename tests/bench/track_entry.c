@@ -122,8 +122,8 @@ uint32_t entry_tracks(const entry *e, uint64_t *id, float *xy, float *cov, uint8
     return n;
 }
 
-/* Bytes of all that tracking keeps between frames, the frames themselves apart: tracker, prediction, keyframe choice,
- * scene, bearings and guesses of the table, and an equidistant lens of 180 degrees with its table of rays. */
+/* Bytes of all that tracking keeps between frames, the frames themselves apart: tracker, prediction, wall, keyframe
+ * choice, scene, bearings and guesses of the table, and an equidistant lens of 180 degrees with its table of rays. */
 size_t entry_memory(uint32_t width, uint32_t height, uint32_t tracks, uint32_t step)
 {
     const pf_tracker_config config = {.width = width, .height = height, .max_tracks = tracks};
@@ -143,8 +143,8 @@ size_t entry_memory(uint32_t width, uint32_t height, uint32_t tracks, uint32_t s
     if (block && pf_camera_fixed_init(&camera, &lens, block, fixed) == PF_OK)
         sum = fixed + pf_camera_rays_workspace_size(camera, step) + pf_tracker_workspace_size(&config) +
               PF_PREDICTOR_BYTES(tracks) + sizeof(pf_predictor) + PF_KEYFRAME_BYTES(tracks) +
-              sizeof(pf_keyframe_state) + sizeof(pf_scene) +
-              2 * (size_t)tracks * (sizeof(pf_ray_q30) + sizeof(pf_expected));
+              sizeof(pf_keyframe_state) + sizeof(pf_scene) + PF_WALL_BYTES(tracks) + sizeof(pf_wall) +
+              tracks * sizeof(uint16_t) + 2 * (size_t)tracks * (sizeof(pf_ray_q30) + sizeof(pf_expected));
     free(block);
     return sum;
 }

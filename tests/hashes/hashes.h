@@ -10,7 +10,7 @@
 #define HASH_PYRAMID      0xE7D88B04u
 #define HASH_CAMERA_REAL  0xC2558C27u
 #define HASH_CAMERA_FIXED 0x38143ED2u
-#define HASH_TRACK        0xbf19795eu
+#define HASH_TRACK        0x9566bdeeu
 #define HASH_LINK         0x168E8C19u
 #define HASH_PROFILE      0xC3F18A3Fu
 

@@ -19,6 +19,8 @@ static pf_ray_q30 rays[PF_TRACKS_MAX];
 static pf_expected expected[PF_TRACKS_MAX];
 static pf_predictor predictor;
 static _Alignas(16) uint8_t predictor_block[PF_PREDICTOR_BYTES(TRACKS)];
+static pf_wall wall;
+static _Alignas(16) uint8_t wall_block[PF_WALL_BYTES(TRACKS)];
 static pf_scene scene;
 static _Alignas(16) uint8_t camera_block[4000], rays_block[30000];
 static const pf_camera_fixed *camera;
@@ -103,7 +105,7 @@ static bool make_lens(void)
 
 /* What came of a replay. */
 typedef struct golden {
-    uint32_t crc, tracked, keyframes, flags; /* flags: all that were ever set */
+    uint32_t crc, tracked, keyframes, astray, flags; /* flags: all that were ever set */
 } golden;
 
 static uint32_t hash_frame(uint32_t crc, const pf_tracker *tracker, uint32_t flags)
@@ -135,7 +137,7 @@ static uint32_t hash_guesses(uint32_t crc, const pf_track *tracks, uint32_t n, c
 /* False: the tracker could not be made. */
 static bool golden_replay(uint32_t frames, golden *out)
 {
-    *out = (golden){0, 0, 0, 0};
+    *out = (golden){0, 0, 0, 0, 0};
     if (!make_lens())
         return false;
     const pf_tracker_config config = {.width = WIDTH,
@@ -144,12 +146,14 @@ static bool golden_replay(uint32_t frames, golden *out)
                                       .window = 15,
                                       .circle = {(WIDTH / 2) << 16, (HEIGHT / 2) << 16},
                                       .circle_radius_q16 = 150u << 16,
+                                      .has_wall = true,
                                       .lens = pf_track_lens_of(table, camera)};
     const pf_keyframe_config choice = {.step_counts = 30, .parallax_urad = 60000, .min_common = 40};
     pf_tracker *tracker;
     make_texture();
     if (pf_keyframe_init(&keyframes, TRACKS, keyframes_block, sizeof keyframes_block) != PF_OK ||
         pf_predictor_init(&predictor, TRACKS, predictor_block, sizeof predictor_block) != PF_OK ||
+        pf_wall_init(&wall, TRACKS, wall_block, sizeof wall_block) != PF_OK ||
         pf_tracker_init(&tracker, &config, workspace, sizeof workspace) != PF_OK)
         return false;
     for (uint32_t k = 0; k < frames; k++) {
@@ -171,7 +175,16 @@ static bool golden_replay(uint32_t frames, golden *out)
             return false;
         tracks = pf_tracker_tracks(tracker, &n);
         pf_track_bearings(table, tracks, n, rays);
+        static uint16_t astray[TRACKS];
+        const uint32_t lost = pf_wall_check(&wall, tracks, rays, n, pf_track_project, camera, 20000, astray);
+        for (uint32_t i = 0; i < lost; i++)
+            out->crc = hash_u32(out->crc, astray[i]);
+        out->astray += lost;
+        if (k % 2u) /* now and then they stay */
+            pf_tracker_give_up(tracker, astray, lost);
         pf_predictor_learn(&predictor, tracks, rays, n, &hints);
+        for (uint32_t i = 0; i < 10u; i++)
+            out->crc = hash_u32(out->crc, (uint32_t)wall.motion[i]);
         const uint32_t flags = pf_scene_update(&scene, &pf_tracker_last_stats(tracker)->scene, &light);
         const pf_keyframe_cause cause = pf_keyframe_decide(&keyframes, &choice, tracks, rays, n,
                                                            hints.has_encoder ? &hints.encoder : NULL, flags, &common);

@@ -178,6 +178,11 @@ static void test_affine_kernels_are_the_same_bits(void)
             BOTH(affine, kind % 3u ? in[0] : in[1], &g, window, groups, &r->affine);
             BOTH(normal, &g, window, groups, &r->normal);
             compare("affine", 0);
+            int8_t relief[31 * 32];
+            for (uint32_t i = 0; i < sizeof relief; i++)
+                relief[i] = (int8_t)(kind % 2u ? (int32_t)(next_random() % 255u) - 127 : 127);
+            const int16_t *c = kind % 3u ? in[0] : in[1];
+            TEST_ASSERT_EQUAL_INT64(pf_c_relief(relief, c, window, groups), pf_neon_relief(relief, c, window, groups));
         }
 }
 

@@ -31,8 +31,8 @@ typedef enum pf_track_reason {
     PF_TRACK_RESIDUAL = 4, /* the patch no longer looks the same */
     PF_TRACK_BACKWARD = 5, /* forward-backward check failed */
     PF_TRACK_CROWDED = 6,  /* ran into an older track */
-    PF_TRACK_DRIFT = 7,    /* no longer looks like its template (first sight, renewed as its shape changes), or lies
-                            * elsewhere than the template says */
+    PF_TRACK_DRIFT = 7,    /* no longer looks like its template (first sight, renewed as its shape changes), lies
+                            * elsewhere than the template says, or has walked off the wall */
     PF_TRACK_MASKED = 8,   /* ran into a masked part of the picture */
     PF_TRACK_STATIC = 9,   /* stands still, or nearly, while all around it moves: a reflection of the lamp, dirt on the
                             * lens, the camera's own shadow */
@@ -90,6 +90,8 @@ typedef struct pf_tracker_config {
     pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
                          * warp alone leaves 0.02 px a fifth of growth, the same way for all; and no track begins at
                          * the edge of the glare [none] */
+    bool has_wall; /* the caller gives up what walks off the wall, with pf_wall_check: what is left need look less alike
+                    * (0.2 less than min_zncc, twice fb, twice the variance at which a track is lost) */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
                  * in each, none in its inner eighth (no parallax there); needs a circle */
 } pf_tracker_config;
@@ -167,6 +169,10 @@ pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, ui
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
 const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
 
+/* Gives up the live tracks in these rows of the table, each named once: they are lost in this frame, for
+ * PF_TRACK_DRIFT. Rows beyond the table and tracks already lost are left as they are. */
+void pf_tracker_give_up(pf_tracker *tracker, const uint16_t *rows, uint32_t n);
+
 /* Forgets all tracks (a break in the video). Ids go on; none is reused. The parts found to stand still stay masked:
  * dirt on the lens outlives a break; what is gone is released as the picture moves on. */
 void pf_tracker_reset(pf_tracker *tracker);
@@ -225,6 +231,39 @@ void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const p
 /* Fills expected[n] for pf_tracker_expect, for the same table; `next` comes with the frame that follows. */
 void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected);
+
+/* --- The wall -----------------------------------------------------------------------------------------------------
+ * Tracks that walk off it. In a light that goes with the camera, relief that shines along with the paint moves like a
+ * wall a little nearer; one track alone cannot tell. All of them tell how the camera moved in its round tube. */
+typedef struct pf_wall { /* private */
+    uint32_t max_tracks, n;
+    int64_t motion[10];  /* of the last frame; the last four are the tube's axis */
+    int64_t known[4][4]; /* of the axis, as information, in units of ... */
+    int64_t variance;    /* ... this; 0: nothing is known */
+    uint64_t *id;        /* tracks of the last frame, ids ascending */
+    pf_ray_q30 *ray;
+    int32_t *off; /* how far each has walked since its first sight, three numbers: its cotangent, its azimuth; and what
+                   * its cotangent fell, Q24 */
+    int64_t *scratch;
+    uint32_t *value;
+    uint16_t *pair;
+} pf_wall;
+
+/* How far a track may walk off: 1 px, Q16. */
+#define PF_WALL_MOST_Q16 65536u
+
+/* Bytes of workspace for a tracker of so many tracks. */
+#define PF_WALL_BYTES(max_tracks) (40u * (size_t)(max_tracks) + 9216u)
+
+/* The workspace is aligned to 8 and stays the caller's. PF_ERR_ARGUMENT: max_tracks is not 1..2048; PF_ERR_SPACE. Call
+ * it again after pf_tracker_reset. */
+pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size_t size);
+
+/* Learns from a frame just tracked: tracks[n], rays[n] are its table and bearings. Puts into astray[] (max_tracks) the
+ * rows of tracks that have walked off the wall by `most_q16` px and by three times the median of all, unless their
+ * neighbours do alike: then that is where the wall is. Returns how many. For pf_tracker_give_up. */
+uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                       pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
  * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */

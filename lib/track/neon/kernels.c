@@ -336,6 +336,15 @@ void pf_neon_normal(const pf_gradients *g, int32_t window, int32_t groups, pf_no
     }
 }
 
+int64_t pf_neon_relief(const int8_t *relief, const int16_t *c, int32_t window, int32_t groups)
+{
+    int32x4_t sum = vdupq_n_s32(0);
+    for (int32_t r = 0; r < window; r++)
+        for (int32_t g = 0; g < groups; g++)
+            sum = pf_dot(sum, vmovl_s8(vld1_s8(relief + 8 * (r * groups + g))), vld1q_s16(c + r * PATCH_ROW + 8 * g));
+    return vaddvq_s32(sum);
+}
+
 void pf_neon_tensor(const uint8_t *p, size_t stride, int32_t n, pf_tensor_row *out)
 {
     const uint8_t *above = p - stride, *below = p + stride;

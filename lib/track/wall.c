@@ -1,0 +1,409 @@
+/* Tracks that walk off the wall. Where relief shines along with the paint, a patch looks shifted, a little farther with
+ * every frame: by the patch alone it cannot be told from a wall that is a little nearer. Its neighbours tell. From
+ * frame to frame the bearings of all tracks determine how the camera moved in its tube; what a track moves beyond that
+ * is summed up along its life.
+ *
+ * The tube is round, its radius the unit. In the camera's frame its axis runs through (o0, o1) + z (o2, o3): where the
+ * camera stands off the axis, and its tilt. A frame's motion is a turn w and a way t, in the frame before. These ten
+ * are fitted by Gauss and Newton with Cauchy weights; what is known of the axis is kept as a matrix of information that
+ * fades as the camera drives on. Q24 unless said. */
+#include <string.h>
+
+#include "track_private.h"
+
+#define ONE      ((int64_t)1 << 24)
+#define UNKNOWN  10 /* w 0..2, t 3..5, o 6..9 */
+#define AXIS     6  /* the first of the axis */
+#define STEPS    4
+#define LEAST    12u                     /* tracks, for a fit */
+#define MOST     96u                     /* more tell no more */
+#define STEEP    ((int64_t)1 << 28)      /* Q30: sine of the polar angle below which the cotangent says nothing */
+#define NOISE    (ONE / 5000)            /* rad: 0.05 px where a pixel is 4 mrad */
+#define TURN     (ONE / 50)              /* rad a frame, expected */
+#define ASIDE    20                      /* a part of the way: how far the camera strays from the tube's direction */
+#define OFFSET   (ONE / 5)               /* of the radius, at the beginning */
+#define TILT     (ONE / 25)              /* rad */
+#define STRIDE   ((int32_t)ONE / 16)     /* of the axis, a step: as far as it is linear */
+#define FARTHEST ((int32_t)ONE * 6 / 10) /* no camera stands nearer to the wall */
+#define PRIOR    ((int64_t)1 << 40)      /* no prior is stronger */
+#define FAINTLY  ((int64_t)1 << 10)      /* a pivot, Q30 */
+#define FADE     3                       /* tenths of a radius: on the way what is known of the axis fades to a third */
+#define ALIKE    8          /* frames in which the same tracks err alike: each adds such a part of what it says */
+#define WELL     (ONE / 64) /* of the radius: so well its place is known, once it is */
+#define OFTEN    3          /* times the median: where the tube is none, all walk off */
+#define AGED     ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
+#define BESIDE   3u                  /* neighbours of whom it is asked whether they walk off alike */
+
+typedef struct pf_pair {
+    int64_t c, s, cot;                /* of the ray before: azimuth and cotangent */
+    int64_t to[3], out[3], beside[3]; /* the ray after; along growing polar angle there, and across */
+} pf_pair;
+
+static int64_t mul(int64_t a, int64_t b)
+{
+    return (a * b) >> 24;
+}
+
+static int64_t dot(const int64_t a[3], const int64_t b[3])
+{
+    return (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) >> 24;
+}
+
+static void cross(const int64_t a[3], const int64_t b[3], int64_t out[3])
+{
+    out[0] = (a[1] * b[2] - a[2] * b[1]) >> 24;
+    out[1] = (a[2] * b[0] - a[0] * b[2]) >> 24;
+    out[2] = (a[0] * b[1] - a[1] * b[0]) >> 24;
+}
+
+static int64_t sine_of(const pf_ray_q30 *v)
+{
+    return pf_isqrt64((uint64_t)((int64_t)v->x * v->x + (int64_t)v->y * v->y));
+}
+
+static bool make_pair(const pf_ray_q30 *before, const pf_ray_q30 *after, pf_pair *p)
+{
+    const int64_t a = sine_of(before), b = sine_of(after);
+    if (a < STEEP || b < STEEP)
+        return false;
+    p->c = before->x * ONE / a;
+    p->s = before->y * ONE / a;
+    p->cot = before->z * ONE / a;
+    p->to[0] = after->x >> 6;
+    p->to[1] = after->y >> 6;
+    p->to[2] = after->z >> 6;
+    const int64_t c = after->x * ONE / b, s = after->y * ONE / b;
+    p->out[0] = mul(c, p->to[2]);
+    p->out[1] = mul(s, p->to[2]);
+    p->out[2] = -(b >> 6);
+    p->beside[0] = -s;
+    p->beside[1] = c;
+    p->beside[2] = 0;
+    return true;
+}
+
+/* Distance of the wall from the camera's z axis at the pair's azimuth and cotangent; *z gets how far along. */
+static int64_t depth_of(const pf_pair *p, const int64_t o[4], int64_t *z)
+{
+    int64_t rho = ONE;
+    for (int32_t i = 0; i < 3; i++) {
+        *z = mul(p->cot, rho);
+        *z = *z < -ONE ? -ONE : *z > 4 * ONE ? 4 * ONE : *z;
+        const int64_t x = o[0] + mul(o[2], *z), y = o[1] + mul(o[3], *z), off = mul(x, p->s) - mul(y, p->c);
+        const int64_t square = ONE * ONE - off * off;
+        rho = mul(x, p->c) + mul(y, p->s) + (square > 0 ? (int64_t)pf_isqrt64((uint64_t)square) : 0);
+        rho = rho < ONE / 8 ? ONE / 8 : rho > 4 * ONE ? 4 * ONE : rho;
+    }
+    return rho;
+}
+
+/* How far the pair's second ray lies from where the parameters put it, rad: outwards and across; and what the
+ * parameters change of that, Q14 (NULL: not asked). */
+static void residual(const pf_pair *p, const int64_t v[UNKNOWN], int64_t r[2], int32_t j[2][UNKNOWN])
+{
+    int64_t z, turn[3], more[3], at[3];
+    const int64_t rho = depth_of(p, v + AXIS, &z), way[3] = {p->c, p->s, p->cot};
+    for (int32_t k = 0; k < 3; k++)
+        at[k] = mul(way[k], rho) - v[3 + k];
+    cross(v, at, turn);
+    cross(v, turn, more);
+    for (int32_t k = 0; k < 3; k++)
+        at[k] += turn[k] + more[k] / 2;
+    int64_t norm = (int64_t)pf_isqrt64((uint64_t)(at[0] * at[0] + at[1] * at[1] + at[2] * at[2]));
+    norm = norm < ONE / 16 ? ONE / 16 : norm;
+    const int64_t *side[2] = {p->out, p->beside};
+    for (int32_t k = 0; k < 3; k++)
+        at[k] = at[k] * ONE / norm;
+    for (int32_t i = 0; i < 2; i++) {
+        r[i] = dot(p->to, side[i]) - dot(at, side[i]);
+        if (!j)
+            continue;
+        cross(at, side[i], turn);
+        const int64_t along = dot(way, side[i]) * ONE / norm;
+        const int64_t axis[4] = {mul(along, p->c), mul(along, p->s), mul(mul(along, p->c), z),
+                                 mul(mul(along, p->s), z)};
+        for (int32_t k = 0; k < 3; k++) {
+            j[i][k] = (int32_t)(turn[k] >> 10);
+            j[i][3 + k] = (int32_t)((-side[i][k] * ONE / norm) >> 10);
+        }
+        for (int32_t k = 0; k < 4; k++)
+            j[i][AXIS + k] = (int32_t)(axis[k] >> 10);
+    }
+}
+
+static int64_t shifted(int64_t v, int32_t by)
+{
+    return by >= 0 ? v * ((int64_t)1 << by) : v >> -by;
+}
+
+/* Solves a x = g (a: Q28, symmetric, positive; g: Q24 of its unit) into x, Q24; and leaves in `axis` what a says of the
+ * last four unknowns alone, Q28. By elimination, a scaled to a unit diagonal. */
+static void solve(int64_t a[UNKNOWN][UNKNOWN], const int64_t g[UNKNOWN], int64_t x[UNKNOWN], int64_t axis[4][4])
+{
+    int64_t m[UNKNOWN][UNKNOWN], b[UNKNOWN];
+    int32_t e[UNKNOWN];
+    for (int32_t i = 0; i < UNKNOWN; i++) {
+        for (e[i] = 14; e[i] > -14 && shifted(a[i][i], -2 * e[i]) < (int64_t)1 << 26; e[i]--)
+            continue;
+        b[i] = shifted(g[i], -e[i]);
+    }
+    for (int32_t i = 0; i < UNKNOWN; i++)
+        for (int32_t k = 0; k < UNKNOWN; k++)
+            m[i][k] = shifted(a[i][k], 2 - e[i] - e[k]);
+    for (int32_t k = 0; k < UNKNOWN; k++) {
+        for (int32_t i = 0; k == AXIS && i < 4; i++)
+            for (int32_t n = 0; n < 4; n++)
+                axis[i][n] = shifted(m[AXIS + i][AXIS + n], e[AXIS + i] + e[AXIS + n] - 2);
+        if (m[k][k] < FAINTLY)
+            m[k][k] = FAINTLY;
+        for (int32_t i = k + 1; i < UNKNOWN; i++) {
+            const int64_t f = m[i][k] * ((int64_t)1 << 30) / m[k][k];
+            for (int32_t n = k; n < UNKNOWN; n++)
+                m[i][n] -= (f * m[k][n]) >> 30;
+            b[i] -= (f * b[k]) >> 30;
+        }
+    }
+    for (int32_t k = UNKNOWN; k-- > 0;) {
+        int64_t v = b[k];
+        for (int32_t n = k + 1; n < UNKNOWN; n++)
+            v -= (m[k][n] * x[n]) >> 30;
+        x[k] = pf_clamp_i64(v, 1 << 28) * ((int64_t)1 << 30) / m[k][k];
+        x[k] = pf_clamp_i64(x[k], 1 << 30);
+    }
+    for (int32_t k = 0; k < UNKNOWN; k++)
+        x[k] = shifted(x[k], -e[k]);
+}
+
+/* variance / sigma^2, Q28. */
+static int64_t prior_of(int64_t variance_q48, int64_t sigma)
+{
+    const int64_t square = sigma * sigma >> 28;
+    const int64_t p = variance_q48 / (square > 0 ? square : 1);
+    return p > PRIOR ? PRIOR : p;
+}
+
+/* The median size of the residuals' larger part, times 1.5, and the noise. */
+static int64_t scale_of(pf_wall *wall, const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN])
+{
+    for (uint32_t i = 0; i < n; i++) {
+        int64_t r[2];
+        residual(&pair[i], v, r, NULL);
+        const int64_t a = r[0] < 0 ? -r[0] : r[0], b = r[1] < 0 ? -r[1] : r[1];
+        wall->value[i] = (uint32_t)(a > b ? a : b);
+    }
+    return (int64_t)pf_value_of_rank(wall->value, n, n / 2u) + NOISE;
+}
+
+/* Adds the pairs to the normal equations. */
+static void gather(const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN], int64_t variance_q48,
+                   int64_t a[UNKNOWN][UNKNOWN], int64_t g[UNKNOWN])
+{
+    for (uint32_t i = 0; i < n; i++) {
+        int64_t r[2];
+        int32_t j[2][UNKNOWN];
+        residual(&pair[i], v, r, j);
+        for (int32_t q = 0; q < 2; q++) {
+            const int64_t far = r[q] > ONE ? ONE : r[q] < -ONE ? -ONE : r[q];
+            const int64_t weight = 4 * variance_q48 / ((4 * variance_q48 + far * far) >> 14);
+            for (int32_t k = 0; k < UNKNOWN; k++) {
+                const int64_t wj = (weight * j[q][k]) >> 14;
+                g[k] += (wj * far) >> 14;
+                for (int32_t m = k; m < UNKNOWN; m++)
+                    a[k][m] += wj * j[q][m];
+            }
+        }
+    }
+}
+
+/* Fits the frame's motion. v begins at the last frame's. */
+static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v[UNKNOWN])
+{
+    int64_t axis[4][4], prior[4][4], before[UNKNOWN], variance = 0;
+    memcpy(before, v, sizeof before);
+    for (int32_t step = 0; step < STEPS; step++) {
+        int64_t a[UNKNOWN][UNKNOWN] = {{0}}, g[UNKNOWN] = {0}, x[UNKNOWN];
+        const int64_t scale = scale_of(wall, pair, n, v), way = before[5] < 0 ? -before[5] : before[5];
+        variance = scale * scale;
+        gather(pair, n, v, variance, a, g);
+        const int64_t ratio = wall->variance > 0 ? variance / ((wall->variance >> 16) + 1) : 0;
+        const int64_t ratio_q16 = ratio < 1 << 22 ? ratio : 1 << 22;
+        for (int32_t k = 0; k < AXIS; k++) {
+            const int64_t aim = k < 3 ? 0 : k < 5 ? mul(v[AXIS + 2 + k - 3], v[5]) : 0;
+            const int64_t p = prior_of(variance / 2, k < 3 ? TURN : k < 5 ? way / ASIDE + 200 : ONE);
+            a[k][k] += p;
+            g[k] -= (p * (v[k] - aim)) >> 28;
+        }
+        for (int32_t i = 0; i < 4; i++)
+            for (int32_t k = 0; k < 4; k++) {
+                const int64_t least = i == k ? prior_of(variance / 2, i < 2 ? OFFSET : TILT) : 0;
+                const int64_t told = (wall->known[i][k] * ratio_q16) >> 16;
+                const int64_t p = i == k && told < least ? least : told;
+                prior[i][k] = p;
+                if (k >= i)
+                    a[AXIS + i][AXIS + k] += p;
+                g[AXIS + i] -= (p * (v[AXIS + k] - before[AXIS + k])) >> 28;
+            }
+        for (int32_t i = 0; i < UNKNOWN; i++)
+            for (int32_t k = 0; k < i; k++)
+                a[i][k] = a[k][i];
+        solve(a, g, x, axis);
+        for (int32_t k = 0; k < UNKNOWN; k++)
+            v[k] = k < AXIS ? pf_clamp_i64(v[k] + x[k], (int32_t)ONE)
+                            : pf_clamp_i64(v[k] + pf_clamp_i64(x[k], STRIDE), FARTHEST);
+    }
+    const int64_t way = v[5] < 0 ? -v[5] : v[5], fades = 10 * way / FADE;
+    const int64_t keep = fades < ONE / 2 ? ONE - fades : ONE / 2;
+    for (int32_t i = 0; i < 4; i++)
+        for (int32_t k = 0; k < 4; k++)
+            wall->known[i][k] = ((prior[i][k] + (axis[i][k] - prior[i][k]) / ALIKE) * (keep >> 8)) >> 16;
+    wall->variance = variance;
+}
+
+pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size_t size)
+{
+    if (max_tracks == 0 || max_tracks > PF_TRACKS_MAX)
+        return PF_ERR_ARGUMENT;
+    if (size < PF_WALL_BYTES(max_tracks))
+        return PF_ERR_SPACE;
+    *wall = (pf_wall){.max_tracks = max_tracks, .id = workspace};
+    wall->motion[5] = ONE / 64; /* somewhere to begin */
+    wall->scratch = (int64_t *)(wall->id + max_tracks);
+    wall->off = (int32_t *)(wall->scratch + MOST * sizeof(pf_pair) / sizeof(int64_t));
+    wall->ray = (pf_ray_q30 *)(wall->off + 3u * max_tracks);
+    wall->value = (uint32_t *)(wall->ray + max_tracks);
+    wall->pair = (uint16_t *)(wall->value + max_tracks);
+    return PF_OK;
+}
+
+/* Row by row, where each track was in the list of the last frame: wall->pair, UINT16_MAX = nowhere. Both have ascending
+ * ids. */
+static uint32_t match(pf_wall *wall, const pf_track *tracks, uint32_t n)
+{
+    uint32_t i = 0, count = 0;
+    for (uint32_t j = 0; j < n; j++) {
+        while (i < wall->n && wall->id[i] < tracks[j].id)
+            i++;
+        const bool is_known = tracks[j].status == PF_TRACK_TRACKED && i < wall->n && wall->id[i] == tracks[j].id;
+        wall->pair[j] = is_known ? (uint16_t)i : UINT16_MAX;
+        count += is_known;
+    }
+    return count;
+}
+
+/* Fits the motion to at most MOST of the tracks seen in both frames. False with too few. */
+static bool learn_motion(pf_wall *wall, const pf_ray_q30 *rays, uint32_t n, uint32_t known)
+{
+    pf_pair *pair = (pf_pair *)wall->scratch;
+    const uint32_t every = (known + MOST - 1u) / MOST;
+    uint32_t count = 0, seen = 0;
+    for (uint32_t j = 0; j < n; j++)
+        if (wall->pair[j] != UINT16_MAX && seen++ % every == 0 &&
+            make_pair(&wall->ray[wall->pair[j]], &rays[j], &pair[count]))
+            count++;
+    if (count < LEAST)
+        return false;
+    fit_motion(wall, pair, count, wall->motion);
+    return true;
+}
+
+/* Takes row j into the list as its k-th (k is at most where it was), with what it has walked off since. */
+static void move_on(pf_wall *wall, uint32_t k, uint64_t id, const pf_ray_q30 *ray, uint32_t before, bool has_motion)
+{
+    int32_t *off = wall->off + 3u * k;
+    pf_pair pair;
+    if (before == UINT16_MAX) {
+        off[0] = off[1] = off[2] = 0;
+    } else {
+        const int32_t *was = wall->off + 3u * before;
+        int64_t now[3] = {was[0], was[1], was[2]}, r[2];
+        if (has_motion && make_pair(&wall->ray[before], ray, &pair)) {
+            const int64_t sine = -pair.out[2];
+            residual(&pair, wall->motion, r, NULL);
+            now[0] += r[0] * ONE / sine * ONE / sine;
+            now[1] += r[1] * ONE / sine;
+            now[2] += pair.cot - pair.to[2] * ONE / sine;
+        }
+        for (uint32_t i = 0; i < 3u; i++)
+            off[i] = pf_clamp_i64(now[i], 1 << 30);
+    }
+    wall->id[k] = id;
+    wall->ray[k] = *ray;
+}
+
+/* Length in the picture of what the k-th track has walked off, its cotangent less `share`, Q16 px; 0 where the camera
+ * does not see. */
+static uint32_t length_of(const pf_wall *wall, uint32_t k, int64_t share, pf_ray_project project, const void *camera)
+{
+    const pf_ray_q30 *v = &wall->ray[k];
+    const int64_t sine = sine_of(v);
+    pf_point_q16 a, b;
+    if (sine < STEEP || !project(camera, v, &a))
+        return 0;
+    const int64_t c = v->x * ONE / sine, s = v->y * ONE / sine, cosine = v->z >> 6, q = sine >> 6;
+    const int64_t along = mul(mul(q, q), wall->off[3u * k] - share), across = mul(q, wall->off[3u * k + 1u]);
+    const int64_t moved[3] = {(v->x >> 6) + mul(mul(c, cosine), along) - mul(s, across),
+                              (v->y >> 6) + mul(mul(s, cosine), along) + mul(c, across), cosine - mul(q, along)};
+    const pf_ray_q30 to = {pf_clamp_i64(moved[0] * 32, (int32_t)1 << 30), pf_clamp_i64(moved[1] * 32, (int32_t)1 << 30),
+                           pf_clamp_i64(moved[2] * 32, (int32_t)1 << 30)};
+    if (!project(camera, &to, &b))
+        return 0;
+    const int64_t dx = (int64_t)a.x - b.x, dy = (int64_t)a.y - b.y;
+    return pf_isqrt64((uint64_t)(dx * dx + dy * dy));
+}
+
+/* What of the k-th track's fall its three nearest neighbours walk off, in the median: 0 with fewer of some age. */
+static int64_t shared_by_neighbours(const pf_wall *wall, uint32_t k)
+{
+    uint32_t near[BESIDE], n = 0;
+    int64_t part[BESIDE] = {0};
+    for (uint32_t i = 0; i < wall->n; i++) {
+        const int32_t *off = wall->off + 3u * i;
+        if (i == k || (off[2] < AGED && off[2] > -AGED))
+            continue;
+        const uint32_t chord = pf_ray_chord2(&wall->ray[k], &wall->ray[i]);
+        uint32_t m = n < BESIDE ? n++ : BESIDE;
+        if (m == BESIDE && chord >= near[BESIDE - 1u])
+            continue;
+        for (m = m == BESIDE ? BESIDE - 1u : m; m > 0 && near[m - 1u] > chord; m--) {
+            near[m] = near[m - 1u];
+            part[m] = part[m - 1u];
+        }
+        near[m] = chord;
+        part[m] = off[0] * ONE / off[2];
+    }
+    if (n < BESIDE)
+        return 0;
+    const int64_t low = part[0] < part[1] ? part[0] : part[1], high = part[0] < part[1] ? part[1] : part[0];
+    const int64_t median = part[2] < low ? low : part[2] > high ? high : part[2];
+    return mul(wall->off[3u * k + 2u], pf_clamp_i64(median, (int32_t)ONE));
+}
+
+/* Whether it is known where the camera stands: what tracks walk off before that is not held against them. */
+static bool knows_axis(const pf_wall *wall)
+{
+    const int64_t enough = prior_of(wall->variance / 2, WELL);
+    return wall->known[0][0] >= enough && wall->known[1][1] >= enough;
+}
+
+uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
+                       pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray)
+{
+    const uint32_t rows = n < 2u * wall->max_tracks ? n : 2u * wall->max_tracks, known = match(wall, tracks, rows);
+    const bool has_motion = known >= LEAST && learn_motion(wall, rays, rows, known) && knows_axis(wall);
+    uint32_t kept = 0, found = 0;
+    for (uint32_t j = 0; j < rows && kept < wall->max_tracks; j++)
+        if (tracks[j].status != PF_TRACK_LOST) {
+            const uint32_t before = wall->pair[j];
+            wall->pair[kept] = (uint16_t)j;
+            move_on(wall, kept++, tracks[j].id, &rays[j], before, has_motion);
+        }
+    wall->n = kept;
+    for (uint32_t k = 0; k < kept; k++)
+        wall->value[k] = length_of(wall, k, 0, project, camera);
+    const uint64_t median = kept ? pf_value_of_rank(wall->value, kept, kept / 2u) : 0;
+    const uint64_t most = most_q16 > OFTEN * median ? most_q16 : OFTEN * median;
+    for (uint32_t k = 0; k < kept; k++)
+        if (wall->value[k] > most && length_of(wall, k, shared_by_neighbours(wall, k), project, camera) > most)
+            astray[found++] = wall->pair[k];
+    return found;
+}

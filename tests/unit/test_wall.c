@@ -1,0 +1,150 @@
+/* Tracks that walk off the wall are told from those that stay on it, by their neighbours. */
+#include <math.h>
+
+#include "pipefish/camera_fixed.h"
+#include "pipefish/track.h"
+#include "unity.h"
+
+#define WIDTH  640
+#define HEIGHT 640
+#define FOCAL  200.0
+#define TRACKS 72u
+
+static _Alignas(16) uint8_t camera_block[4000], block[PF_WALL_BYTES(TRACKS)];
+static const pf_camera_fixed *camera;
+static pf_wall wall;
+
+/* A point on the wall of a tube of radius 1, by azimuth and place along; a part by which it lies nearer. */
+static struct {
+    double azimuth, z, nearer;
+} point[TRACKS];
+static pf_track track[TRACKS];
+static pf_ray_q30 ray[TRACKS];
+static uint16_t astray[TRACKS];
+static uint32_t noise;
+
+void setUp(void)
+{
+    const pf_camera lens = {.width = WIDTH,
+                            .height = HEIGHT,
+                            .radial = PF_RADIAL_EQUIDISTANT,
+                            .f_u = FOCAL,
+                            .f_v = FOCAL,
+                            .c_u = WIDTH / 2,
+                            .c_v = HEIGHT / 2,
+                            .theta_max = 1.57};
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_fixed_init(&camera, &lens, camera_block, sizeof camera_block));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_wall_init(&wall, TRACKS, block, sizeof block));
+    noise = 1;
+    for (uint32_t i = 0; i < TRACKS; i++) {
+        point[i].azimuth = 2.399963 * i; /* spread by the golden angle */
+        point[i].z = 1.2 + 0.8 * (i % 9u) / 8.0;
+        point[i].nearer = 0;
+        track[i] = (pf_track){.id = i + 1, .status = PF_TRACK_TRACKED};
+    }
+}
+void tearDown(void) {}
+
+static double next_noise(void)
+{
+    noise = noise * 1664525u + 1013904223u;
+    return (double)(noise >> 8) / (1 << 23) - 1.0;
+}
+
+/* The rays of all points from a camera that has driven by `way`: below the axis, tilted, swaying; to 0.1 px. */
+static void look(double way)
+{
+    const double x = 0.02 * sin(3 * way), y = 0.16, yaw = 0.01 + 0.01 * sin(5 * way), pitch = 0.02;
+    for (uint32_t i = 0; i < TRACKS; i++) {
+        const double near = 1 - point[i].nearer;
+        double p[3] = {cos(point[i].azimuth) * near - x, sin(point[i].azimuth) * near - y, point[i].z - way};
+        const double a = p[0] * cos(yaw) - p[2] * sin(yaw), c = p[0] * sin(yaw) + p[2] * cos(yaw);
+        const double b = p[1] * cos(pitch) - c * sin(pitch), d = p[1] * sin(pitch) + c * cos(pitch);
+        const double u = a + 0.0005 * next_noise() * d, v = b + 0.0005 * next_noise() * d,
+                     n = sqrt(u * u + v * v + d * d);
+        ray[i] = (pf_ray_q30){(int32_t)lrint(u / n * 1073741823), (int32_t)lrint(v / n * 1073741823),
+                              (int32_t)lrint(d / n * 1073741823)};
+    }
+}
+
+static uint32_t check(void)
+{
+    return pf_wall_check(&wall, track, ray, TRACKS, pf_track_project, camera, PF_WALL_MOST_Q16, astray);
+}
+
+/* Drives a radius in 40 frames; returns how often each track was found astray. */
+static void drive(uint32_t times[TRACKS])
+{
+    for (uint32_t i = 0; i < TRACKS; i++)
+        times[i] = 0;
+    for (uint32_t k = 0; k <= 40; k++) {
+        look(k * 0.025);
+        const uint32_t n = check();
+        for (uint32_t i = 0; i < n; i++)
+            times[astray[i]]++;
+    }
+}
+
+/* Proves: on a round wall nobody is astray, wherever the camera stands, however it sways and is tilted. */
+static void test_nobody_walks_off_a_round_wall(void)
+{
+    uint32_t times[TRACKS];
+    drive(times);
+    for (uint32_t i = 0; i < TRACKS; i++)
+        TEST_ASSERT_EQUAL_UINT32(0, times[i]);
+}
+
+/* Proves: a track that moves like a wall a fiftieth nearer, 2 px and more at the rim, is found, and it alone. */
+static void test_a_track_that_walks_off_is_found(void)
+{
+    uint32_t times[TRACKS];
+    point[30].nearer = 0.02;
+    drive(times);
+    for (uint32_t i = 0; i < TRACKS; i++)
+        TEST_ASSERT_EQUAL_UINT32(i == 30, times[i] > 0);
+}
+
+/* Proves: where neighbours lie nearer alike, something stands on the wall: they are not astray. */
+static void test_what_stands_on_the_wall_stays(void)
+{
+    uint32_t times[TRACKS], near = 0;
+    for (uint32_t i = 0; i < TRACKS; i++)
+        if (cos(point[i].azimuth - 1) > 0.9) {
+            point[i].nearer = 0.06;
+            near++;
+        }
+    TEST_ASSERT_GREATER_THAN_UINT32(6, near);
+    drive(times);
+    for (uint32_t i = 0; i < TRACKS; i++)
+        TEST_ASSERT_TRUE(point[i].nearer == 0 || times[i] == 0);
+}
+
+/* Proves: fewer than twelve tracks judge nobody; standing still, frames without tracks and a bad size do no harm. */
+static void test_what_tells_nothing_does_no_harm(void)
+{
+    for (uint32_t k = 0; k < 50; k++) {
+        look(0);
+        TEST_ASSERT_EQUAL_UINT32(0, check());
+    }
+    TEST_ASSERT_EQUAL_UINT32(0,
+                             pf_wall_check(&wall, track, ray, 0, pf_track_project, camera, PF_WALL_MOST_Q16, astray));
+    for (uint32_t i = 11; i < TRACKS; i++)
+        track[i].status = PF_TRACK_LOST;
+    for (uint32_t k = 0; k < 20; k++) {
+        look(k * 0.03);
+        ray[3] = ray[4];
+        TEST_ASSERT_EQUAL_UINT32(0, check());
+    }
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_wall_init(&wall, TRACKS, block, sizeof block - 1));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_wall_init(&wall, PF_TRACKS_MAX + 1, block, sizeof block));
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_nobody_walks_off_a_round_wall);
+    RUN_TEST(test_a_track_that_walks_off_is_found);
+    RUN_TEST(test_what_stands_on_the_wall_stays);
+    RUN_TEST(test_what_tells_nothing_does_no_harm);
+    return UNITY_END();
+}
