@@ -33,6 +33,7 @@ def run_dense(args: argparse.Namespace) -> Result:
                     strip.wall,
                     cell=args.cell / 1000 if args.cell else None,
                     scale=args.scale,
+                    raw=args.raw,
                     threads=args.threads,
                     tell=lambda done, n=n: bar.update(round(100 * (n + done))),
                 )
@@ -92,4 +93,5 @@ def add_dense(commands: Any) -> None:
         metavar="N",
         help="pixels of the pictures to a cell of the unrolled ones; 2 takes a quarter of the time [1]",
     )
+    p.add_argument("--raw", action="store_true", help="match the pictures as they are: to check the unrolled way by")
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from pipefish import _engine
 from pipefish.camera import Camera
+from pipefish.dense_regions import find_regions
 from pipefish.errors import ArgumentError
 from pipefish.matching import Seeds, grey, match_quasi_dense
-from pipefish.wallmodel import Floats, WallModel
+from pipefish.wallmodel import Floats, WallModel, predicted_seeds, seen_on_wall
+
+Rays = tuple[Floats, Floats]  # origins and directions of unit length, (K,3) each
 
 THETA_LEAST = math.radians(30)  # nearer to the axis a pixel covers four times as much of the wall as beside the camera
 RIM_PX = 6.0  # inside the image circle's rim
@@ -27,8 +30,16 @@ CELLS = 100  # of the map, to a diameter
 BASE = (0.2, 0.7)  # travel between the two keyframes of a pair, diameters
 STRIDE = 0.12  # between keyframes that begin pairs, diameters
 PAIRS = 2  # of each of them, with later ones
-SEARCH_S, SEARCH_CLOCK = 10, 3  # cells of the unrolled picture around the model's prediction
+SEARCH_S, SEARCH_CLOCK = 10, 3  # cells of the unrolled picture around the model's prediction, and along s
+WRONG_RADIUS = (
+    0.12  # besides, of the way between the keyframes: a tube wrong by that share of its radius shifts all by it
+)
 SEED_STEP, SEED_RADIUS = 36, 7
+RAW_STEP, RAW_RADIUS = 24, 5  # pixels between the seeds of raw pictures; radius of the window there
+RAW_BEND_STEP = 16  # pixels between the places where the map's bend is looked at
+_OFF = np.arange(-RAW_RADIUS, RAW_RADIUS + 1)
+_WEIGHT = np.exp(-0.5 * (_OFF / (0.6 * RAW_RADIUS)) ** 2)  # the growth's window
+WINDOW_VARIANCE = float((_WEIGHT * _OFF**2).sum() / _WEIGHT.sum())  # pixels squared
 ANGLE_LEAST = math.radians(1.5)  # between two rays
 MATCH_PX = 0.25  # sigma of a match as growth leaves it, before the map's own scatter corrects it
 CALIBRATION_PX = 0.1
@@ -37,7 +48,6 @@ SKEW_PX = 1.5  # two rays may miss each other by so much
 WINDOW = 7  # side of the correlation window: matches nearer to each other than that share their error
 BATCH = 8  # pairs at a time, whatever the number of threads: sums have one order
 SPREAD_LEAST = 3  # pairs, for a cell to say something about the scatter
-REGION_SIGMA, REGION_CELLS = 3.0, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +95,7 @@ class _View:
     picture: NDArray[np.float32]
     even: NDArray[np.float32]  # the picture without the lamp's falloff
     sound: NDArray[np.bool_]
+    image: NDArray[np.float32]
     centre: Floats
     pose: Floats
 
@@ -124,7 +135,7 @@ class _Unroller:
         values = _engine.sample_image(image, pixels.reshape(-1, 2)).reshape(sound.shape)
         sound &= np.isfinite(values)
         picture = np.where(sound, values, 0).astype(np.float32)
-        return _View(first, picture, _even(picture, sound), sound, -pose[:, :3].T @ pose[:, 3], pose)
+        return _View(first, picture, _even(picture, sound), sound, image, -pose[:, :3].T @ pose[:, 3], pose)
 
     def _pixels(self, rows: Any, columns: Any, pose: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Where cells are in the picture: every 4th is projected, the others lie between (0.003 px off at most)."""
@@ -171,17 +182,15 @@ def _even(picture: NDArray[np.float32], sound: NDArray[np.bool_], radius: int = 
     return np.clip(value, 0, 1).astype(np.float32)
 
 
-def _seeds(one: NDArray[np.float32], two: NDArray[np.float32], sound: NDArray[np.bool_]) -> Seeds:
-    """Places of a coarse grid in `one` with the best of the shifts in `two` around none at all. Growth judges them."""
-    r, margin = SEED_RADIUS, SEED_RADIUS + max(SEARCH_S, SEARCH_CLOCK) + 1
-    y, x = (
-        a.ravel()
-        for a in np.meshgrid(
-            np.arange(margin, one.shape[0] - margin, SEED_STEP),
-            np.arange(margin, one.shape[1] - margin, SEED_STEP),
-            indexing="ij",
-        )
-    )
+def _seeds(one: NDArray[np.float32], two: NDArray[np.float32], sound: NDArray[np.bool_], reach: int) -> Seeds:
+    """Places of a coarse grid in `one` with the best of the shifts in `two`, up to `reach` rows. Growth judges them."""
+    r = SEED_RADIUS
+    # Shifts beyond the picture are not looked at near its ends, where the wall is seen by a tube that is right.
+    rows = np.arange(r + SEARCH_S + 1, one.shape[0] - r - SEARCH_S - 1, SEED_STEP)
+    across = r + SEARCH_CLOCK + 1
+    y, x = (a.ravel() for a in np.meshgrid(rows, np.arange(across, one.shape[1] - across, SEED_STEP), indexing="ij"))
+    two = np.pad(two, ((reach - SEARCH_S, reach - SEARCH_S), (0, 0)))
+    below = reach - SEARCH_S
     keep = sound[y, x]
     y, x = y[keep], x[keep]
     if not len(x):
@@ -189,25 +198,25 @@ def _seeds(one: NDArray[np.float32], two: NDArray[np.float32], sound: NDArray[np
     off = np.arange(-r, r + 1)
     patch = one[y[:, None, None] + off[:, None], x[:, None, None] + off]
     patch = patch - patch.mean(axis=(1, 2), keepdims=True)
-    wide_s, wide_c = np.arange(-r - SEARCH_S, r + SEARCH_S + 1), np.arange(-r - SEARCH_CLOCK, r + SEARCH_CLOCK + 1)
-    block = two[y[:, None, None] + wide_s[:, None], x[:, None, None] + wide_c]
+    wide_s, wide_c = np.arange(-r - reach, r + reach + 1), np.arange(-r - SEARCH_CLOCK, r + SEARCH_CLOCK + 1)
+    block = two[y[:, None, None] + below + wide_s[:, None], x[:, None, None] + wide_c]
     best = np.full(len(x), -1.0)
     shift = np.zeros((len(x), 2))
-    for i, j in itertools.product(range(2 * SEARCH_S + 1), range(2 * SEARCH_CLOCK + 1)):
+    for i, j in itertools.product(range(2 * reach + 1), range(2 * SEARCH_CLOCK + 1)):
         other = block[:, i : i + 2 * r + 1, j : j + 2 * r + 1]
         other = other - other.mean(axis=(1, 2), keepdims=True)
         norm = np.sqrt((patch**2).sum(axis=(1, 2)) * (other**2).sum(axis=(1, 2)))
         score = (patch * other).sum(axis=(1, 2)) / np.maximum(norm, 1e-9)
         better = score > best
-        best[better], shift[better] = score[better], (j - SEARCH_CLOCK, i - SEARCH_S)
+        best[better], shift[better] = score[better], (j - SEARCH_CLOCK, i - reach)
     good = best > 0.7
     at = np.column_stack([x, y])[good].astype(float)
     return Seeds(at, at + shift[good])
 
 
-def _match(one: _View, two: _View, every: int) -> tuple[Floats, Floats] | None:
+def _match(one: _View, two: _View, cell: float, every: int) -> tuple[Floats, Floats] | None:
     """Cells (K,2) column, row of the grid in either view, where both show the wall; of the matches, every n-th along
-    and around."""
+    and around. cell: side of one."""
     first, end = max(one.row, two.row), min(one.row + len(one.picture), two.row + len(two.picture))
     if end - first < 64:
         return None
@@ -215,19 +224,20 @@ def _match(one: _View, two: _View, every: int) -> tuple[Floats, Floats] | None:
     sound = one.sound[part[0]] & two.sound[part[1]]
     whole = _box(sound.astype(float), 6) >= 13 * 13 - 0.5
     pictures = [v.even[p] for v, p in zip((one, two), part, strict=True)]
-    seeds = _seeds(pictures[0], pictures[1], whole)
+    reach = SEARCH_S + round(WRONG_RADIUS * float(np.linalg.norm(two.centre - one.centre)) / cell)
+    seeds = _seeds(pictures[0], pictures[1], whole, reach)
     if not len(seeds):
         return None
     m = match_quasi_dense(*pictures, seeds, mode="translation", radius=WINDOW // 2, zncc_min=0.75)
     x, y = m.xy1.astype(int).T
     x2, y2 = np.rint(m.xy2).astype(int).T
     inside = (x >= _Unroller.pad) & (x < one.picture.shape[1] - _Unroller.pad)
-    near = (np.abs(m.xy2 - m.xy1) <= [2 * SEARCH_CLOCK, 2 * SEARCH_S]).all(axis=1)
+    near = (np.abs(m.xy2 - m.xy1) <= [2 * SEARCH_CLOCK, SEARCH_S + reach]).all(axis=1)
     keep = inside & near & whole[y, x] & whole[y2, x2] & (x % every == 0) & (y % every == 0)
     return m.xy1[keep] + [0, first], m.xy2[keep] + [0, first]
 
 
-def _rays(unroller: _Unroller, view: _View, cells: Floats) -> tuple[Floats, Floats]:
+def _rays(unroller: _Unroller, view: _View, cells: Floats) -> Rays:
     """Origins and directions (K,3), of unit length, of what is at cells: rays through the tube's own points."""
     target = unroller.wall.points(unroller.s(cells[:, 1]), unroller.clock(cells[:, 0]))
     origin = np.broadcast_to(view.centre, target.shape)
@@ -238,10 +248,59 @@ def _rays(unroller: _Unroller, view: _View, cells: Floats) -> tuple[Floats, Floa
     return origin, ray / np.linalg.norm(ray, axis=1, keepdims=True)
 
 
-def _triangulated(unroller: _Unroller, one: _View, two: _View, cells: tuple[Floats, Floats]) -> tuple[Floats, ...]:
+def _unrolled_rays(unroller: _Unroller, one: _View, two: _View, every: int) -> tuple[Rays, Rays] | None:
+    """Rays of what matches in the unrolled pictures, each n-th cell along and around."""
+    cells = _match(one, two, unroller.cell, every)
+    if cells is None:
+        return None
+    return _rays(unroller, one, cells[0]), _rays(unroller, two, cells[1])
+
+
+def _raw_rays(unroller: _Unroller, one: _View, two: _View) -> tuple[Rays, Rays] | None:
+    """Rays of what matches in the keyframes as they are, from seeds that the wall predicts."""
+    camera = unroller.camera
+    seeds = predicted_seeds(unroller.wall, camera, one.pose, two.pose, _pixel_grid(camera, RAW_STEP))
+    if not len(seeds):
+        return None
+    turn = two.pose[:, :3] @ one.pose[:, :3].T
+    pose = np.column_stack([turn, two.pose[:, 3] - turn @ one.pose[:, 3]])
+    central = {} if camera.pupil_e1 else {"cameras": camera, "relative_pose": pose}
+    m = match_quasi_dense(one.image, two.image, seeds, **central, radius=RAW_RADIUS)
+    pixels, keep = (m.xy1, m.xy2 - _bulge(unroller, one, two, m.xy1)), np.ones(len(m), bool)
+    rays = []
+    for view, xy in zip((one, two), pixels, strict=True):
+        ray, ok = camera.unproject(xy)
+        theta = np.arccos(np.clip(ray[:, 2], -1, 1))
+        keep &= ok & camera.in_image(xy) & (theta >= THETA_LEAST) & (theta <= unroller.theta_most)
+        rays.append((view.centre + camera.origins(xy) @ view.pose[:, :3], ray @ view.pose[:, :3]))
+    (o1, d1), (o2, d2) = ((o[keep], d[keep]) for o, d in rays)
+    return (o1, d1), (o2, d2)
+
+
+def _pixel_grid(camera: Camera, step: int) -> Floats:
+    """(n,2) pixels, row by row."""
+    grid = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
+    return np.stack(grid, axis=-1).reshape(-1, 2).astype(float)
+
+
+def _bulge(unroller: _Unroller, one: _View, two: _View, pixels: Floats) -> Floats:
+    """(K,2): how far a match fitted by an affine map lies off in view two, because over its window the true map is
+    not affine: half the map's Laplacian times the window's variance. NaN where the wall does not tell."""
+    camera, step = unroller.camera, RAW_BEND_STEP
+    points = seen_on_wall(unroller.wall, camera, one.pose, _pixel_grid(camera, step))
+    there, ok = camera.project(np.nan_to_num(points) @ two.pose[:, :3].T + two.pose[:, 3])
+    there[~ok | np.isnan(points[:, 0])] = np.nan
+    at = there.reshape(-(-camera.height // step), -(-camera.width // step), 2)
+    laplacian = np.full(at.shape, np.nan)
+    laplacian[1:-1, 1:-1] = (at[2:, 1:-1] + at[:-2, 1:-1] + at[1:-1, 2:] + at[1:-1, :-2] - 4 * at[1:-1, 1:-1]) / step**2
+    column, row = np.rint(pixels / step).astype(int).T.clip(0, [[at.shape[1] - 1], [at.shape[0] - 1]])
+    return 0.5 * laplacian[row, column] * WINDOW_VARIANCE
+
+
+def _triangulated(unroller: _Unroller, rays: tuple[Rays, Rays]) -> tuple[Floats, ...]:
     """s, clock, deviation, its sigma, each (K,), of matches whose rays meet."""
     wall, pixel = unroller.wall, 1 / unroller.camera.f_u
-    (o1, d1), (o2, d2) = (_rays(unroller, v, c) for v, c in zip((one, two), cells, strict=True))
+    (o1, d1), (o2, d2) = rays
     cosine = np.einsum("ki,ki->k", d1, d2)
     base = o2 - o1
     sine2 = np.maximum(1 - cosine**2, 1e-12)
@@ -252,7 +311,7 @@ def _triangulated(unroller: _Unroller, one: _View, two: _View, cells: tuple[Floa
     point = weight[:, None] * p1 + (1 - weight)[:, None] * p2
     skew = np.linalg.norm(p1 - p2, axis=1) / np.maximum(pixel * np.hypot(r1, r2), 1e-12)
     keep = (r1 > 0) & (r2 > 0) & (sine2 > math.sin(ANGLE_LEAST) ** 2) & (skew < SKEW_PX)
-    s, clock, deviation = wall.locate(point[keep], unroller.s(cells[0][keep, 1]))
+    s, clock, deviation = wall.locate(point[keep])
     _, tangent, up, right = wall.frames(s)
     out = np.cos(clock)[:, None] * up + np.sin(clock)[:, None] * right
     # A shift of one ray's foot along s moves the crossing outwards by 1 / (difference of the rays' slopes).
@@ -263,9 +322,10 @@ def _triangulated(unroller: _Unroller, one: _View, two: _View, cells: tuple[Floa
 
 
 def _per_cell(
-    key: NDArray[np.int64], value: Floats, sigma: Floats, every: int
+    key: NDArray[np.int64], value: Floats, sigma: Floats, share: float
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Median and sigma of it of each key that has 3 values or more; sigma as if a window's matches were one."""
+    """Median and sigma of it of each key that has 3 values or more; sigma as if a window's matches were one. share: of
+    a window, a match's own."""
     order = np.lexsort((value, key))
     key, value, sigma = key[order], value[order], sigma[order]
     start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
@@ -273,7 +333,7 @@ def _per_cell(
     middle = 0.5 * (value[start + (count - 1) // 2] + value[start + count // 2])
     mean_sigma = np.add.reduceat(sigma, start) / count
     keep = count >= 3
-    effective = np.maximum(count * every**2 / WINDOW**2, 1)
+    effective = np.maximum(count * share, 1)
     return key[start][keep], middle[keep], (mean_sigma / np.sqrt(effective))[keep]
 
 
@@ -337,6 +397,7 @@ def dense_wall(
     *,
     cell: float | None = None,
     scale: float = 1.0,
+    raw: bool = False,
     calibration_px: float = CALIBRATION_PX,
     threads: int = 1,
     tell: Callable[[float], None] | None = None,
@@ -349,6 +410,8 @@ def dense_wall(
     wall     the fitted tube, or a piece of it between joints
     cell     side of the map's cells [a hundredth of the diameter, or three pixels]
     scale    pixels of the pictures to a cell of the unrolled ones: 2 takes a quarter of the time
+    raw      keyframes are matched as they are, with maps fitted at each match, instead of unrolled: to check the one by
+             the other. Slower, and the tube must be within a few hundredths of its radius, for seeds come from it
     calibration_px   what all pairs share and no scatter tells: errors that the calibration leaves (zones of 0.1 px are
              ordinary) and shading that moves with the lamp. In a simulated concrete pipe errors stay as they are from 2
              pairs to 7, and 0.1 px makes sigmas true
@@ -369,6 +432,7 @@ def dense_wall(
     if not (math.isfinite(size) and diameter / 1000 <= size <= diameter / 10):
         raise ArgumentError(f"cell: {size} is not within a thousandth to a tenth of the diameter")
     every = max(1, int(size / unroller.cell / ACROSS))
+    share = 1 / (2 * RAW_RADIUS + 1) ** 2 if raw else every**2 / WINDOW**2
     rows, columns = max(1, round(wall.length / size)), max(8, round(math.pi * diameter / size))
 
     def seen(k: int) -> _View:
@@ -388,13 +452,15 @@ def dense_wall(
 
     def measured(pair: tuple[int, int]) -> tuple[NDArray[np.int64], Floats, Floats] | None:
         one, two = (views[k] for k in pair)
-        cells = _match(one, two, every)
-        if cells is None:
+        rays = _raw_rays(unroller, one, two) if raw else _unrolled_rays(unroller, one, two, every)
+        if rays is None:
             return None
-        s, clock, deviation, sigma = _triangulated(unroller, one, two, cells)
+        s, clock, deviation, sigma = _triangulated(unroller, rays)
         row, column = np.floor(s / wall.length * rows).astype(int), (clock / (2 * np.pi) * columns).astype(int)
         keep = (row >= 0) & (row < rows) & (np.abs(deviation) < 0.25 * diameter)
-        return _per_cell((row * columns + column % columns)[keep], deviation[keep], sigma[keep], every)
+        if not keep.any():
+            return None
+        return _per_cell((row * columns + column % columns)[keep], deviation[keep], sigma[keep], share)
 
     with ThreadPoolExecutor(threads) as pool:
         for n in range(0, len(pairs), BATCH):
@@ -454,89 +520,3 @@ def _in_view(unroller: _Unroller, one: _View, two: _View, rows: int, columns: in
     sound = one.sound[first - one.row : end - one.row] & two.sound[first - two.row : end - two.row]
     _, key = _cells_of(unroller, first, sound, rows, columns)
     return (np.bincount(key, minlength=rows * columns) > 0).astype(int)
-
-
-def find_regions(found: DenseWall) -> list[dict[str, float]]:
-    """Connected cells (12 or more) whose 3 x 3 neighbourhood stands over 3 sigma and a 500th of the diameter in or out
-    of the ellipse through the wall half a diameter around, which leaves out what a tube's smoothness makes of ovality
-    and bends. Largest volume first: s, clock (radians) of the middle; length (along), extent (around, radians); height
-    (the 90th percentile, negative: it stands into the pipe); sigma of it; area; volume."""
-    measured = np.isfinite(found.deviation)
-    weight = np.where(measured, np.nan_to_num(found.sigma, nan=1.0) ** -2.0, 0)
-    total = _wrapped_box(weight)
-    local = np.where(measured, found.deviation, 0) - _ellipses(found)
-    mean = _wrapped_box(weight * local) / np.maximum(total, 1e-30)
-    sigma = np.nan_to_num(found.sigma, nan=np.inf)  # neighbours share keyframes: their mean is hardly better than one
-    off = measured & (np.abs(mean) > REGION_SIGMA * sigma) & (np.abs(mean) > found.wall.mean_radius / 250)
-    out = []
-    step = (found.s[1] - found.s[0] if len(found.s) > 1 else 1.0, found.clock[1] - found.clock[0])
-    area = step[0] * step[1] * found.wall.mean_radius
-    for sign in (-1, 1):
-        for cells in _connected(off & (sign * mean > 0)):
-            if len(cells) < REGION_CELLS:
-                continue
-            i, j = cells.T
-            value = local[i, j]
-            angle = found.clock[j]
-            middle = np.arctan2(np.sin(angle).sum(), np.cos(angle).sum()) % (2 * np.pi)
-            spread = (angle - middle + np.pi) % (2 * np.pi) - np.pi
-            height = sign * float(np.percentile(sign * value, 90))
-            out.append(
-                {
-                    "s": float(found.s[i].mean()),
-                    "clock": float(middle),
-                    "length": float(np.ptp(found.s[i]) + step[0]),
-                    "extent": float(np.ptp(spread) + step[1]),
-                    "height": height,
-                    "sigma": float(np.median(found.sigma[i, j])),
-                    "area": float(len(cells) * area),
-                    "volume": float(value.sum() * area),
-                }
-            )
-    return sorted(out, key=lambda r: -abs(r["volume"]))
-
-
-def _ellipses(found: DenseWall) -> Floats:
-    """(rows, columns): mean, shift and ellipse through the cells a quarter diameter to either side, robustly."""
-    angle = np.outer([1, 1, 2, 2], found.clock) - np.array([[0], [np.pi / 2], [0], [np.pi / 2]])
-    terms = np.vstack([np.ones(len(found.clock)), np.cos(angle)])  # (5, columns)
-    value = np.nan_to_num(found.deviation)
-    weight = np.isfinite(found.deviation).astype(float)
-    spacing = found.s[1] - found.s[0] if len(found.s) > 1 else 1.0
-    half = max(1, round(0.5 * found.wall.mean_radius / spacing))
-    fitted = np.zeros_like(value)
-    bound = 3 * max(float(np.median(found.sigma[weight > 0])), 1e-9) if weight.any() else 1.0
-    for _ in range(4):
-        h = np.einsum("ac,rc,bc->rab", terms, weight, terms)
-        g = np.einsum("ac,rc->ra", terms, weight * value)
-        h, g = (np.array([a[max(k - half, 0) : k + half + 1].sum(axis=0) for k in range(len(a))]) for a in (h, g))
-        h += 1e-3 * np.eye(5)
-        fitted = np.linalg.solve(h, g[..., None])[..., 0] @ terms
-        off = (value - fitted) / bound
-        weight = np.isfinite(found.deviation) / (1 + off**2) ** 2  # a deposit does not bend the ellipse
-    return fitted
-
-
-def _wrapped_box(values: Floats) -> Floats:
-    """Sums over 3 x 3 cells; columns go around."""
-    around = values + np.roll(values, 1, axis=1) + np.roll(values, -1, axis=1)
-    padded = np.pad(around, ((1, 1), (0, 0)))
-    return padded[:-2] + padded[1:-1] + padded[2:]
-
-
-def _connected(cells: NDArray[np.bool_]) -> Iterable[NDArray[np.int64]]:
-    """Groups of neighbouring cells, (n,2) each; columns go around."""
-    columns = cells.shape[1]
-    left = set(zip(*(a.tolist() for a in np.nonzero(cells)), strict=True))
-    while left:
-        stack = [left.pop()]
-        group = []
-        while stack:
-            i, j = stack.pop()
-            group.append((i, j))
-            for a, b in itertools.product((i - 1, i, i + 1), (j - 1, j, j + 1)):
-                near = (a, b % columns)
-                if near in left:
-                    left.remove(near)
-                    stack.append(near)
-        yield np.array(group)
