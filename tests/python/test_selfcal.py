@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 
 import pipefish as pf
-from pipefish import _engine
+from pipefish import _engine, selfcal_input
 from pipefish.cli import main
 from pipefish.health import BUDGET, _chi2_tail
 from pipefish.selfcal import self_calibrate
 from selfcal_drives import health_of
 from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup
+from test_reconstruct_cli import survey_of
+from tube_tracks import fisheye, tube_drive
 
 SIZE = (1280, 960)
 
@@ -147,6 +149,43 @@ def test_bad_files_are_named(tmp_path: Path, capsys, content):
     file.write_bytes(content)
     assert main(["selfcal", str(file), "--size", "640x480", "-o", str(tmp_path / "o.json")]) == 1
     assert "matches.csv" in capsys.readouterr().err
+
+
+def test_matches_of_pictures_are_dense_even_and_in_pixels_of_the_whole_picture(monkeypatch):
+    """Halved pictures, as large ones are: a place that is half a pixel off would show."""
+    monkeypatch.setattr(selfcal_input, "DENSE_PIXELS", 320 * 240)
+    monkeypatch.setattr(selfcal_input, "MOST_MATCHES", 300)
+    random = np.random.default_rng(3)
+    base = sum(
+        np.kron(random.uniform(0, 1, (600 // n + 1, 760 // n + 1)), np.ones((n, n)))[:600, :760] for n in (4, 8, 16, 32)
+    )
+    wave = np.exp(-(np.linspace(-2, 2, 9) ** 2))
+    for axis in (0, 1):
+        base = np.apply_along_axis(np.convolve, axis, base, wave / wave.sum(), "same")
+    base = (base - base.min()) / np.ptp(base)
+    shift = np.array([17.0, 9.0])
+    one, two = selfcal_input.match_pictures(base[40:520, 40:680], base[31:511, 23:663])
+    off = np.linalg.norm(two - one - shift, axis=1)
+    assert 100 < len(one) <= 320
+    assert np.median(off) < 0.1 and (off < 0.5).mean() > 0.9
+    assert (one.max(axis=0) > [560, 400]).all() and (one.min(axis=0) < [80, 80]).all()
+
+
+def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path, capsys):
+    """From the file a device sends: the scale within three sigmas and 2 %; straight on, what is missing is named."""
+    camera = fisheye(100)
+    drive = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, pan=0.6)
+    survey = survey_of(drive, tmp_path / "pan.mcap")
+    assert main(["selfcal", str(survey), "-o", str(tmp_path / "camera.json"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = pf.Camera.load(tmp_path / "camera.json")
+    assert document["sigma"] >= selfcal_input.SURVEY_SIGMA
+    assert abs(found.f_u - camera.f_u) < min(3 * math.sqrt(found.covariance[0, 0]), 0.02 * camera.f_u)
+    straight = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, wobble=0.0)
+    survey = survey_of(straight, tmp_path / "straight.mcap")
+    assert main(["selfcal", str(survey), "-o", str(tmp_path / "no.json")]) == 1
+    error = capsys.readouterr().err
+    assert "along its optical axis" in error and "Pan or tilt by at least" in error
 
 
 # ---------------------------------------------------------------------- health
