@@ -14,7 +14,7 @@ import numpy as np
 from pipefish import _engine
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
-from pipefish.health import ProfileCheck, check_profile
+from pipefish.health import ProfileCheck, check_profile, drift_prior
 from pipefish.sectionsigma import diameter_sigma
 from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
@@ -266,6 +266,7 @@ def measure(
             method=method,
             threads=threads,
             sag_sigma=TRACK_SAG_PX2,
+            drift=drift_prior(weighed, camera),
         ),
         lambda: tell(0.05, "poses and points"),
     )
@@ -303,6 +304,7 @@ def measure(
             weighed,
             camera,
             chainage,
+            structure=structure if structure.drift else None,
             encoder=quality,
             attitude=attitude,
             attitude_sigma=attitude_sigma,

@@ -32,7 +32,9 @@ TILT_LITTLE = math.radians(4.0)
 CENTRE_SIGMA = 0.01  # of the picture's width
 BEND = 0.01  # of the radius at the rim: how far a lens differs from its nearest nominal projection
 ASPECT_SIGMA = 1e-3  # pixels are taken to be square; the covariance says how sure that is
-SIGMA_LEAST = 0.02  # pixels
+# Pixels. No lens is rounder, no pixel squarer: corners of a bent board have residuals of 0.03 px, and say of alpha
+# what is not so.
+SIGMA_LEAST = 0.2
 PARAMETERS = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
 
 #: Why there is no camera.

@@ -23,7 +23,9 @@ MATCHES = (".npz", ".csv", ".txt")
 MOST_MATCHES = 2000  # a pair: more say little more and take longer
 DENSE_PIXELS = 2_000_000  # larger pictures are halved before they are matched: four times as fast, a tenth less sharp
 SURVEY_PAIRS = 24
-SURVEY_SIGMA = 0.5  # pixels: a tracker's errors are common to neighbours (measure.TRACK_FLOOR_PX); residuals show 0.06
+# Pixels: a tracker's errors are common to neighbours (measure.TRACK_FLOOR_PX) and a dense matcher's too. Residuals show
+# 0.06 and 0.2, which made bearings of fountain-P11's triples wrong by up to six of their sigmas.
+COMMON_SIGMA = 0.5
 SURVEY_COMMON = 50  # tracks that two keyframes must have in common
 ALL_PAIRS = 4  # pictures up to which every two of them are matched
 
@@ -87,7 +89,7 @@ def from_pictures(paths: Sequence[str], threads: int, tell: Callable[[int, int],
         tell(done, len(chosen))
         pairs.append(match_pictures(pictures[a], pictures[b], threads))
     names = [f"{Path(paths[a]).name}, {Path(paths[b]).name}" for a, b in chosen]
-    return Input(pairs, (pictures[0].shape[1], pictures[0].shape[0]), names)
+    return Input(pairs, (pictures[0].shape[1], pictures[0].shape[0]), names, COMMON_SIGMA)
 
 
 def from_matches(path: str | os.PathLike[str]) -> Input:
@@ -141,7 +143,7 @@ def from_survey(path: str | os.PathLike[str]) -> Input:
     frame = survey.keyframes[0]
     pairs = [pair for *_, pair in found[:SURVEY_PAIRS]]
     names = [f"keyframes {frames[a]}, {frames[b]}" for _, a, b, _ in found[:SURVEY_PAIRS]]
-    return Input(pairs, (frame.width, frame.height), names, SURVEY_SIGMA)
+    return Input(pairs, (frame.width, frame.height), names, COMMON_SIGMA)
 
 
 def read(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -> Input:

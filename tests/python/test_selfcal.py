@@ -179,7 +179,7 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
     assert main(["selfcal", str(survey), "-o", str(tmp_path / "camera.json"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     found = pf.Camera.load(tmp_path / "camera.json")
-    assert document["sigma"] >= selfcal_input.SURVEY_SIGMA
+    assert document["sigma"] >= selfcal_input.COMMON_SIGMA
     assert abs(found.f_u - camera.f_u) < min(3 * math.sqrt(found.covariance[0, 0]), 0.02 * camera.f_u)
     straight = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, wobble=0.0)
     survey = survey_of(straight, tmp_path / "straight.mcap")

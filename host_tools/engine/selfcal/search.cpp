@@ -434,23 +434,25 @@ private:
             }
         }
         std::sort(at.used.begin(), at.used.end());
-        at.sigma = std::max({start.sigma, 0.1, options_.sigma_least});
+        double noise = std::max(start.sigma, 0.1); // as residuals show it; what is right is chosen by it
+        at.sigma = std::max(noise, options_.sigma_least);
         at.loss = {optim::RobustLoss::Kind::cauchy, 1.5, 0.0};
-        select(at, 5.0 * at.sigma);
+        select(at, 5.0 * noise);
         follow(at);
         at.adjust(Stage::all, 30);
         at.loss = {};
         for (int round = 0; round < 3; round++) {
-            select(at, 3.0 * at.sigma);
+            select(at, 3.0 * noise);
             drop_levers(at);
             at.adjust(Stage::all, 20);
-            at.sigma = std::max(spread(at), options_.sigma_least);
+            noise = std::max(spread(at), 0.02);
+            at.sigma = std::max(noise, options_.sigma_least);
         }
         if (at.used.empty()) {
             start.cost = std::numeric_limits<double>::infinity();
             return;
         }
-        start.sigma = at.sigma;
+        start.sigma = noise;
         start.cost = 0.0;
         const double common = std::max(start.sigma, 0.2);
         start.cost = at.truncated(common) * common * common;
