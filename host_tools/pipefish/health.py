@@ -186,6 +186,7 @@ def check_profile(
     diameter: float | None = None,
     diameter_sigma: float = 0.001,
     budget: float = BUDGET,
+    common: float = 1.0,
     threads: int | None = None,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
@@ -195,9 +196,12 @@ def check_profile(
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
+    common           factor on the noise of the tracks, for errors that many of them have in common
 
     Raises ArgumentError.
     """
+    if not common >= 1:
+        raise ArgumentError(f"common: {common} is below 1")
     if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
         raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
     if camera.radial != "generic":
@@ -232,22 +236,23 @@ def check_profile(
     weight = np.linalg.inv(own)
     into = np.linalg.solve(scaled.T @ weight @ scaled + np.eye(5), scaled.T @ weight)
     before, own_part = into @ prior @ into.T, into @ own @ into.T
-    value, spread = _together(found, into, before)
+    value, spread = _together(found, into, before, common)
     slope = _diameter_slope(camera, tracks, directions) * drift
     evidence = "bends and turns of the drive"
     if diameter is not None and found.unit == "metre":
-        value, spread, evidence = _with_diameter(found, camera, diameter, diameter_sigma, value, spread, slope)
-    return _judge(camera, value, spread, before, own_part, slope, drift, budget, evidence)
+        value, spread, evidence = _with_diameter(found, diameter, diameter_sigma, common, value, spread, slope)
+    return _judge(value, spread, before, own_part, slope, drift, budget, evidence)
 
 
-def _together(found: Reconstruction, into: Floats, before: Floats) -> tuple[Floats, Floats]:
+def _together(found: Reconstruction, into: Floats, before: Floats, common: float) -> tuple[Floats, Floats]:
     """Drift (5,) in its prior's sigmas and its covariance, from all segments. Noise above the one stated counts."""
     prior = np.linalg.inv(before)
     known, weighed = prior.copy(), np.zeros(len(before))
     for part, factor in zip(found.drift, found.variance_factor, strict=True):
         posterior = np.linalg.inv(into @ part["covariance"] @ into.T)
-        known += (posterior - prior) / max(1.0, factor)
-        weighed += posterior @ into @ part["camera"] / max(1.0, factor)
+        noise = common**2 * max(1.0, factor)
+        known += (posterior - prior) / noise
+        weighed += posterior @ into @ part["camera"] / noise
     spread = np.linalg.inv((known + known.T) / 2)
     return spread @ weighed, spread
 
@@ -270,9 +275,9 @@ def _nothing(budget: float, why: str) -> ProfileCheck:
 
 def _with_diameter(
     found: Reconstruction,
-    camera: Camera,
     diameter: float,
     diameter_sigma: float,
+    common: float,
     value: Floats,
     spread: Floats,
     slope: Floats,
@@ -287,7 +292,7 @@ def _with_diameter(
     if tube.status != "ok":
         return value, spread, f"bends and turns of the drive; no diameter ({tube.reason})"
     measured = float(tube.summary["d_mean"])
-    random = float(tube.summary["d_mean_sigma"]) / measured
+    random = common * float(tube.summary["d_mean_sigma"]) / measured
     noise = random**2 + found.scale_sigma**2 + diameter_sigma**2
     gain = spread @ slope / (slope @ spread @ slope + noise)
     value = value + gain * math.log(diameter / measured)
@@ -296,7 +301,6 @@ def _with_diameter(
 
 
 def _judge(
-    camera: Camera,
     value: Floats,
     spread: Floats,
     before: Floats,
