@@ -32,7 +32,6 @@ from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup  # noqa:
 KEEP = ROOT / "build" / "accept_selfcal"
 DATA = Path(os.environ.get("PIPEFISH_DATA", ROOT.parent / "shared" / "data"))
 Row = dict
-FOCAL, BEARING_DEG = 0.03, 0.5  # of fountain-P11: largest errors of focal length, relative, and of a bearing
 
 
 def figure(name: str, value: float, bound: str, holds: bool) -> Row:
@@ -198,6 +197,9 @@ def boards() -> list[Row]:
 
         rows += kept("static", 4, standing)
     return rows
+
+
+FOCAL, BEARING_DEG = 0.03, 0.5  # largest errors of focal length, relative, and of a bearing
 
 
 def meets(row: Row) -> bool:
