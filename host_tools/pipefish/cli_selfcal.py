@@ -35,7 +35,7 @@ def run_selfcal(args: argparse.Namespace) -> Result:
         if not given.pairs:
             raise PipefishError(f"{args.inputs[0]}: no two keyframes have enough tracks in common")
         bar.update(80, "calibrating")
-        found = self_calibrate(given.pairs, size, threads=args.threads)
+        found = self_calibrate(given.pairs, size, sigma_least=given.sigma_least, threads=args.threads)
     pairs = [
         {
             "name": name,

@@ -1,7 +1,7 @@
 """Whether a survey still agrees with its camera profile. docs/selfcal.md.
 
-The survey's tracks are adjusted once more with the profile free to drift, and what they say of the drift is compared
-with what noise and the profile's own covariance allow. A drift that they cannot see is never called none.
+The survey's last adjustment is made once more with the profile free to drift, and what it says of the drift is
+compared with what noise and the profile's own covariance allow. A drift that it cannot see is never called none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .camera import Camera
 from .errors import ArgumentError
-from .structure import Encoder, reconstruct
+from .structure import Encoder, Reconstruction, reconstruct
 from .survey import Tracks
 from .tube import fit_tube
 
@@ -24,7 +24,10 @@ Floats = npt.NDArray[np.float64]
 
 BUDGET = 0.005  # of the diameter: what profilers are required to hold, and calibration's verdict allows
 FALSE_ALARM = 0.005  # of the test: the noise is never quite the one stated, and the bar is 2 %
-FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
+FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1")
+#: Metres, of a profile that says nothing of the pupil's shift: two millimetres at 57 degrees, five at 90. A wall 75 mm
+#: away looks through it as if the angles had drifted.
+PUPIL_SIGMA = 0.002
 #: How a profile may drift: directions, and their sigmas. A knock or another temperature moves these, no others.
 DRIFT = {
     "angle scale": 0.03,  # all angles by a factor
@@ -76,7 +79,7 @@ class ProfileCheck:
 
 
 def _directions(camera: Camera, theta_end: float) -> Floats:
-    """(8,5): what each way to drift, by its unit, does to FREE."""
+    """(9,5): what each way to drift, by its unit, does to FREE."""
     theta = np.linspace(0.02, 1.0, 60) * theta_end
     k = np.array([camera.k2, camera.k3, camera.k4, camera.k5])
     powers = theta[:, None] ** np.array([3, 5, 7, 9])
@@ -84,16 +87,18 @@ def _directions(camera: Camera, theta_end: float) -> Floats:
     design = np.column_stack([theta + powers @ k, powers])
     scale = np.abs(design).max(axis=0)
     along = np.linalg.lstsq(design / scale, rise * np.sin(theta) * np.cos(theta), rcond=None)[0] / scale
-    out = np.zeros((8, 5))
+    out = np.zeros((len(FREE), len(DRIFT)))
     out[0, 0], out[1, 0] = camera.f_u, camera.f_v
-    out[0, 1], out[1, 1], out[4:, 1] = along[0] * camera.f_u, along[0] * camera.f_v, along[1:]
+    out[0, 1], out[1, 1], out[4:8, 1] = along[0] * camera.f_u, along[0] * camera.f_v, along[1:]
     out[4, 2] = out[2, 3] = out[3, 4] = 1.0
     return out
 
 
 def _own_covariance(camera: Camera) -> Floats:
-    """The profile's covariance of FREE, (8,8); with a little of each so that it has an inverse."""
-    out = np.diag([(2e-4 * camera.f_u) ** 2, (2e-4 * camera.f_v) ** 2, 0.01, 0.01, 1e-8, 1e-9, 1e-10, 1e-11])
+    """The profile's covariance of FREE, (9,9); with a little of each so that it has an inverse."""
+    pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_SIGMA
+    bends = [1e-8, 1e-9, 1e-10, 1e-11]
+    out = np.diag([(2e-4 * camera.f_u) ** 2, (2e-4 * camera.f_v) ** 2, 0.01, 0.01, *bends, pupil**2])
     if camera.covariance is not None:
         places = [(i, FREE.index(n)) for i, n in enumerate(camera.covariance_parameters) if n in FREE]
         for i, a in places:
@@ -149,11 +154,31 @@ def _chi2_tail(value: float, degrees: int) -> float:
     return min(1.0, tail)
 
 
+def _theta_end(camera: Camera, tracks: Tracks) -> float:
+    """Largest angle from the axis that tracks were seen at but for a fiftieth, radians; 0 where there are none."""
+    rays, ok = camera.unproject(tracks.pixels)
+    theta = np.arctan2(np.hypot(rays[ok, 0], rays[ok, 1]), rays[ok, 2])
+    return float(np.quantile(theta, 0.98)) if len(theta) else 0.0
+
+
+def _prior(camera: Camera, directions: Floats) -> Floats:
+    scaled = directions * np.array(list(DRIFT.values()))
+    return _own_covariance(camera) + scaled @ scaled.T
+
+
+def drift_prior(tracks: Tracks, camera: Camera) -> tuple[tuple[str, ...], Floats] | None:
+    """What reconstruct(drift=...) takes for a check of the profile. None for a camera that is not generic, or not a
+    track inside its field."""
+    end = _theta_end(camera, tracks) if camera.radial == "generic" else 0.0
+    return (FREE, _prior(camera, _directions(camera, end))) if end > 0 else None
+
+
 def check_profile(
     tracks: Tracks,
     camera: Camera,
     chainage: npt.ArrayLike | None = None,
     *,
+    structure: Reconstruction | None = None,
     encoder: Encoder | None = None,
     attitude: npt.ArrayLike | None = None,
     attitude_sigma: float = 0.01,
@@ -161,41 +186,44 @@ def check_profile(
     diameter: float | None = None,
     diameter_sigma: float = 0.001,
     budget: float = BUDGET,
+    common: float = 1.0,
     threads: int | None = None,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
     tracks .. sigma  as of reconstruct()
+    structure        reconstruct() of the same with drift=drift_prior(tracks, camera); None: it is made here
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
+    common           factor on the noise of the tracks, for errors that many of them have in common
 
     Raises ArgumentError.
     """
+    if not common >= 1:
+        raise ArgumentError(f"common: {common} is below 1")
     if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
         raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
     if camera.radial != "generic":
         camera = camera.to_generic()[0]
-    rays, ok = camera.unproject(tracks.pixels)
-    theta = np.arctan2(np.hypot(rays[ok, 0], rays[ok, 1]), rays[ok, 2])
-    if not len(theta):
+    end = _theta_end(camera, tracks)
+    if not end > 0:
         return _nothing(budget, "no track inside the profile's field")
-    directions = _directions(camera, float(np.quantile(theta, 0.98)))
+    directions = _directions(camera, end)
     drift = np.array(list(DRIFT.values()))
-    own = _own_covariance(camera)
-    prior = own + (directions * drift**2) @ directions.T
-    free = dataclasses.replace(camera, covariance=prior, covariance_parameters=FREE)
-    found = reconstruct(
+    own, prior = _own_covariance(camera), _prior(camera, directions)
+    found = structure or reconstruct(
         tracks,
-        free,
+        dataclasses.replace(camera, covariance=None, covariance_parameters=()),
         chainage,
         encoder=encoder,
         attitude=attitude,
         attitude_sigma=attitude_sigma,
         sigma=sigma,
         threads=threads,
+        drift=(FREE, prior),
     )
-    if found.camera_change is None:
+    if not found.drift:
         return _nothing(budget, f"nothing was measured: {found.reason}")
     if diameter is None and _largest_turn(found) < TURN_LEAST:
         return _nothing(
@@ -203,21 +231,33 @@ def check_profile(
             "the camera never panned, tilted or went round a bend; a known diameter beside the encoder "
             "would show a drift",
         )
-    border = found.parts[0][1].border[-8:, -8:]
     # In units of the drift's sigmas; what of a change is no drift belongs to the profile's own covariance.
     scaled = directions * drift
     weight = np.linalg.inv(own)
     into = np.linalg.solve(scaled.T @ weight @ scaled + np.eye(5), scaled.T @ weight)
-    value, spread = into @ found.camera_change, into @ border @ into.T
     before, own_part = into @ prior @ into.T, into @ own @ into.T
+    value, spread = _together(found, into, before, common)
     slope = _diameter_slope(camera, tracks, directions) * drift
     evidence = "bends and turns of the drive"
     if diameter is not None and found.unit == "metre":
-        value, spread, evidence = _with_diameter(found, camera, diameter, diameter_sigma, value, spread, slope)
-    return _judge(camera, value, spread, before, own_part, slope, drift, budget, evidence)
+        value, spread, evidence = _with_diameter(found, diameter, diameter_sigma, common, value, spread, slope)
+    return _judge(value, spread, before, own_part, slope, drift, budget, evidence)
 
 
-def _largest_turn(found: Any) -> float:
+def _together(found: Reconstruction, into: Floats, before: Floats, common: float) -> tuple[Floats, Floats]:
+    """Drift (5,) in its prior's sigmas and its covariance, from all segments. Noise above the one stated counts."""
+    prior = np.linalg.inv(before)
+    known, weighed = prior.copy(), np.zeros(len(before))
+    for part, factor in zip(found.drift, found.variance_factor, strict=True):
+        posterior = np.linalg.inv(into @ part["covariance"] @ into.T)
+        noise = common**2 * max(1.0, factor)
+        known += (posterior - prior) / noise
+        weighed += posterior @ into @ part["camera"] / noise
+    spread = np.linalg.inv((known + known.T) / 2)
+    return spread @ weighed, spread
+
+
+def _largest_turn(found: Reconstruction) -> float:
     """Largest angle of the optical axis between keyframes of a stretch up to TURN_KEYFRAMES apart, radians."""
     most = 0.0
     for number in np.unique(found.segment):
@@ -234,16 +274,25 @@ def _nothing(budget: float, why: str) -> ProfileCheck:
 
 
 def _with_diameter(
-    found: Any, camera: Camera, diameter: float, diameter_sigma: float, value: Floats, spread: Floats, slope: Floats
+    found: Reconstruction,
+    diameter: float,
+    diameter_sigma: float,
+    common: float,
+    value: Floats,
+    spread: Floats,
+    slope: Floats,
 ) -> tuple[Floats, Floats, str]:
     """The known diameter beside the measured one, as one more measurement of the drift."""
-    inside = found.point_segment == 0
-    centres = found.centres[found.segment == 0]
-    tube = fit_tube(found.points[inside], found.covariance[inside], centres)
+    part = found.drift[0]
+    inside = np.flatnonzero(found.point_segment == 0)
+    inside = inside[np.isin(found.track[inside], part["tracks"])]
+    kept = np.isin(part["tracks"], found.track[inside])
+    centres = -np.einsum("nij,ni->nj", part["poses"][:, :, :3], part["poses"][:, :, 3])
+    tube = fit_tube(part["points"][kept], found.covariance[inside], centres)
     if tube.status != "ok":
         return value, spread, f"bends and turns of the drive; no diameter ({tube.reason})"
     measured = float(tube.summary["d_mean"])
-    random = float(tube.summary["d_mean_sigma"]) / measured
+    random = common * float(tube.summary["d_mean_sigma"]) / measured
     noise = random**2 + found.scale_sigma**2 + diameter_sigma**2
     gain = spread @ slope / (slope @ spread @ slope + noise)
     value = value + gain * math.log(diameter / measured)
@@ -252,7 +301,6 @@ def _with_diameter(
 
 
 def _judge(
-    camera: Camera,
     value: Floats,
     spread: Floats,
     before: Floats,
@@ -291,8 +339,7 @@ def _judge(
         )
         if moved:
             text += f" What can be seen does not fit the profile, though: {what}. Recalibrate where limits are tight"
-            pupil = ", with the pupil shift: a profile without one does that too." if camera.pupil_e1 == 0 else "."
-            text += pupil
+            text += "."
     elif moved:
         verdict = VERDICTS["drifted"]
         text = f"The profile has drifted: {what}; {open_text}. Recalibrate the camera."

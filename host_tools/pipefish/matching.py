@@ -106,15 +106,15 @@ def find_seeds(image1: ArrayLike, image2: ArrayLike, most: int = 1000, affine: b
     stable extremal regions), matched by descriptors. Many may be wrong. most: regions an image; affine=False: circles
     only, faster. Large images are halved first, until they are of 800,000 pixels: the growth fits seeds anew."""
     one, two = grey(image1, "image1"), grey(image2, "image2")
-    halved = 0
+    times = 0
     while one.size > SEED_PIXELS or two.size > SEED_PIXELS:
-        one, two, halved = _half(one), _half(two), halved + 1
+        one, two, times = halved(one), halved(two), times + 1
     rows = _engine.find_seeds(one, two, most, affine, affine, threads)
-    xy = rows[:, :4] * 2**halved + (2**halved - 1) / 2
+    xy = rows[:, :4] * 2**times + (2**times - 1) / 2
     return Seeds(xy[:, :2].copy(), xy[:, 2:].copy(), rows[:, 4:].reshape(-1, 2, 2).copy())
 
 
-def _half(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """Means of 2 x 2 pixels."""
     even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
     return np.ascontiguousarray((even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4)

@@ -32,6 +32,9 @@ TILT_LITTLE = math.radians(4.0)
 CENTRE_SIGMA = 0.01  # of the picture's width
 BEND = 0.01  # of the radius at the rim: how far a lens differs from its nearest nominal projection
 ASPECT_SIGMA = 1e-3  # pixels are taken to be square; the covariance says how sure that is
+# Pixels. No lens is rounder, no pixel squarer: corners of a bent board have residuals of 0.03 px, and say of alpha
+# what is not so.
+SIGMA_LEAST = 0.2
 PARAMETERS = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
 
 #: Why there is no camera.
@@ -43,7 +46,8 @@ REASONS = {
     "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
     "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",
     "axial": "the camera moved along its optical axis without panning or tilting: any lens explains that",
-    "weak": "the matches leave the lens too uncertain: few, noisy, or of a scene that is nearly flat",
+    "weak": "the matches leave the lens too uncertain: few, noisy, of a camera that hardly turned, or of a scene that "
+    "is nearly flat",
 }
 
 
@@ -131,6 +135,7 @@ def self_calibrate(
     *,
     centre: tuple[float, float] | None = None,
     centre_sigma: float | None = None,
+    sigma_least: float = SIGMA_LEAST,
     seed: int = 0,
     threads: int | None = None,
 ) -> SelfCalibration:
@@ -140,6 +145,7 @@ def self_calibrate(
                   may be wrong
     image_size    (width, height), pixels
     centre        where the principal point is likely to be, pixels, and its sigma [the picture's, 1 % of the width]
+    sigma_least   of a match's error, pixels: above what the residuals show where errors are common to many matches
     threads       do not change the result [all cores]
 
     The lens: radially symmetric, one viewpoint, square pixels, between perspective and orthographic or a central
@@ -157,6 +163,8 @@ def self_calibrate(
     spread = CENTRE_SIGMA * width if centre_sigma is None else centre_sigma
     if not (np.isfinite(middle).all() and math.isfinite(spread) and spread > 0):
         raise ArgumentError("centre, centre_sigma: not finite and above 0")
+    if not (math.isfinite(sigma_least) and sigma_least > 0):
+        raise ArgumentError("sigma_least: not finite and above 0")
     found = _engine.self_calibrate(
         [one for one, _ in taken],
         [two for _, two in taken],
@@ -168,6 +176,7 @@ def self_calibrate(
         BEND,
         ALPHA_LIMIT,
         ALONE_LIMIT,
+        float(sigma_least),
         seed,
         threads or len(os.sched_getaffinity(0)),
     )
@@ -191,13 +200,17 @@ def _status(found: dict[str, Any]) -> str:
         return "standing" if "standing" in states else "no_matches"
     if found["area"] < AREA_LEAST:
         return "low_coverage"
+    # Ahead in a straight pipe one radius maps to another, as before a wall: that the camera never tilted comes first.
+    straight = "axial" if found["axial"] < AXIAL else "no_rotation"
     if "ok" not in states:
+        if max(set(states), key=states.count) == "plane" and found["tilt"] < TILT_LITTLE:
+            return straight
         return {"plane": "planar", "turning": "turning", "standing": "standing"}.get(
             max(set(states), key=states.count), "no_matches"
         )
     if found["alpha_alone"] > ALONE_LIMIT or found["alpha_sigma"] > ALPHA_LIMIT:
         if found["tilt"] < TILT_LITTLE or found["alpha_alone"] > 5 * ALONE_LIMIT:
-            return "axial" if found["axial"] < AXIAL else "no_rotation"
+            return straight
         return "weak"
     return "ok"
 

@@ -89,6 +89,8 @@ class Reconstruction:
     sag              px^2, of each segment: the tracks' common sag
     camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
     cost             sum of half the squared residuals
+    drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
+                     covariance (m,m); poses, points and tracks as they are then
     """
 
     status: str
@@ -122,6 +124,7 @@ class Reconstruction:
     sag: list[float] = field(default_factory=list)
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
+    drift: list[dict[str, Any]] = field(default_factory=list, repr=False)
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
 
@@ -220,6 +223,7 @@ def reconstruct(
     seed: int = 0,
     still: float = 0.5,
     sag_sigma: float = 0.0,
+    drift: tuple[Sequence[str], Floats] | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
 
@@ -233,6 +237,8 @@ def reconstruct(
     still      px: frames in which tracks moved less (median) are not used
     sag_sigma  px^2, above 0: tracks have a common sag that is not known, as those of a tracker with a window have in a
                tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
+    drift      names of the camera's parameters and their covariance, as wide as they may have changed since it was
+               calibrated: the adjustment is then made once more with them free, for Reconstruction.drift alone
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
     that are wrong in themselves.
@@ -270,6 +276,8 @@ def reconstruct(
         float(attitude_sigma),
         uncertain,
         None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
+        [PARAMETERS.index(name) for name in drift[0]] if drift else [],
+        np.ascontiguousarray(drift[1]) if drift else None,
         float(sag_sigma),
     )
     out = _result(found, names, frames, step, encoder, camera)
@@ -386,6 +394,7 @@ def _result(
         cost=sum(s["cost"] for s in segments),
         sag=[s["sag"] for s in segments],
         iterations=[s["iterations"] for s in segments],
+        drift=[s["drift"] | {"tracks": names[s["drift"]["tracks"]]} for s in segments if s["drift"]],
         parts=[(s["random"], s["total"]) for s in segments],
         turns=[move[:, :3] for move in moves[: len(segments)]],
     )

@@ -37,7 +37,13 @@ def drifted(camera: Camera, change: str) -> Camera:
 
 
 def survey(
-    seed: int, case: str, length: float = 5.0, sigma: float = 0.2, density: float = 600.0, step: float = 0.05
+    seed: int,
+    case: str,
+    length: float = 5.0,
+    sigma: float = 0.2,
+    density: float = 600.0,
+    step: float = 0.05,
+    camera: Camera | None = None,
 ) -> tuple[Any, np.ndarray]:
     """Tracks and the encoder's readings. A straight drive has no wobble at all: a crawler's own panning would tell."""
     drive = tube_drive(
@@ -49,7 +55,7 @@ def survey(
         density=density,
         sigma=sigma,
         limits=(20.0, 89.0),
-        camera=fisheye(100),
+        camera=camera or fisheye(100),
         wobble=0.0 if case == "straight" else 1.0,
         bend=0.4 if case == "bend" else 0.0,
     )

@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 
 import pipefish as pf
-from pipefish import _engine
+from pipefish import _engine, health, selfcal_input
 from pipefish.cli import main
 from pipefish.health import BUDGET, _chi2_tail
 from pipefish.selfcal import self_calibrate
-from selfcal_drives import health_of
+from pipefish.structure import reconstruct
+from selfcal_drives import ENCODER, health_of, survey
 from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup
+from test_reconstruct_cli import survey_of
+from tube_tracks import fisheye, tube_drive
 
 SIZE = (1280, 960)
 
@@ -149,6 +152,43 @@ def test_bad_files_are_named(tmp_path: Path, capsys, content):
     assert "matches.csv" in capsys.readouterr().err
 
 
+def test_matches_of_pictures_are_dense_even_and_in_pixels_of_the_whole_picture(monkeypatch):
+    """Halved pictures, as large ones are: a place that is half a pixel off would show."""
+    monkeypatch.setattr(selfcal_input, "DENSE_PIXELS", 320 * 240)
+    monkeypatch.setattr(selfcal_input, "MOST_MATCHES", 300)
+    random = np.random.default_rng(3)
+    base = sum(
+        np.kron(random.uniform(0, 1, (600 // n + 1, 760 // n + 1)), np.ones((n, n)))[:600, :760] for n in (4, 8, 16, 32)
+    )
+    wave = np.exp(-(np.linspace(-2, 2, 9) ** 2))
+    for axis in (0, 1):
+        base = np.apply_along_axis(np.convolve, axis, base, wave / wave.sum(), "same")
+    base = (base - base.min()) / np.ptp(base)
+    shift = np.array([17.0, 9.0])
+    one, two = selfcal_input.match_pictures(base[40:520, 40:680], base[31:511, 23:663])
+    off = np.linalg.norm(two - one - shift, axis=1)
+    assert 100 < len(one) <= 320
+    assert np.median(off) < 0.1 and (off < 0.5).mean() > 0.9
+    assert (one.max(axis=0) > [560, 400]).all() and (one.min(axis=0) < [80, 80]).all()
+
+
+def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path, capsys):
+    """From the file a device sends: the scale within three sigmas and 2 %; straight on, what is missing is named."""
+    camera = fisheye(100)
+    drive = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, pan=0.6)
+    file = survey_of(drive, tmp_path / "pan.mcap")
+    assert main(["selfcal", str(file), "-o", str(tmp_path / "camera.json"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = pf.Camera.load(tmp_path / "camera.json")
+    assert document["sigma"] >= selfcal_input.COMMON_SIGMA
+    assert abs(found.f_u - camera.f_u) < min(3 * math.sqrt(found.covariance[0, 0]), 0.02 * camera.f_u)
+    straight = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, wobble=0.0)
+    file = survey_of(straight, tmp_path / "straight.mcap")
+    assert main(["selfcal", str(file), "-o", str(tmp_path / "no.json")]) == 1
+    error = capsys.readouterr().err
+    assert "along its optical axis" in error and "Pan or tilt by at least" in error
+
+
 # ---------------------------------------------------------------------- health
 
 
@@ -172,6 +212,34 @@ def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius():
 def test_turns_that_noise_feigns_in_a_straight_drive_count_for_nothing():
     """They would leave sigma(alpha) at a few per cent, less with the length: so little was not seen."""
     assert health_of(3, "straight", "alpha", density=400.0)["alpha_sigma"] == math.inf
+
+
+def bent_drive(**camera):
+    return survey(1, "bend", density=400.0, camera=fisheye(100, **camera))
+
+
+def test_a_profile_without_the_pupil_shift_is_not_accused(monkeypatch):
+    """A shift of 2.5 mm at 90 degrees, 15 cm from the wall: as large as a drift, and another thing."""
+    drive, readings = bent_drive(pupil_e1=0.001)
+    profile = fisheye(100)
+    known = {"encoder": ENCODER, "sigma": 0.2, "threads": 1}
+    assert health.check_profile(drive.tracks, profile, readings, **known).verdict != "drifted, recalibrate"
+    monkeypatch.setattr(health, "PUPIL_SIGMA", 1e-6)
+    assert health.check_profile(drive.tracks, profile, readings, **known).probability < 1e-6
+
+
+def test_the_check_asks_for_no_second_reconstruction(monkeypatch):
+    """With one that was made for it the answer is the same; `common` noise widens it."""
+    drive, readings = bent_drive()
+    known = {"encoder": ENCODER, "sigma": 0.2, "threads": 1}
+    alone = health.check_profile(drive.tracks, drive.camera, readings, **known)
+    prior = health.drift_prior(drive.tracks, drive.camera)
+    structure = reconstruct(drive.tracks, drive.camera, readings, drift=prior, **known)
+    monkeypatch.setattr(health, "reconstruct", None)
+    again = health.check_profile(drive.tracks, drive.camera, readings, structure=structure, **known)
+    assert (again.verdict, again.alpha_sigma) == (alone.verdict, pytest.approx(alone.alpha_sigma, rel=1e-6))
+    wider = health.check_profile(drive.tracks, drive.camera, readings, structure=structure, common=3.0, **known)
+    assert wider.alpha_sigma > 2 * again.alpha_sigma and wider.verdict == "cannot tell"
 
 
 def test_chi2_tail_against_tables():

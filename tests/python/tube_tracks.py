@@ -125,11 +125,12 @@ def tube_drive(
     camera: pf.Camera | None = None,
     wobble: float = 1.0,
     bend: float = 0.0,
+    pan: float = 0.0,
 ) -> Drive:
     """Frames every `step` metres; `density` points a metre of wall, seen between two angles from the axis (degrees).
 
     ovality: (max - min) / diameter, the long axis upright. wrong: share of observations at a random place nearby.
-    bend: the tube's curvature, 1/m, to the side.
+    bend: the tube's curvature, 1/m, to the side. pan: radians that the camera swings to either side, every half metre.
     """
     random = np.random.default_rng(seed)
     camera = camera or fisheye(95)
@@ -156,7 +157,8 @@ def tube_drive(
     poses = np.zeros((len(s), 3, 4))
     for i in range(len(s)):
         about_y = rotation(np.array([0.0, -heading[i], 0.0]))
-        r = rotation(angles[i] * [1, 0, 1] + [0, wobble * 0.04 * np.sin(3.1 * s[i] + phase[3]), 0]) @ about_y
+        swing = wobble * 0.04 * np.sin(3.1 * s[i] + phase[3]) + pan * np.sin(4 * np.pi * s[i])
+        r = rotation(angles[i] * [1, 0, 1] + [0, swing, 0]) @ about_y
         poses[i] = np.column_stack([r, -r @ centres[i]])
     count = int(density * (length + 0.8))
     z, phi = np.sort(random.uniform(-0.1, length + 0.7, count)), random.uniform(0, 2 * np.pi, count)

@@ -64,7 +64,7 @@ Eigen::Matrix<double, 7, 7> profile_covariance(const selfcal::Result &found)
 
 nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixels> &second, uint32_t width,
                         uint32_t height, double c_u, double c_v, double centre_sigma, double bend, double alpha_limit,
-                        double alone_limit, uint64_t seed, int threads)
+                        double alone_limit, double sigma_least, uint64_t seed, int threads)
 {
     std::vector<selfcal::Pair> pairs(std::min(first.size(), second.size()));
     for (size_t p = 0; p < pairs.size(); p++) {
@@ -78,6 +78,7 @@ nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixe
     options.prior.centre_sigma = centre_sigma;
     options.alpha_limit = alpha_limit;
     options.alone_limit = alone_limit;
+    options.sigma_least = sigma_least;
     options.seed = seed;
     options.threads = threads;
     selfcal::Result found;
@@ -127,7 +128,7 @@ void bind_selfcal(nb::module_ &m)
 {
     m.def("self_calibrate", &self_calibrate, nb::arg("first"), nb::arg("second"), nb::arg("width"), nb::arg("height"),
           nb::arg("c_u"), nb::arg("c_v"), nb::arg("centre_sigma"), nb::arg("bend"), nb::arg("alpha_limit"),
-          nb::arg("alone_limit"), nb::arg("seed"), nb::arg("threads"),
+          nb::arg("alone_limit"), nb::arg("sigma_least"), nb::arg("seed"), nb::arg("threads"),
           "A camera from matches of pairs of views; see pipefish.selfcal.");
     m.def(
         "bearing_difference",

@@ -149,10 +149,9 @@ Array<double> point_covariances(const sfm::BundleCovariance &covariance)
     return to_numpy(std::move(flat), {covariance.points().size(), 3, 3});
 }
 
-nb::dict segment_dict(sfm::Segment &segment)
+// Poses (K,3,4), points (N,3) and their tracks (N,).
+void add_map(const sfm::Submap &map, nb::dict &out)
 {
-    nb::dict out;
-    const sfm::Submap &map = segment.map;
     std::vector<double> poses, points;
     for (const geometry::Pose &pose : map.poses) {
         for (Eigen::Index row = 0; row < 3; row++) {
@@ -166,6 +165,21 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["poses"] = to_numpy(std::move(poses), {map.poses.size(), 3, 4});
     out["points"] = to_numpy(std::move(points), {map.points.size(), 3});
     out["tracks"] = to_numpy<int>(map.tracks.data(), {map.tracks.size()});
+}
+
+nb::dict segment_dict(sfm::Segment &segment)
+{
+    nb::dict out;
+    add_map(segment.map, out);
+    out["drift"] = nb::none();
+    if (segment.drift.camera.size() > 0) {
+        nb::dict drift;
+        add_map(segment.drift.map, drift);
+        drift["camera"] =
+            to_numpy<double>(segment.drift.camera.data(), {static_cast<size_t>(segment.drift.camera.size())});
+        drift["covariance"] = matrix_to_numpy(segment.drift.covariance);
+        out["drift"] = drift;
+    }
     const bool uncertain = !segment.total.empty();
     out["random"] = nb::cast(std::move(segment.random));
     out["total"] = uncertain ? nb::cast(std::move(segment.total)) : nb::object(nb::none());
@@ -187,15 +201,29 @@ nb::dict segment_dict(sfm::Segment &segment)
 struct Extras { // what may be known beside the tracks
     sfm::Odometry odometry;
     sfm::Gravity gravity;
-    sfm::CameraPrior camera;
+    sfm::CameraPrior camera, drift;
 };
+
+// Null where there is no covariance.
+const sfm::CameraPrior *prior_of(const std::vector<uint32_t> &parameters, const std::optional<Square> &covariance,
+                                 sfm::CameraPrior &room)
+{
+    if (!covariance) {
+        return nullptr;
+    }
+    const Eigen::Index n = static_cast<Eigen::Index>(parameters.size());
+    room.parameter = parameters;
+    room.covariance = Eigen::Map<const Eigen::MatrixXd>(covariance->data(), n, n);
+    return &room;
+}
 
 nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const Indices &frame, const Indices &track,
                      const Pixels &uv, const std::optional<Covariances> &covariance, double sigma,
                      const std::string &method, uint64_t seed, int threads, double still,
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
-                     const std::optional<Square> &uncertainty, double sag_sigma)
+                     const std::optional<Square> &uncertainty, const std::vector<uint32_t> &drifting,
+                     const std::optional<Square> &drift, double sag_sigma)
 {
     Extras extras;
     sfm::ReconstructOptions options;
@@ -217,12 +245,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
         extras.gravity.sigma = down_sigma;
         options.gravity = &extras.gravity;
     }
-    if (uncertainty) {
-        const Eigen::Index n = static_cast<Eigen::Index>(uncertain.size());
-        extras.camera.parameter = uncertain;
-        extras.camera.covariance = Eigen::Map<const Eigen::MatrixXd>(uncertainty->data(), n, n);
-        options.camera_prior = &extras.camera;
-    }
+    options.camera_prior = prior_of(uncertain, uncertainty, extras.camera);
+    options.drift_prior = prior_of(drifting, drift, extras.drift);
     sfm::Reconstruction found;
     int outside = 0, repeated = 0;
     {
@@ -271,7 +295,8 @@ void bind_sfm(nb::module_ &m)
           nb::arg("covariance").noconvert().none(), nb::arg("sigma"), nb::arg("method"), nb::arg("seed"),
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
-          nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("sag_sigma"),
+          nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("drifting"),
+          nb::arg("drift").noconvert().none(), nb::arg("sag_sigma"),
           "Poses and points from tracks; see pipefish.structure.");
     m.def(
         "sag",

@@ -25,6 +25,7 @@ using geometry::TwoViewStatus;
 
 constexpr double DEGREE = std::numbers::pi / 180.0;
 constexpr int LEAST_MATCHES = 15, LEADS = 3, FINALISTS = 3;
+constexpr size_t START_MATCHES = 500;       // of a pair, that starts are tried with: which minimum, not how well
 constexpr double SAME_LENS = 0.25 * DEGREE; // starts that end nearer than this have found one minimum
 
 std::vector<Sight> sights_of(const pf_camera &camera, const std::vector<double> &uv, double sigma)
@@ -48,6 +49,30 @@ double median_shift(const Pair &pair)
     return median(std::move(shift));
 }
 
+// How much a pair promises to tell: the shift that its matches have in common is mostly panning and tilting, which is
+// what shows a lens; driving along the axis moves them apart. Weighed as the noise of so many averages out.
+double promise(const Pair &pair)
+{
+    std::vector<double> across(pair.size()), down(pair.size());
+    for (size_t i = 0; i < pair.size(); i++) {
+        const Eigen::Vector2d shift = pair.two(i) - pair.one(i);
+        across[i] = shift[0];
+        down[i] = shift[1];
+    }
+    return std::hypot(median(std::move(across)), median(std::move(down))) * std::sqrt(static_cast<double>(pair.size()));
+}
+
+Pair thinned(const Pair &pair, size_t most)
+{
+    const size_t step = (pair.size() + most - 1) / most;
+    Pair out;
+    for (size_t i = 0; i < pair.size(); i += std::max<size_t>(step, 1)) {
+        out.uv1.insert(out.uv1.end(), {pair.uv1[2 * i], pair.uv1[2 * i + 1]});
+        out.uv2.insert(out.uv2.end(), {pair.uv2[2 * i], pair.uv2[2 * i + 1]});
+    }
+    return out;
+}
+
 // One node of the grid, and where it led.
 struct Start {
     Adjustment at;
@@ -64,9 +89,14 @@ public:
     {
         result_.pairs.resize(pairs.size());
         std::vector<int> order(pairs.size());
+        std::vector<double> promises;
         std::iota(order.begin(), order.end(), 0);
+        for (const Pair &pair : pairs) {
+            thin_.push_back(thinned(pair, START_MATCHES));
+            promises.push_back(promise(pair));
+        }
         std::stable_sort(order.begin(), order.end(), [&](int a, int b) {
-            return pairs[static_cast<size_t>(a)].size() > pairs[static_cast<size_t>(b)].size();
+            return promises[static_cast<size_t>(a)] > promises[static_cast<size_t>(b)];
         });
         for (const int p : order) {
             PairReport &report = result_.pairs[static_cast<size_t>(p)];
@@ -154,7 +184,7 @@ private:
                 start.at.height = height_;
                 start.at.family = family;
                 start.at.prior = options_.prior;
-                start.at.pairs = &pairs_;
+                start.at.pairs = &thin_;
                 start.at.lens[kLogF] = std::log(reach_ / nominal_radius(q, rim * DEGREE));
                 start.at.lens[kShape] = q;
                 start.at.lens[kMix] = kMixMean;
@@ -175,7 +205,7 @@ private:
         double sum = 0.0;
         for (size_t lead = 0; lead < std::min<size_t>(LEADS, usable_.size()); lead++) {
             const int p = usable_[lead];
-            const Pair &pair = pairs_[static_cast<size_t>(p)];
+            const Pair &pair = thin_[static_cast<size_t>(p)];
             const std::vector<Sight> a = sights_of(camera, pair.uv1, coarse_), b = sights_of(camera, pair.uv2, coarse_);
             geometry::TwoViewOptions options;
             options.max_iterations = 300;
@@ -328,7 +358,7 @@ private:
                 double lost = 0.0;
                 for (size_t lead = 0; lead < std::min<size_t>(LEADS, usable_.size()); lead++) {
                     if (std::find(start.at.used.begin(), start.at.used.end(), usable_[lead]) == start.at.used.end()) {
-                        lost += 9.0 * static_cast<double>(pairs_[static_cast<size_t>(usable_[lead])].size());
+                        lost += 9.0 * static_cast<double>(thin_[static_cast<size_t>(usable_[lead])].size());
                     }
                 }
                 start.cost = lost + start.at.truncated(std::max(least, 0.2));
@@ -385,6 +415,7 @@ private:
     void complete(Start &start) const
     {
         Adjustment &at = start.at;
+        at.pairs = &pairs_;
         const std::vector<int> had = at.used;
         const pf_camera camera = at.camera();
         for (const int p : usable_) {
@@ -403,23 +434,25 @@ private:
             }
         }
         std::sort(at.used.begin(), at.used.end());
-        at.sigma = std::max(start.sigma, 0.1);
+        double noise = std::max(start.sigma, 0.1); // as residuals show it; what is right is chosen by it
+        at.sigma = std::max(noise, options_.sigma_least);
         at.loss = {optim::RobustLoss::Kind::cauchy, 1.5, 0.0};
-        select(at, 5.0 * at.sigma);
+        select(at, 5.0 * noise);
         follow(at);
         at.adjust(Stage::all, 30);
         at.loss = {};
         for (int round = 0; round < 3; round++) {
-            select(at, 3.0 * at.sigma);
+            select(at, 3.0 * noise);
             drop_levers(at);
             at.adjust(Stage::all, 20);
-            at.sigma = spread(at);
+            noise = std::max(spread(at), 0.02);
+            at.sigma = std::max(noise, options_.sigma_least);
         }
         if (at.used.empty()) {
             start.cost = std::numeric_limits<double>::infinity();
             return;
         }
-        start.sigma = at.sigma;
+        start.sigma = noise;
         start.cost = 0.0;
         const double common = std::max(start.sigma, 0.2);
         start.cost = at.truncated(common) * common * common;
@@ -440,7 +473,7 @@ private:
             }
         }
         const double free = static_cast<double>(count) - 5.0 * static_cast<double>(at.used.size()) - 4.0;
-        return std::max(std::sqrt(sum / std::max(free, 1.0)) / 0.9866, 0.02);
+        return std::sqrt(sum / std::max(free, 1.0)) / 0.9866;
     }
 
     // What each pair is, by the lens found; those that tell nothing are left out of what is said of the lens.
@@ -495,7 +528,8 @@ private:
     const std::vector<Pair> &pairs_;
     uint32_t width_, height_;
     Options options_;
-    std::vector<int> usable_; // pairs with enough matches that moved, most matches first
+    std::vector<Pair> thin_;  // of pairs_
+    std::vector<int> usable_; // pairs with enough matches that moved, the most promising first
     std::vector<double> radii_;
     double reach_ = 0.0;  // pixels from the prior's centre that nearly all right matches are within
     double coarse_ = 1.5; // pixels that a wrong lens is forgiven at first

@@ -12,6 +12,7 @@ namespace pipefish::selfcal
 struct Options {
     Prior prior;
     double alpha_limit = 0.08, alone_limit = 0.02; // sigmas of ln alpha from which on a motion is missing
+    double sigma_least = 0.2; // pixels: what matches have in common, and lenses that are not round, residuals hide
     uint64_t seed = 0;
     int threads = 1;
 };

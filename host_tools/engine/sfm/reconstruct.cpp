@@ -375,9 +375,17 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
     settings.cost_tolerance = 0.01 / std::max(observations, 1);
     segment.report = adjust(map, table, central, settings, &segment.random);
+    const std::vector<int> used = segment.report.used; // or the covariances would be of different points
+    settings.only = &used;
+    if (options.drift_prior) {
+        segment.drift.map = map;
+        settings.camera_prior = options.drift_prior;
+        BundleCovariance known;
+        segment.drift.camera = adjust(segment.drift.map, table, central, settings, &known).camera;
+        const Eigen::Index n = segment.drift.camera.size();
+        segment.drift.covariance = known.border().bottomRightCorner(n, n);
+    }
     if (options.camera_prior) {
-        const std::vector<int> used = segment.report.used; // or the two covariances would be of different points
-        settings.only = &used;
         settings.camera_prior = options.camera_prior;
         segment.report = adjust(map, table, central, settings, &segment.total);
     }

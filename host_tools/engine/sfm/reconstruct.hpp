@@ -16,7 +16,8 @@ struct ReconstructOptions {
     const Odometry *odometry = nullptr; // by frame of the table
     const Gravity *gravity = nullptr;   // by frame of the table
     const CameraPrior *camera_prior = nullptr;
-    double sag_sigma = 0.0; // as in BundleOptions
+    const CameraPrior *drift_prior = nullptr; // as wide as a camera may have changed since it was calibrated
+    double sag_sigma = 0.0;                   // as in BundleOptions
 };
 
 // A stretch that could not be measured, between two frames.
@@ -26,10 +27,18 @@ struct Gap {
     int common = 0;
 };
 
+// The adjustment once more, with the camera free within `drift_prior`.
+struct Drift {
+    Submap map;
+    Eigen::VectorXd camera; // changes of its parameters, and their covariance
+    Eigen::MatrixXd covariance;
+};
+
 struct Segment {
     Submap map; // frames are numbers in `frames`
     BundleReport report;
     BundleCovariance random, total; // with the camera as it is; with its uncertainty (empty where that is not known)
+    Drift drift;                    // empty without drift_prior
     double sigma = 1.0;             // robust, of the whitened residuals before the last selection
     bool metric = false;            // scale from odometry
     double scale_sigma = 0.0;       // relative, of the scale from odometry before the adjustment
