@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .camera import Camera
 from .errors import ArgumentError
-from .structure import Encoder, reconstruct
+from .structure import Encoder, RollingShutter, reconstruct
 from .survey import Tracks
 from .tube import fit_tube
 
@@ -162,10 +162,11 @@ def check_profile(
     diameter_sigma: float = 0.001,
     budget: float = BUDGET,
     threads: int | None = None,
+    shutter: RollingShutter | None = None,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
-    tracks .. sigma  as of reconstruct()
+    tracks .. sigma, shutter  as of reconstruct()
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
@@ -194,6 +195,7 @@ def check_profile(
         attitude_sigma=attitude_sigma,
         sigma=sigma,
         threads=threads,
+        shutter=shutter,
     )
     if found.camera_change is None:
         return _nothing(budget, f"nothing was measured: {found.reason}")

@@ -1,5 +1,6 @@
 // Two views and whole reconstructions for Python; pipefish.twoview.py and pipefish/structure.py check the arguments.
 #include "arrays.hpp"
+#include "geometry/between.hpp"
 #include "geometry/minimal.hpp"
 #include "geometry/two_view.hpp"
 #include "pipefish/profile.h"
@@ -34,6 +35,7 @@ using Values = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device
 using Square = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using Jacobians = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using Poses = nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>;
 using Covariances = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
 
 const char *status_name(geometry::TwoViewStatus status)
@@ -83,6 +85,12 @@ nb::dict two_view(const pf_profile &first, const pf_profile &second, const Pixel
     return out;
 }
 
+geometry::Pose pose_at(const Poses &poses, size_t i)
+{
+    const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(poses.data() + 12 * i);
+    return {m.leftCols<3>(), m.col(3)};
+}
+
 template <size_t N> std::array<geometry::Vector3d, N> vectors(const Triples &rows)
 {
     if (rows.shape(0) != N) {
@@ -108,6 +116,34 @@ nb::object sampson_squared(const pf_profile &profile, const Matrix34 &pose, cons
         out[i] = geometry::sampson_squared(relative, a[i], b[i]);
     }
     return to_numpy<double>(out.data(), {n});
+}
+
+nb::object row_poses(const Poses &poses, const Indices &segment, const Values &time, const Indices &place,
+                     const Values &late)
+{
+    const int frames = static_cast<int>(poses.shape(0));
+    const size_t n = place.shape(0);
+    if (segment.shape(0) != poses.shape(0) || time.shape(0) != poses.shape(0) || late.shape(0) != n) {
+        throw nb::value_error("not one segment and time a pose, or not one time a place");
+    }
+    std::vector<double> out(12 * n);
+    for (size_t i = 0; i < n; i++) {
+        const int frame = place.data()[i];
+        if (frame < 0 || frame >= frames) {
+            throw nb::value_error("place: no such frame");
+        }
+        const auto range = std::equal_range(segment.data(), segment.data() + frames, segment.data()[frame]);
+        const int first = static_cast<int>(range.first - segment.data());
+        const int end = static_cast<int>(range.second - segment.data());
+        geometry::Pose pose = pose_at(poses, static_cast<size_t>(frame));
+        if (end - first > 1) {
+            const sfm::Moment moment = sfm::moment_of(late.data()[i], frame, first, end, {time.data(), time.shape(0)});
+            pose = geometry::pose_between(pose, pose_at(poses, static_cast<size_t>(moment.other)), moment.share);
+        }
+        Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> row(out.data() + 12 * i);
+        row << pose.r, pose.t;
+    }
+    return to_numpy<double>(out.data(), {n, 3, 4});
 }
 
 // (m,m) covariance of m linear functions of points: jacobian (m, n, 3) of points (n,).
@@ -188,6 +224,7 @@ struct Extras { // what may be known beside the tracks
     sfm::Odometry odometry;
     sfm::Gravity gravity;
     sfm::CameraPrior camera;
+    sfm::Shutter shutter;
 };
 
 nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const Indices &frame, const Indices &track,
@@ -195,7 +232,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::string &method, uint64_t seed, int threads, double still,
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
-                     const std::optional<Square> &uncertainty, double sag_sigma)
+                     const std::optional<Square> &uncertainty, double sag_sigma,
+                     const std::optional<Values> &frame_time, double line_time, double middle_row)
 {
     Extras extras;
     sfm::ReconstructOptions options;
@@ -222,6 +260,12 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
         extras.camera.parameter = uncertain;
         extras.camera.covariance = Eigen::Map<const Eigen::MatrixXd>(uncertainty->data(), n, n);
         options.camera_prior = &extras.camera;
+    }
+    if (frame_time) {
+        extras.shutter.time.assign(frame_time->data(), frame_time->data() + frame_time->shape(0));
+        extras.shutter.line_time = line_time;
+        extras.shutter.middle_row = middle_row;
+        options.shutter = &extras.shutter;
     }
     sfm::Reconstruction found;
     int outside = 0, repeated = 0;
@@ -272,6 +316,7 @@ void bind_sfm(nb::module_ &m)
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("sag_sigma"),
+          nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"),
           "Poses and points from tracks; see pipefish.structure.");
     m.def(
         "sag",
@@ -284,6 +329,21 @@ void bind_sfm(nb::module_ &m)
         },
         nb::arg("first").noconvert(), nb::arg("now").noconvert(), nb::arg("f"),
         "Pixels outwards for each px^2 of the sag, of tracks seen first and now at these angles (N,) from the axis.");
+    m.def("row_poses", &row_poses, nb::arg("poses").noconvert(), nb::arg("segment").noconvert(),
+          nb::arg("time").noconvert(), nb::arg("place").noconvert(), nb::arg("late").noconvert(),
+          "(n,3,4) where the camera was `late` (n,) seconds after frames `place` (n,), of poses (K,3,4) with segments "
+          "and times (K,).");
+    m.def(
+        "turn_between",
+        [](const Poses &first, const Poses &second, double share) {
+            const geometry::Matrix3d r1 = pose_at(first, 0).r, r2 = pose_at(second, 0).r;
+            const geometry::TurnBetween out =
+                geometry::turn_between(r1, geometry::rotation_log(r2 * r1.transpose()), share);
+            return nb::make_tuple(matrix_to_numpy(out.r), matrix_to_numpy(out.by_first),
+                                  matrix_to_numpy(out.by_second));
+        },
+        nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("share"),
+        "Rotation (3,3) between two poses (1,3,4), and how it turns with each of them (3,3).");
     m.def("sampson_squared", &sampson_squared, nb::arg("camera"), nb::arg("pose").noconvert(),
           nb::arg("uv1").noconvert(), nb::arg("uv2").noconvert(), nb::arg("sigma"),
           "Squared Sampson distances (N,) of pairs of pixels with noise sigma under cam2_from_cam1 (3,4).");

@@ -348,8 +348,8 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     settings.gravity = options.gravity;
     settings.sag_sigma = options.sag_sigma;
     settings.min_views = 3;
-    // Hardly damped: the softest bend of 300 m has 1e-12 of the diagonal's curvature, and steps damped by more than that
-    // straighten it bit by bit (26 of them from 1e-9, which fell by a third each; now 3).
+    // Hardly damped: the softest bend of 300 m has 1e-12 of the diagonal's curvature, and steps damped by more than
+    // that straighten it bit by bit (26 of them from 1e-9, which fell by a third each; now 3).
     settings.lambda = 1e-15;
     int observations = 0;
     for (int cycle = 0; cycle < 3; cycle++) {
@@ -482,6 +482,14 @@ Reconstruction reconstruct(const TrackTable &whole, const pf_camera &camera, con
     Building building = options.method == Method::hierarchical ? Tree(table, central, inner).build()
                                                                : Chain(table, central, inner).build();
     trim(building.maps, table);
+    if (options.shutter) { // the maps are built as if all rows were seen at once: near enough to start from
+        Shutter shutter = *options.shutter;
+        shutter.time.clear();
+        for (const int f : out.frames) {
+            shutter.time.push_back(options.shutter->time[static_cast<size_t>(f)]);
+        }
+        table.roll(shutter);
+    }
     for (Submap &map : building.maps) {
         Segment segment;
         segment.map = std::move(map);

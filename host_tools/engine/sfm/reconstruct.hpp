@@ -16,7 +16,8 @@ struct ReconstructOptions {
     const Odometry *odometry = nullptr; // by frame of the table
     const Gravity *gravity = nullptr;   // by frame of the table
     const CameraPrior *camera_prior = nullptr;
-    double sag_sigma = 0.0; // as in BundleOptions
+    double sag_sigma = 0.0;           // as in BundleOptions
+    const Shutter *shutter = nullptr; // that rolls; times by frame of the table
 };
 
 // A stretch that could not be measured, between two frames.
