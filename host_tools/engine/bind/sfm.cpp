@@ -220,6 +220,29 @@ nb::dict segment_dict(sfm::Segment &segment)
     return out;
 }
 
+// Adjusts given poses (K,3,4) and points (N,3), which tracks 0..N-1 see: first pose and the distance to the last held.
+nb::dict adjust(const pf_profile &profile, const Poses &poses, const Triples &points, const Indices &frame,
+                const Indices &track, const Pixels &uv, double sigma, int max_iterations)
+{
+    const int frames = static_cast<int>(poses.shape(0)), tracks = static_cast<int>(points.shape(0));
+    const sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
+                                {track.data(), track.shape(0)}, uv.data(), nullptr, sigma);
+    sfm::Submap map;
+    for (int f = 0; f < frames; f++) {
+        map.poses.push_back(pose_at(poses, static_cast<size_t>(f)));
+    }
+    for (int t = 0; t < tracks; t++) {
+        map.tracks.push_back(t);
+        map.points.emplace_back(points.data()[3 * t], points.data()[3 * t + 1], points.data()[3 * t + 2]);
+    }
+    sfm::BundleOptions options;
+    options.max_iterations = max_iterations;
+    sfm::Segment segment;
+    segment.report = sfm::adjust(map, table, profile.camera, options, &segment.random);
+    segment.map = std::move(map);
+    return segment_dict(segment);
+}
+
 struct Extras { // what may be known beside the tracks
     sfm::Odometry odometry;
     sfm::Gravity gravity;
@@ -318,6 +341,9 @@ void bind_sfm(nb::module_ &m)
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("sag_sigma"),
           nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"),
           "Poses and points from tracks; see pipefish.structure.");
+    m.def("adjust", &adjust, nb::arg("camera"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(),
+          nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(), nb::arg("sigma"),
+          nb::arg("max_iterations"), "Least squares from a start, as a segment of reconstruct().");
     m.def(
         "sag",
         [](const Values &first, const Values &now, double f) {
