@@ -62,6 +62,8 @@ static const setting settings[] = {
      "cameras: with exposure = fixed, in the camera's own units (libcamera: a factor); 0 = as the camera is set"},
     {"camera", "exposure_max_us", INTEGER, AT(camera.exposure_max_us), "us", "10000", 0, 1000000, NULL,
      "cameras: longest exposure of auto and hold, against motion blur; 0 = the camera's limit"},
+    {"camera", "line_time_us", NUMBER, AT(camera.line_time_us), "us", "0", -1000, 1000, NULL,
+     "of a rolling shutter, for the host: from one row's exposure to the next one's; below 0 = from the last row up"},
     {"camera", "zero_copy", SWITCH, AT(camera.zero_copy), "", "true", 0, 0, NULL,
      "track frames where the driver put them; false = copy each first, for boards that read such memory slowly"},
     {"camera", "index", TEXT, AT(camera.index), "", "", 0, 0, NULL,

@@ -31,7 +31,7 @@ typedef struct pf_config {
         pf_config_text path, csv, profile, profile_store, device, format, index;
         uint32_t loops, trial_starts, black_level, white_level;
         uint32_t width, height, buffers, exposure, exposure_us, exposure_max_us;
-        double frame_rate, gain;
+        double frame_rate, gain, line_time_us;
         bool zero_copy;
     } camera;
     struct {

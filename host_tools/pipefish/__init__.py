@@ -25,6 +25,7 @@ _LAZY = {
     "reconstruct": "pipefish.structure",
     "Reconstruction": "pipefish.structure",
     "Encoder": "pipefish.structure",
+    "RollingShutter": "pipefish.structure",
     "two_view": "pipefish.twoview",
     "TwoView": "pipefish.twoview",
     "Survey": "pipefish.survey",

@@ -62,6 +62,12 @@ def add_reconstruct(commands: Any) -> None:
         default="hierarchical",
         help="how poses are found [hierarchical]",
     )
+    p.add_argument(
+        "--line-time",
+        type=float,
+        metavar="US",
+        help="of a rolling shutter: microseconds from a row's exposure to the next one's [as the survey says]; 0: none",
+    )
     add_profile_input(p)
 
     p = add_command(
@@ -110,6 +116,8 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
     from pipefish.survey import Survey
 
     camera = None
+    if args.line_time is not None and not abs(args.line_time) <= 1000.0:
+        raise UsageError(f"reconstruct: --line-time: {args.line_time:g} is not within 1000 microseconds")
     if args.profile:
         from pipefish.cli_profile import load_profile
 
@@ -121,6 +129,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
             diameter=args.diameter,
             nominal=args.nominal,
             method=args.method,
+            line_time=None if args.line_time is None else 1e-6 * args.line_time,
             tell=lambda done, word: bar.update(round(100 * done), word),
         )
         bar.update(97, "writing files")

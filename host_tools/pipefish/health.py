@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .camera import Camera
 from .errors import ArgumentError
-from .structure import Encoder, Reconstruction, reconstruct
+from .structure import Encoder, Reconstruction, RollingShutter, reconstruct
 from .survey import Tracks
 from .tube import fit_tube
 
@@ -188,10 +188,11 @@ def check_profile(
     budget: float = BUDGET,
     common: float = 1.0,
     threads: int | None = None,
+    shutter: RollingShutter | None = None,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
-    tracks .. sigma  as of reconstruct()
+    tracks .. sigma, shutter  as of reconstruct()
     structure        reconstruct() of the same with drift=drift_prior(tracks, camera); None: it is made here
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
@@ -222,6 +223,7 @@ def check_profile(
         sigma=sigma,
         threads=threads,
         drift=(FREE, prior),
+        shutter=shutter,
     )
     if not found.drift:
         return _nothing(budget, f"nothing was measured: {found.reason}")

@@ -15,6 +15,7 @@ from pipefish import _engine
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.rolling import shutter_of
 from pipefish.sectionsigma import diameter_sigma
 from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
@@ -226,6 +227,7 @@ def measure(
     nominal: float | None = None,
     method: str = "hierarchical",
     threads: int | None = None,
+    line_time: float | None = None,
     tell: Tell | None = None,
 ) -> Measurement:
     """Measures a survey.
@@ -233,6 +235,7 @@ def measure(
     camera     None: the survey's profile
     diameter   known true inner diameter, metres: the scale where there is no encoder, a check where there is one
     nominal    nominal diameter, metres [the survey's], for what is defined against it
+    line_time  of a rolling shutter, seconds from a row's exposure to the next one's [as the survey says]
     tell       is called with a fraction done and a word
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
@@ -258,6 +261,7 @@ def measure(
     )
     walk = np.hypot(TRACK_FLOOR_PX, TRACK_WALK_PX * _travel(tracks, camera))
     weighed = dataclasses.replace(tracks, covariance=tracks.covariance + (walk**2)[:, None, None] * np.eye(2))
+    shutter = shutter_of(survey, line_time)
     structure = _while_telling(
         lambda: reconstruct(
             weighed,
@@ -270,6 +274,7 @@ def measure(
             threads=threads,
             sag_sigma=TRACK_SAG_PX2,
             drift=drift_prior(weighed, camera),
+            shutter=shutter,
         ),
         lambda: tell(0.05, "poses and points"),
     )
@@ -314,6 +319,7 @@ def measure(
             attitude_sigma=attitude_sigma,
             diameter=diameter if m.scale.source == "encoder" else None,
             threads=threads,
+            shutter=shutter,
         ),
         lambda: tell(0.9, "profile"),
     )
@@ -367,7 +373,8 @@ def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Res
     item = np.flatnonzero((j >= 0) & (k >= 0))
     item = item[structure.point_segment[j[item]] == structure.segment[k[item]]]
     j, k = j[item], k[item]
-    seen = np.einsum("nij,nj->ni", structure.poses[k, :, :3], structure.points[j]) + structure.poses[k, :, 3]
+    poses = structure.poses_at(k, tracks.pixels[item])
+    seen = np.einsum("nij,nj->ni", poses[:, :, :3], structure.points[j]) + poses[:, :, 3]
     pixels, ok = camera.project(seen)
     item, j, k, seen, pixels = item[ok], j[ok], k[ok], seen[ok], pixels[ok]
     residual = tracks.pixels[item] - pixels - _sag(tracks, camera, np.array(structure.sag)[structure.segment[k]], item)

@@ -1,6 +1,6 @@
 """Structure from motion: camera poses and wall points from tracks, with their covariances.
 
-Works on rays, so views of 180 degrees and beyond are ordinary. docs/reconstruct.md describes the method.
+Works on rays, so views of 180 degrees and beyond are ordinary. docs/reconstruction.md describes the method.
 """
 
 from __future__ import annotations
@@ -47,6 +47,20 @@ class Encoder:
 
 
 @dataclass(frozen=True)
+class RollingShutter:
+    """Rows that are exposed one after the other: row v is, line_time (v - middle_row) after its frame's time.
+
+    time        (F,) seconds of each frame, NaN where unknown: there the frame counts as seen at once
+    line_time   seconds from a row's exposure to the next one's, below 0 for a camera that reads upwards
+    middle_row  that is exposed at the frame's time, None: the picture's middle
+    """
+
+    time: npt.ArrayLike
+    line_time: float
+    middle_row: float | None = None
+
+
+@dataclass(frozen=True)
 class Gap:
     """A stretch between two frames that was not measured."""
 
@@ -87,6 +101,7 @@ class Reconstruction:
     gaps             list of Gap
     down             (3,) direction of gravity in the world, None without an inclinometer
     sag              px^2, of each segment: the tracks' common sag
+    shutter          what was said of a rolling shutter; poses are those of its middle row: see poses_at()
     camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
     cost             sum of half the squared residuals
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
@@ -125,6 +140,7 @@ class Reconstruction:
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
     drift: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    shutter: RollingShutter | None = field(default=None, repr=False)
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
 
@@ -132,6 +148,19 @@ class Reconstruction:
     def centres(self) -> Floats:
         """(K,3) where the camera was."""
         return -np.einsum("nij,ni->nj", self.poses[:, :, :3], self.poses[:, :, 3])
+
+    def poses_at(self, place: npt.NDArray[np.int64], pixels: Floats) -> Floats:
+        """(n,3,4) where the camera was when it saw pixels (n,2) of the frames in `place` (n,), positions in `frames`:
+        the frames' poses or, with a rolling shutter, on the way to a neighbour."""
+        if self.shutter is None:
+            return self.poses[place]
+        return _engine.row_poses(
+            np.ascontiguousarray(self.poses),
+            self.segment.astype(np.int32),
+            np.asarray(self.shutter.time, dtype=np.float64)[self.frames],
+            place.astype(np.int32),
+            np.ascontiguousarray(self.shutter.line_time * (pixels[:, 1] - self.shutter.middle_row)),
+        )
 
     def functions_covariance(
         self, points: npt.ArrayLike, jacobian: npt.ArrayLike, *, systematic: bool = False
@@ -187,6 +216,17 @@ def _down(attitude: npt.ArrayLike, frames: int) -> Floats:
     return np.ascontiguousarray(np.nan_to_num(down))
 
 
+def _checked(shutter: RollingShutter, frames: int, camera: Camera) -> RollingShutter | None:
+    """As the engine wants it; None where all rows are exposed at once."""
+    time = np.ascontiguousarray(shutter.time, dtype=np.float64)
+    if time.ndim != 1 or len(time) < frames:
+        raise ArgumentError(f"shutter: expected one time for each of {frames} frames, got shape {time.shape}")
+    middle = (camera.height - 1) / 2 if shutter.middle_row is None else shutter.middle_row
+    if not np.isfinite([shutter.line_time, middle]).all():
+        raise ArgumentError(f"shutter: line_time {shutter.line_time} or middle_row {middle} is not finite")
+    return RollingShutter(time[:frames], float(shutter.line_time), float(middle)) if shutter.line_time else None
+
+
 def _merged(segments: Sequence[dict[str, Any]], steps: Floats | None, frames: npt.NDArray[np.int64]) -> list[Floats]:
     """For each segment the (3,4) that takes it into the world of the first: along the path by odometry, where there is
     any."""
@@ -224,6 +264,7 @@ def reconstruct(
     still: float = 0.5,
     sag_sigma: float = 0.0,
     drift: tuple[Sequence[str], Floats] | None = None,
+    shutter: RollingShutter | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
 
@@ -239,6 +280,7 @@ def reconstruct(
                tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
     drift      names of the camera's parameters and their covariance, as wide as they may have changed since it was
                calibrated: the adjustment is then made once more with them free, for Reconstruction.drift alone
+    shutter    of a camera whose rows are exposed one after the other; None: all at once
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
     that are wrong in themselves.
@@ -255,6 +297,8 @@ def reconstruct(
         step, step_sigma = _steps(chainage, frames, encoder)
     if attitude is not None:
         down = _down(attitude, frames)
+    if shutter is not None:
+        shutter = _checked(shutter, frames, camera)
     uncertain = [PARAMETERS.index(name) for name in camera.covariance_parameters]
     found = _engine.reconstruct(
         camera._profile,
@@ -279,8 +323,12 @@ def reconstruct(
         [PARAMETERS.index(name) for name in drift[0]] if drift else [],
         np.ascontiguousarray(drift[1]) if drift else None,
         float(sag_sigma),
+        None if shutter is None else shutter.time,
+        0.0 if shutter is None else shutter.line_time,
+        0.0 if shutter is None else shutter.middle_row,
     )
     out = _result(found, names, frames, step, encoder, camera)
+    out.shutter = shutter
     out.own_covariance = _own_covariance(out, tracks, camera, sigma)
     return out
 
@@ -300,8 +348,9 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
     here &= keys[number] == wanted
     item = np.flatnonzero(here)
     number, place = number[item], place[item]
-    turn = rec.poses[place, :, :3]
-    seen = np.einsum("nij,nj->ni", turn, rec.points[number]) + rec.poses[place, :, 3]
+    poses = rec.poses_at(place, tracks.pixels[item])
+    turn = poses[:, :, :3]
+    seen = np.einsum("nij,nj->ni", turn, rec.points[number]) + poses[:, :, 3]
     pixels, ok, slope = camera.project_jacobian(seen)[:3]
     spread = np.broadcast_to(sigma**2 * np.eye(2), (len(item), 2, 2))
     if tracks.covariance is not None:

@@ -1,5 +1,6 @@
 // Two views and whole reconstructions for Python; pipefish.twoview.py and pipefish/structure.py check the arguments.
 #include "arrays.hpp"
+#include "geometry/between.hpp"
 #include "geometry/minimal.hpp"
 #include "geometry/two_view.hpp"
 #include "pipefish/profile.h"
@@ -34,6 +35,7 @@ using Values = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device
 using Square = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using Jacobians = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Matrix34 = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using Poses = nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>;
 using Covariances = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
 
 const char *status_name(geometry::TwoViewStatus status)
@@ -83,6 +85,12 @@ nb::dict two_view(const pf_profile &first, const pf_profile &second, const Pixel
     return out;
 }
 
+geometry::Pose pose_at(const Poses &poses, size_t i)
+{
+    const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(poses.data() + 12 * i);
+    return {m.leftCols<3>(), m.col(3)};
+}
+
 template <size_t N> std::array<geometry::Vector3d, N> vectors(const Triples &rows)
 {
     if (rows.shape(0) != N) {
@@ -108,6 +116,34 @@ Array<double> sampson_squared(const pf_profile &profile, const Matrix34 &pose, c
         out[i] = geometry::sampson_squared(relative, a[i], b[i]);
     }
     return to_numpy(std::move(out), {n});
+}
+
+Array<double> row_poses(const Poses &poses, const Indices &segment, const Values &time, const Indices &place,
+                        const Values &late)
+{
+    const int frames = static_cast<int>(poses.shape(0));
+    const size_t n = place.shape(0);
+    if (segment.shape(0) != poses.shape(0) || time.shape(0) != poses.shape(0) || late.shape(0) != n) {
+        throw nb::value_error("not one segment and time a pose, or not one time a place");
+    }
+    std::vector<double> out(12 * n);
+    for (size_t i = 0; i < n; i++) {
+        const int frame = place.data()[i];
+        if (frame < 0 || frame >= frames) {
+            throw nb::value_error("place: no such frame");
+        }
+        const auto range = std::equal_range(segment.data(), segment.data() + frames, segment.data()[frame]);
+        const int first = static_cast<int>(range.first - segment.data());
+        const int end = static_cast<int>(range.second - segment.data());
+        geometry::Pose pose = pose_at(poses, static_cast<size_t>(frame));
+        if (end - first > 1) {
+            const sfm::Moment moment = sfm::moment_of(late.data()[i], frame, first, end, {time.data(), time.shape(0)});
+            pose = geometry::pose_between(pose, pose_at(poses, static_cast<size_t>(moment.other)), moment.share);
+        }
+        Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> row(out.data() + 12 * i);
+        row << pose.r, pose.t;
+    }
+    return to_numpy(std::move(out), {n, 3, 4});
 }
 
 // (m,m) covariance of m linear functions of points: jacobian (m, n, 3) of points (n,).
@@ -198,10 +234,34 @@ nb::dict segment_dict(sfm::Segment &segment)
     return out;
 }
 
+// Adjusts given poses (K,3,4) and points (N,3), which tracks 0..N-1 see: first pose and the distance to the last held.
+nb::dict adjust(const pf_profile &profile, const Poses &poses, const Triples &points, const Indices &frame,
+                const Indices &track, const Pixels &uv, double sigma, int max_iterations)
+{
+    const int frames = static_cast<int>(poses.shape(0)), tracks = static_cast<int>(points.shape(0));
+    const sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
+                                {track.data(), track.shape(0)}, uv.data(), nullptr, sigma);
+    sfm::Submap map;
+    for (int f = 0; f < frames; f++) {
+        map.poses.push_back(pose_at(poses, static_cast<size_t>(f)));
+    }
+    for (int t = 0; t < tracks; t++) {
+        map.tracks.push_back(t);
+        map.points.emplace_back(points.data()[3 * t], points.data()[3 * t + 1], points.data()[3 * t + 2]);
+    }
+    sfm::BundleOptions options;
+    options.max_iterations = max_iterations;
+    sfm::Segment segment;
+    segment.report = sfm::adjust(map, table, profile.camera, options, &segment.random);
+    segment.map = std::move(map);
+    return segment_dict(segment);
+}
+
 struct Extras { // what may be known beside the tracks
     sfm::Odometry odometry;
     sfm::Gravity gravity;
     sfm::CameraPrior camera, drift;
+    sfm::Shutter shutter;
 };
 
 // Null where there is no covariance.
@@ -223,7 +283,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
                      const std::optional<Square> &uncertainty, const std::vector<uint32_t> &drifting,
-                     const std::optional<Square> &drift, double sag_sigma)
+                     const std::optional<Square> &drift, double sag_sigma, const std::optional<Values> &frame_time,
+                     double line_time, double middle_row)
 {
     Extras extras;
     sfm::ReconstructOptions options;
@@ -247,6 +308,12 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     }
     options.camera_prior = prior_of(uncertain, uncertainty, extras.camera);
     options.drift_prior = prior_of(drifting, drift, extras.drift);
+    if (frame_time) {
+        extras.shutter.time.assign(frame_time->data(), frame_time->data() + frame_time->shape(0));
+        extras.shutter.line_time = line_time;
+        extras.shutter.middle_row = middle_row;
+        options.shutter = &extras.shutter;
+    }
     sfm::Reconstruction found;
     int outside = 0, repeated = 0;
     {
@@ -296,8 +363,11 @@ void bind_sfm(nb::module_ &m)
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("drifting"),
-          nb::arg("drift").noconvert().none(), nb::arg("sag_sigma"),
-          "Poses and points from tracks; see pipefish.structure.");
+          nb::arg("drift").noconvert().none(), nb::arg("sag_sigma"), nb::arg("frame_time").noconvert().none(),
+          nb::arg("line_time"), nb::arg("middle_row"), "Poses and points from tracks; see pipefish.structure.");
+    m.def("adjust", &adjust, nb::arg("camera"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(),
+          nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(), nb::arg("sigma"),
+          nb::arg("max_iterations"), "Least squares from a start, as a segment of reconstruct().");
     m.def(
         "sag",
         [](const Values &first, const Values &now, double f) {
@@ -309,6 +379,21 @@ void bind_sfm(nb::module_ &m)
         },
         nb::arg("first").noconvert(), nb::arg("now").noconvert(), nb::arg("f"),
         "Pixels outwards for each px^2 of the sag, of tracks seen first and now at these angles (N,) from the axis.");
+    m.def("row_poses", &row_poses, nb::arg("poses").noconvert(), nb::arg("segment").noconvert(),
+          nb::arg("time").noconvert(), nb::arg("place").noconvert(), nb::arg("late").noconvert(),
+          "(n,3,4) where the camera was `late` (n,) seconds after frames `place` (n,), of poses (K,3,4) with segments "
+          "and times (K,).");
+    m.def(
+        "turn_between",
+        [](const Poses &first, const Poses &second, double share) {
+            const geometry::Matrix3d r1 = pose_at(first, 0).r, r2 = pose_at(second, 0).r;
+            const geometry::TurnBetween out =
+                geometry::turn_between(r1, geometry::rotation_log(r2 * r1.transpose()), share);
+            return nb::make_tuple(matrix_to_numpy(out.r), matrix_to_numpy(out.by_first),
+                                  matrix_to_numpy(out.by_second));
+        },
+        nb::arg("first").noconvert(), nb::arg("second").noconvert(), nb::arg("share"),
+        "Rotation (3,3) between two poses (1,3,4), and how it turns with each of them (3,3).");
     m.def("sampson_squared", &sampson_squared, nb::arg("camera"), nb::arg("pose").noconvert(),
           nb::arg("uv1").noconvert(), nb::arg("uv2").noconvert(), nb::arg("sigma"),
           "Squared Sampson distances (N,) of pairs of pixels with noise sigma under cam2_from_cam1 (3,4).");

@@ -1,5 +1,7 @@
 #include "sfm/bundle.hpp"
 
+#include "geometry/between.hpp"
+
 #include <Eigen/Cholesky>
 
 #include <algorithm>
@@ -47,6 +49,8 @@ public:
             std::sort(wanted_.begin(), wanted_.end());
         }
         offset_.push_back(0);
+        coupled_offset_.push_back(0);
+        Pose room;
         for (size_t p = 0; p < map.tracks.size(); p++) {
             const size_t before = place_.size();
             const std::span<const Observation> seen = table.of_track(map.tracks[p]);
@@ -54,19 +58,23 @@ public:
                 const Observation &o = seen[i];
                 const int place = static_cast<int>(&o - table.observations().data());
                 if (map.has(o.frame) &&
-                    is_wanted(place, reprojection_squared(camera, map.pose(o.frame), map.points[p], o))) {
+                    is_wanted(place, reprojection_squared(camera, pose_of(map, table, o, room), map.points[p], o))) {
                     place_.push_back(place);
                     frame_.push_back(o.frame - first_);
-                    block_.push_back(block_of(o.frame - first_));
+                    if (table.rolls()) {
+                        const Moment moment = table.moment(o, map.first, map.end());
+                        moment_.push_back({moment.other - first_, moment.share});
+                    }
                 }
             }
             if (place_.size() - before < static_cast<size_t>(options.min_views)) {
                 place_.resize(before);
                 frame_.resize(before);
-                block_.resize(before);
+                moment_.resize(std::min(moment_.size(), before));
                 continue;
             }
             offset_.push_back(place_.size());
+            couple(before);
             state_.point.push_back(map.points[p]);
             track_.push_back(map.tracks[p]);
         }
@@ -82,8 +90,8 @@ public:
     int reach() const { return options_.odometry ? 1 : 0; }
     std::span<const int> couplings(int e) const
     {
-        const size_t from = offset_[static_cast<size_t>(e)];
-        return {block_.data() + from, offset_[static_cast<size_t>(e) + 1] - from};
+        const size_t from = coupled_offset_[static_cast<size_t>(e)];
+        return {coupled_.data() + from, coupled_offset_[static_cast<size_t>(e) + 1] - from};
     }
 
     template <class Sink> void linearize(int e, Sink &sink) const
@@ -97,8 +105,8 @@ public:
         const bool shared = camera_columns_ > 0 || sag_at_ >= 0 || measures_pupil();
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
             const Observation &o = table_[place_[k]];
-            const size_t f = static_cast<size_t>(frame_[k]);
-            const Vector3d x = seen_from(f, state_.point[point]);
+            const geometry::TurnBetween turn = turn_at(k);
+            const Vector3d x = turn.r * (state_.point[point] - centre_at(k)) / yardstick();
             Vector2d uv;
             Rows<2, 3> slope;
             Rows<2, PF_CAMERA_PARAMS> by_camera;
@@ -108,15 +116,20 @@ public:
             }
             const Vector2d r = o.whiten * (uv + state_.sag * o.sag - o.sight.uv);
             const Rows<2, 3> whitened = o.whiten * slope / yardstick();
-            const Rows<2, 3> j_point = whitened * state_.rotation[f];
-            Rows<2, 6> j_pose;
-            if (is_held(frame_[k])) {
-                j_pose.setZero();
-            } else {
-                for (int row = 0; row < 2; row++) { // d(R (X - c)) = w x x - R dc
-                    j_pose.row(row).head<3>() = yardstick() * x.cross(Vector3d(whitened.row(row))).transpose();
-                }
-                j_pose.rightCols<3>() = -j_point;
+            const Rows<2, 3> j_point = whitened * turn.r;
+            Rows<2, 3> j_turn;
+            for (int row = 0; row < 2; row++) { // d(R (X - c)) = w x x - R dc
+                j_turn.row(row) = yardstick() * x.cross(Vector3d(whitened.row(row))).transpose();
+            }
+            Rows<2, 6> j_pose[2] = {Rows<2, 6>::Zero(), Rows<2, 6>::Zero()};
+            const int frames[2] = {frame_[k], rolls() ? moment_[k].other : -1};
+            const int blocks[2] = {block_of(frames[0]), block_of(frames[1])};
+            const double share = rolls() ? moment_[k].share : 0.0;
+            if (!is_held(frames[0])) {
+                j_pose[0] << j_turn * turn.by_first, (share - 1.0) * j_point;
+            }
+            if (rolls() && !is_held(frames[1])) {
+                j_pose[1] << j_turn * turn.by_second, -share * j_point;
             }
             if (measures_pupil()) {
                 j_border.col(0) = -whitened * x;
@@ -128,8 +141,9 @@ public:
                 j_border.col(camera_at_ + c) =
                     o.whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
             }
-            const std::array<const double *, 1> j_f{j_pose.data()};
-            sink.add(2, r.data(), options_.loss, j_point.data(), std::span(&block_[k], 1), j_f,
+            const double *j_f[2] = {j_pose[0].data(), j_pose[1].data()};
+            const size_t poses = rolls() ? 2 : 1;
+            sink.add(2, r.data(), options_.loss, j_point.data(), std::span(blocks, poses), std::span(j_f, poses),
                      shared ? j_border.data() : nullptr);
         }
     }
@@ -210,22 +224,66 @@ private:
     // that, and what is wrong with the tracks would be read as a scale. So it is taken in the wheel's metres, too.
     bool measures_pupil() const { return options_.odometry && original_.pupil_e1 != 0.0; }
     double yardstick() const { return measures_pupil() ? 1.0 + state_.wheel : 1.0; }
-    Vector3d seen_from(size_t f, const Vector3d &x) const
+
+    bool rolls() const { return !moment_.empty(); }
+
+    // The camera's rotation at observation k, and how it turns with the two frames it lies between; its centre.
+    geometry::TurnBetween turn_at(size_t k) const
     {
-        return state_.rotation[f] * (x - state_.centre[f]) / yardstick();
+        const size_t f = static_cast<size_t>(frame_[k]);
+        if (!rolls()) {
+            return {state_.rotation[f], Matrix3d::Identity(), Matrix3d::Zero()};
+        }
+        return geometry::turn_between(state_.rotation[f], turn_towards(f, moment_[k].other), moment_[k].share);
+    }
+    Vector3d centre_at(size_t k) const
+    {
+        const Vector3d &here = state_.centre[static_cast<size_t>(frame_[k])];
+        if (!rolls()) {
+            return here;
+        }
+        return here + moment_[k].share * (state_.centre[static_cast<size_t>(moment_[k].other)] - here);
+    }
+    Vector3d turn_towards(size_t f, int other) const
+    {
+        return static_cast<size_t>(other) > f ? turn_[f] : Vector3d(-turn_[static_cast<size_t>(other)]);
+    }
+
+    // The blocks of the newest point's observations, from place `from` on.
+    void couple(size_t from)
+    {
+        const size_t begin = coupled_.size();
+        for (size_t k = from; k < place_.size(); k++) {
+            coupled_.push_back(block_of(frame_[k]));
+            if (rolls()) {
+                coupled_.push_back(block_of(moment_[k].other));
+            }
+        }
+        const auto first = coupled_.begin() + static_cast<std::ptrdiff_t>(begin);
+        std::sort(first, coupled_.end());
+        coupled_.erase(std::unique(first, coupled_.end()), coupled_.end());
+        coupled_offset_.push_back(coupled_.size());
     }
 
     // All pixels in one batch, which takes a tenth of the time of one by one.
     void project_all()
     {
         const size_t n = place_.size();
+        turn_.clear();
+        for (size_t f = 0; rolls() && f + 1 < state_.rotation.size(); f++) {
+            turn_.push_back(geometry::rotation_log(state_.rotation[f + 1] * state_.rotation[f].transpose()));
+        }
         in_camera_.resize(3 * n);
         pixel_.resize(2 * n);
         seen_.resize(n);
         for (size_t p = 0; p < state_.point.size(); p++) {
             for (size_t k = offset_[p]; k < offset_[p + 1]; k++) {
                 const size_t f = static_cast<size_t>(frame_[k]);
-                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) = seen_from(f, state_.point[p]);
+                Matrix3d part = state_.rotation[f];
+                if (rolls()) {
+                    part = geometry::rotation_exp(moment_[k].share * turn_towards(f, moment_[k].other)) * part;
+                }
+                Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) = part * (state_.point[p] - centre_at(k)) / yardstick();
             }
         }
         pf_camera_project_n(&camera_, n, in_camera_.data(), pixel_.data(), seen_.data());
@@ -449,8 +507,12 @@ private:
     BundleOptions options_;
     int first_;
     State state_, saved_;
-    std::vector<size_t> offset_; // of each point in place_, frame_ and block_
-    std::vector<int> place_, frame_, block_, track_;
+    std::vector<size_t> offset_; // of each point in place_, frame_ and moment_
+    std::vector<int> place_, frame_, track_;
+    std::vector<Moment> moment_; // where the shutter rolls; frames as in frame_
+    std::vector<Vector3d> turn_; // likewise: from each frame to the next
+    std::vector<size_t> coupled_offset_;
+    std::vector<int> coupled_;              // blocks of each point
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
     std::vector<int> wanted_; // ascending
@@ -468,6 +530,17 @@ pf_camera changed_camera(const pf_camera &camera, const CameraPrior &prior, cons
         *pf_camera_param_at(&changed, prior.parameter[i]) += change[static_cast<Eigen::Index>(i)];
     }
     return changed;
+}
+
+const Pose &pose_of(const Submap &map, const TrackTable &table, const Observation &o, Pose &room)
+{
+    const Pose &pose = map.pose(o.frame);
+    if (!table.rolls()) {
+        return pose;
+    }
+    const Moment moment = table.moment(o, map.first, map.end());
+    room = geometry::pose_between(pose, map.pose(moment.other), moment.share);
+    return room;
 }
 
 double reprojection_squared(const pf_camera &camera, const Pose &pose, const Vector3d &x, const Observation &o)

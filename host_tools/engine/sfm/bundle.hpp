@@ -22,6 +22,9 @@ struct Submap {
     bool has(int frame) const { return frame >= first && frame < end(); }
 };
 
+// Where the camera was when it saw `o`: the pose of its frame, or that of its row, which is then put into `room`.
+const Pose &pose_of(const Submap &map, const TrackTable &table, const Observation &o, Pose &room);
+
 // Distance driven between frames, from wheels: truth = reading (1 + w), w unknown with sigma `scale_sigma`.
 struct Odometry {
     std::vector<double> step;   // from frame i to i + 1, metres; NaN where unknown

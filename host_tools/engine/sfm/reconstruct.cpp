@@ -85,6 +85,23 @@ void adjust_window(Submap &map, const TrackTable &table, const pf_camera &camera
     put_back(map, part);
 }
 
+// One more frame, from the points of the map; new points with it. False where it cannot be placed.
+bool grow(Submap &map, const TrackTable &table, const pf_camera &camera, const Limits &limits, int window)
+{
+    const int frame = map.end();
+    const Pose &last = map.poses.back(), &before = map.poses[map.poses.size() - 2];
+    const Pose guess = last * before.inverse() * last;
+    const auto pose = resect(table, map, frame, guess, limits);
+    if (!pose) {
+        return false;
+    }
+    map.poses.push_back(*pose);
+    fuse_points(map, table, limits, 3, frame, frame + 1);
+    const int from = std::max(map.first + 2, frame + 1 - window);
+    adjust_window(map, table, camera, from, frame + 1, 2);
+    return true;
+}
+
 struct Building {
     std::vector<Submap> maps;
     std::vector<Gap> gaps;
@@ -171,6 +188,9 @@ private:
                     return;
                 }
                 auto merged = merge(run[a], run[b], table_, camera_, options_.limits, trouble[k]);
+                if (trouble[k] == Trouble::weak_texture) {
+                    merged = merge_grown(run[a], run[b], trouble[k]);
+                }
                 if (!merged) {
                     next[k] = std::move(run[a]);
                     left_over[k] = std::move(run[b]);
@@ -205,6 +225,19 @@ private:
         run.clear();
     }
 
+    // Short tracks, of which some are wrong, leave few points in both of two maps: one that goes further into the
+    // other shares more of them.
+    std::optional<Submap> merge_grown(Submap a, const Submap &b, Trouble &trouble) const
+    {
+        while (a.end() < b.end() && grow(a, table_, camera_, options_.limits, static_cast<int>(b.poses.size()))) {
+            auto merged = merge(a, b, table_, camera_, options_.limits, trouble);
+            if (merged || trouble != Trouble::weak_texture || a.end() > b.first + LONGEST_OVERLAP) {
+                return merged;
+            }
+        }
+        return std::nullopt;
+    }
+
     void settle(Submap &map, int seam) const
     {
         if (map.poses.size() <= 18) {
@@ -215,6 +248,8 @@ private:
         }
         clean(map, table_, camera_, 5.0, 3, options_.limits);
     }
+
+    static constexpr int LONGEST_OVERLAP = 5; // frames
 
     const TrackTable &table_;
     const pf_camera &camera_;
@@ -248,7 +283,7 @@ public:
                 continue;
             }
             Submap map = std::move(leaf.map);
-            while (map.end() < table_.frames() && grow(map)) {
+            while (map.end() < table_.frames() && grow(map, table_, camera_, options_.limits, WINDOW)) {
             }
             first = map.end();
             if (first < table_.frames()) {
@@ -271,22 +306,6 @@ private:
         } else {
             out.gaps.push_back(gap);
         }
-    }
-
-    bool grow(Submap &map) const
-    {
-        const int frame = map.end();
-        const Pose &last = map.poses.back(), &before = map.poses[map.poses.size() - 2];
-        const Pose guess = last * before.inverse() * last;
-        const auto pose = resect(table_, map, frame, guess, options_.limits);
-        if (!pose) {
-            return false;
-        }
-        map.poses.push_back(*pose);
-        fuse_points(map, table_, options_.limits, 3, frame, frame + 1);
-        const int from = std::max(map.first + 2, frame + 1 - WINDOW);
-        adjust_window(map, table_, camera_, from, frame + 1, 2);
-        return true;
     }
 
     const TrackTable &table_;
@@ -348,12 +367,14 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     settings.gravity = options.gravity;
     settings.sag_sigma = options.sag_sigma;
     settings.min_views = 3;
+    // Hardly damped: the softest bend of 300 m has 1e-12 of the diagonal's curvature, and steps damped by more than
+    // that straighten it bit by bit (26 of them from 1e-9, which fell by a third each; now 3).
+    settings.lambda = 1e-15;
     int observations = 0;
     for (int cycle = 0; cycle < 3; cycle++) {
         settings.loss = {optim::RobustLoss::Kind::huber, 3.0};
         settings.max_iterations = cycle == 0 ? 30 : 15;
         settings.cost_tolerance = 1e-6;
-        settings.lambda = 1e-9;
         settings.gate = cycle == 0 ? 50.0 : 15.0;
         const BundleReport report = adjust(map, table, central, settings);
         observations = report.observations;
@@ -488,6 +509,14 @@ Reconstruction reconstruct(const TrackTable &whole, const pf_camera &camera, con
     Building building = options.method == Method::hierarchical ? Tree(table, central, inner).build()
                                                                : Chain(table, central, inner).build();
     trim(building.maps, table);
+    if (options.shutter) { // the maps are built as if all rows were seen at once: near enough to start from
+        Shutter shutter = *options.shutter;
+        shutter.time.clear();
+        for (const int f : out.frames) {
+            shutter.time.push_back(options.shutter->time[static_cast<size_t>(f)]);
+        }
+        table.roll(shutter);
+    }
     for (Submap &map : building.maps) {
         Segment segment;
         segment.map = std::move(map);

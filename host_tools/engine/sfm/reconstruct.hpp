@@ -18,6 +18,7 @@ struct ReconstructOptions {
     const CameraPrior *camera_prior = nullptr;
     const CameraPrior *drift_prior = nullptr; // as wide as a camera may have changed since it was calibrated
     double sag_sigma = 0.0;                   // as in BundleOptions
+    const Shutter *shutter = nullptr;         // that rolls; times by frame of the table
 };
 
 // A stretch that could not be measured, between two frames.

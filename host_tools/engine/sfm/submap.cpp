@@ -116,12 +116,15 @@ Fit judge(const Pose &pose, std::span<const Seen> seen, double limit)
     return fit;
 }
 
-std::vector<View> views_of(const Submap &map, const TrackTable &table, int track)
+// `rooms`: what the views' poses may be kept in.
+std::vector<View> views_of(const Submap &map, const TrackTable &table, int track, std::vector<Pose> &rooms)
 {
     std::vector<View> views;
-    for (const Observation &o : table.of_track(track)) {
-        if (map.has(o.frame)) {
-            views.push_back({&map.pose(o.frame), &o.sight});
+    const std::span<const Observation> seen = table.of_track(track);
+    rooms.resize(seen.size());
+    for (size_t i = 0; i < seen.size(); i++) {
+        if (map.has(seen[i].frame)) {
+            views.push_back({&pose_of(map, table, seen[i], rooms[i]), &seen[i].sight});
         }
     }
     return views;
@@ -250,8 +253,9 @@ void fuse_points(Submap &map, const TrackTable &table, const Limits &limits, int
             points.emplace_back(map.tracks[p], map.points[p]);
         }
     }
+    std::vector<Pose> rooms;
     for (const int track : wanted) {
-        std::vector<View> views = views_of(map, table, track);
+        std::vector<View> views = views_of(map, table, track, rooms);
         if (const auto x = robust_point(std::move(views), limits, min_views)) {
             points.emplace_back(track, *x);
         }
@@ -264,11 +268,17 @@ void clean(Submap &map, const TrackTable &table, const pf_camera &camera, double
 {
     size_t kept = 0;
     std::vector<View> views;
+    std::vector<Pose> rooms;
     for (size_t p = 0; p < map.tracks.size(); p++) {
         views.clear();
-        for (const Observation &o : table.of_track(map.tracks[p])) {
-            if (map.has(o.frame) && reprojection_squared(camera, map.pose(o.frame), map.points[p], o) < gate * gate) {
-                views.push_back({&map.pose(o.frame), &o.sight});
+        const std::span<const Observation> seen = table.of_track(map.tracks[p]);
+        rooms.resize(seen.size());
+        for (size_t i = 0; i < seen.size(); i++) {
+            if (map.has(seen[i].frame)) {
+                const Pose &pose = pose_of(map, table, seen[i], rooms[i]);
+                if (reprojection_squared(camera, pose, map.points[p], seen[i]) < gate * gate) {
+                    views.push_back({&pose, &seen[i].sight});
+                }
             }
         }
         if (views.size() < static_cast<size_t>(min_views) ||
@@ -285,10 +295,11 @@ void clean(Submap &map, const TrackTable &table, const pf_camera &camera, double
 double robust_sigma(const Submap &map, const TrackTable &table, const pf_camera &camera)
 {
     std::vector<double> squared;
+    Pose room;
     for (size_t p = 0; p < map.tracks.size(); p++) {
         for (const Observation &o : table.of_track(map.tracks[p])) {
             if (map.has(o.frame)) {
-                squared.push_back(reprojection_squared(camera, map.pose(o.frame), map.points[p], o));
+                squared.push_back(reprojection_squared(camera, pose_of(map, table, o, room), map.points[p], o));
             }
         }
     }
@@ -375,13 +386,14 @@ Leaf make_leaf(const TrackTable &table, const pf_camera &camera, int first, int 
     // Of the tracks that agree in first and last frame: how many of all do is a matter of wrong matches, not of the
     // leaf.
     int seen_by_all = 0, measured = 0;
+    std::vector<Pose> rooms;
     std::vector<double> angles;
     for (size_t i = 0; i < track.size(); i++) {
         const int t = track[i];
         if (!pair.inlier[i]) {
             continue;
         }
-        const std::vector<View> views = views_of(leaf.map, table, t);
+        const std::vector<View> views = views_of(leaf.map, table, t, rooms);
         if (static_cast<int>(views.size()) == count) {
             seen_by_all++;
             const auto at = std::lower_bound(leaf.map.tracks.begin(), leaf.map.tracks.end(), t);

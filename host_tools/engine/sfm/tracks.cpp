@@ -93,6 +93,25 @@ void TrackTable::index(int frames, int tracks)
     }
 }
 
+void TrackTable::roll(const Shutter &shutter)
+{
+    time_ = shutter.time;
+    for (Observation &o : all_) {
+        o.late = shutter.line_time * (o.sight.uv.y() - shutter.middle_row);
+    }
+}
+
+Moment moment_of(double late, int frame, int first, int end, std::span<const double> time)
+{
+    int other = late < 0.0 ? frame - 1 : frame + 1;
+    if (other < first || other >= end) {
+        other = 2 * frame - other;
+    }
+    const double apart = time[static_cast<size_t>(other)] - time[static_cast<size_t>(frame)];
+    const bool known = std::isfinite(apart) && (other > frame ? apart > 0.0 : apart < 0.0);
+    return {other, known ? late / apart : 0.0};
+}
+
 void TrackTable::scale_noise(double factor)
 {
     for (Observation &o : all_) {

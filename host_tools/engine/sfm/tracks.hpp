@@ -23,7 +23,25 @@ struct Observation {
     Sight sight;
     Eigen::Matrix2d whiten;          // of a pixel error: root^-1
     Vector2d sag = Vector2d::Zero(); // pixels by which it is off for each px^2 of the sag, see sag_of()
+    double late = 0.0;               // seconds after its frame's time: of its row, where the shutter rolls
 };
+
+// A rolling shutter exposes row v line_time (v - middle_row) after the frame's time.
+struct Shutter {
+    std::vector<double> time; // of each frame, seconds; NaN where unknown
+    double line_time = 0.0;   // seconds, below 0 from the last row upwards
+    double middle_row = 0.0;
+};
+
+// When an observation was made, on the way from its frame to a neighbour.
+struct Moment {
+    int other;    // frame
+    double share; // of the way there; below 0: on the other side of its frame
+};
+
+// Of what was seen `late` seconds after `frame`, among frames first .. end - 1 (two at least) with these times:
+// towards the neighbour on whose side it was, or away from the only one. Where a time is not known the share is 0.
+Moment moment_of(double late, int frame, int first, int end, std::span<const double> time);
 
 // A window that is fitted by an affine map, as trackers do, follows the mean of the motion over it, which is its
 // centre's only where the motion has no curvature. In a tube, seen along its axis, the polar angle moves by
@@ -60,6 +78,14 @@ public:
     int repeated() const { return repeated_; } // observations left out: their track was there already in their frame
     void scale_noise(double factor);           // all covariances by factor^2
 
+    // From here on rows count. `shutter`: by frame of this table.
+    void roll(const Shutter &shutter);
+    bool rolls() const { return !time_.empty(); }
+    Moment moment(const Observation &o, int first, int end) const
+    {
+        return moment_of(o.late, o.frame, first, end, time_);
+    }
+
     // Calls body(first, second) with the observations of each track that two frames share.
     template <typename Body> void for_pairs(int first, int second, const Body &body) const
     {
@@ -81,6 +107,7 @@ private:
     std::vector<Observation> all_;
     std::vector<size_t> begin_; // of each track
     std::vector<std::vector<int>> by_frame_;
+    std::vector<double> time_; // of each frame, where rows count
     int outside_ = 0, repeated_ = 0;
 };
 
