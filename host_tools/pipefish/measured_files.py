@@ -87,10 +87,9 @@ def summary(m: Measurement) -> dict[str, Any]:
     table = stations(m)
     d, oval = table["d_mean"], table["ovality"]
     value, sigma = mean_diameter(m)
-    from_prior = m.scale.source != "encoder"
     out: dict[str, Any] = {
         "unit": m.scale.unit,
-        "diameter_from_prior": from_prior,
+        "diameter_from_prior": m.scale.diameter_from_prior,
         "d_mean": value,
         "d_mean_sigma": sigma,
         "d_mean_systematic": m.systematic * value,
@@ -160,7 +159,10 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "sigma": m.scale.sigma,
                 "wheel": m.scale.wheel,
                 "wheel_sigma": m.scale.wheel_sigma,
-                "check": m.scale.check,
+                "sources": m.scale.sources,
+                "consistent": m.scale.consistent,
+                "chi2": m.scale.chi2,
+                "freedom": m.scale.freedom,
             },
             "clock_zero": m.measured[0].tube.clock_zero,
             "camera": {

@@ -10,7 +10,8 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
-from pipefish.measure import Measurement, Residuals
+from pipefish.measure import Measurement, Residuals, mean_diameter
+from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
 
@@ -42,21 +43,21 @@ def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str
     return rows
 
 
-def remark(m: Measurement, diameter: float | None) -> None:
+def remark(m: Measurement) -> None:
     """What one should know, most serious first."""
-    remarks: list[str] = []
+    told = disagreement(m.scale)
+    remarks = [told] if told else []
     if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
         remarks.append(m.health.text)
     if m.scale.source == "none":
         remarks.append(
-            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
-            "measured. "
-            "--diameter gives a scale."
+            "There is no scale: no encoder, no known length. Lengths are in mean diameters; only ratios were "
+            "measured. --joint-spacing or --target gives a scale, --diameter one for all but the diameter."
         )
-    if m.scale.source == "diameter" and diameter:
+    if m.scale.source == "diameter":
         remarks.append(
-            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
-            "changes along the pipe, ovality and angles were."
+            f"The scale is the given diameter of {1000 * mean_diameter(m)[0]:.1f} mm. So the mean diameter was not "
+            "measured; its changes along the pipe, ovality and angles were."
         )
     worst = m.residuals.spread
     if worst > SIGMA_MOST:

@@ -77,6 +77,19 @@ def events_text(e: dict[str, Any], unit: str) -> str:
     return ", ".join(p for p in (at, clock, *size_parts(e, unit)) if p)
 
 
+def scale_texts(scale: dict[str, Any]) -> list[str]:
+    """A line for each source that tells the scale, where there are several."""
+    if len(scale["sources"]) < 2:
+        return []
+    out = []
+    for row in scale["sources"]:
+        word = "agrees" if row["consistent"] else f"DISAGREES by {abs(row['deviation']):.1f} sigma"
+        role = "used" if row["used"] else "a check"
+        size = f"{100 * row['relative']:+.2f} ± {100 * Z95 * row['sigma']:.2f} %"
+        out.append(f"{row['name']}: {size}, {role}, {word} ({row['detail']})")
+    return out
+
+
 # ---- reading
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_texts import LIMITS, Z95, clock_text, length_text, size_parts, verdict
+from pipefish.measured_texts import LIMITS, Z95, clock_text, length_text, scale_texts, size_parts, verdict
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_wall import WallPicture, wall_picture
@@ -65,6 +65,13 @@ class Report(Charts):
         note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
 
+    def scale_source(self) -> str:
+        """What the scale is from, in words."""
+        words = {"diameter": "given diameter", "joints": "joint spacing"}
+        scale = self.document["scale"]
+        used = dict.fromkeys(r["name"] for r in scale["sources"] if r["used"]) or {scale["source"]: None}
+        return " and ".join(words.get(name, name) for name in used)
+
     def accuracy_rows(self) -> list[tuple[str, str]]:
         """Repeatability and systematic error side by side."""
         s = self.summary
@@ -76,7 +83,7 @@ class Report(Charts):
                 ("repeatability of the mean diameter", f"± {Z95 * 1000 * s['d_mean_sigma']:.2f} mm"),
                 ("repeatability of one station", f"± {Z95 * 1000 * s['station_sigma']:.2f} mm"),
                 ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
-                ("  of which scale (encoder)", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
+                (f"  of which scale ({self.scale_source()})", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
             ]
         camera = s["systematic"]["camera"]
         rows.append(
@@ -87,16 +94,9 @@ class Report(Charts):
         )
         if "ovality_sigma" in s:
             rows.append(("ovality at one station", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
-        check = self.document["scale"]["check"]
-        if check:
-            word = "agrees" if check["consistent"] else "DISAGREES"
-            rows.append(
-                (
-                    "known diameter against the encoder",
-                    f"{word}: {1000 * check['given']:.1f} mm given, {1000 * check['measured']:.1f} ± "
-                    f"{Z95 * 1000 * check['sigma']:.1f} mm measured",
-                )
-            )
+        for text in scale_texts(self.document["scale"]):
+            name, _, told = text.partition(": ")
+            rows.append((f"lengths by the {name}, against the given ones", told))
         return rows
 
     def events_html(self) -> str:
@@ -119,7 +119,6 @@ class Report(Charts):
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(heading, rows) of what stands at the end."""
         d, s, camera = self.document, self.summary, self.document["camera"]
-        source = {"encoder": "encoder", "diameter": "given diameter", "none": "none"}[d["scale"]["source"]]
         structure = d["structure"]
         gaps = [
             (
@@ -142,7 +141,7 @@ class Report(Charts):
             ("stations with ovality", f"{s['stations_with_ovality']} of {s['stations']}"),
             ("residuals", f"{d['quality']['residual_rms_px']:.3f} px rms per coordinate"),
             ("residuals over the tracker's stated noise", f"{d['quality']['residuals_over_noise']:.2f}"),
-            ("scale from", source),
+            ("scale from", self.scale_source()),
             ("clock zero", d["clock_zero"]),
             ("nominal diameter", f"{1000 * s['nominal']:.0f} mm" if s["nominal"] else "unknown"),
         ]

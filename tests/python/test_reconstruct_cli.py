@@ -225,8 +225,8 @@ def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged
     survey = survey_of(drive, tmp_path / "a.mcap", gain=1.05)
     assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--diameter", "300", "--json"]) == 0
     document = document_of(tmp_path / "out")
-    check = document["scale"]["check"]
-    assert not check["consistent"] and check["deviation"] > 3
+    check = next(r for r in document["scale"]["sources"] if r["name"] == "diameter")
+    assert not check["consistent"] and check["deviation"] < -3 and not check["used"]
     assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
     assert "sigma apart" in " ".join(document["remarks"])
 
