@@ -17,7 +17,7 @@ from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile
 from pipefish.scale import Known, Scale, with_diameter
 from pipefish.scale_sources import beforehand, find_scale
-from pipefish.sectionsigma import diameter_sigma
+from pipefish.sectionsigma import diameter_sigma, shared_of
 from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
@@ -390,6 +390,7 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             m.path(segment),
             nominal=m.nominal if m.scale.unit == "metre" else None,
             up=m.up,
+            shared=shared_of(structure, segment, m.factors[segment]),
             threads=threads or 2,
             progress=lambda f, word, k=segment: tell(0.5 + 0.45 * (k + f) / count, word),
         )
@@ -451,10 +452,12 @@ def _sigmas(m: Measurement) -> None:
 
 def _systematic_columns(m: Measurement) -> None:
     for stretch in m.measured:
-        stations = stretch.tube.stations
-        for name in [n for n in stations if n.endswith("_systematic")]:
-            shared = np.hypot(m.scale.sigma, stretch.camera)
-            stations[name] = shared * stations[name.removesuffix("_systematic")]
+        stations, shared = stretch.tube.stations, np.hypot(m.scale.sigma, stretch.camera)
+        for name in ("d_mean", "d_area", "d_max", "d_min"):
+            stations[name + "_systematic"] = shared * stations[name]
+        half = 0.5 * stations["ovality_systematic"] * stations["d_mean"]
+        for name in ("d_max", "d_min"):
+            stations[name + "_systematic"] = np.hypot(stations[name + "_systematic"], half)
 
 
 def mean_diameter(m: Measurement) -> tuple[float, float]:

@@ -119,6 +119,7 @@ def summary(m: Measurement) -> dict[str, Any]:
             "ovality_most": float(oval[worst]),
             "ovality_most_at": float(table["chainage"][worst]),
             "ovality_sigma": float(np.nanmedian(table["ovality_sigma"])),
+            "ovality_systematic": float(np.nanmedian(table["ovality_systematic"])),
         }
     return out
 

@@ -124,10 +124,15 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
         return _verdict(name, bound, unit, "not measured", "there is no scale")
     value = factor * column(document, quantity)
     sigma = factor * column(document, f"{quantity}_sigma")
-    if quantity in ("d_max", "d_min"):
+    camera = column(document, "ovality_systematic")  # of (max - min) / mean
+    if quantity.startswith("ovality"):
+        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
+        share = {"ovality": 1.0, "ovality_nominal": over_nominal, "ovality_astm": 0.5}[quantity]
+        sigma = np.hypot(sigma, factor * share * camera)
+    elif quantity in ("d_max", "d_min"):
         sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
     elif quantity == "reduction_nominal":
-        sigma = np.hypot(sigma, factor * scale["systematic"]["relative"])
+        sigma = np.sqrt(sigma**2 + (factor * scale["systematic"]["relative"]) ** 2 + (0.5 * factor * camera) ** 2)
     if not np.isfinite(value).any():
         return _verdict(name, bound, unit, "not measured", "no station has it")
     excess = (value - bound) * (1 if side == "most" else -1)

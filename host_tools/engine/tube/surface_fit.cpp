@@ -174,7 +174,9 @@ void Surface::smooth(const SurfaceProblem &problem, const SurfaceVariance &varia
         count[c][k] += 1.0;
     });
     freedom_ = static_cast<double>(problem.each()) * static_cast<double>(control_.size());
-    const double least = 1e-4 * 0.5 * diameter_, most = 0.3 * 0.5 * diameter_;
+    // A pipe may be straight and round to a hair over all its length: a limit at 1e-4 of the radius left ellipses more
+    // freedom than they had, and their intervals a quarter too wide.
+    const double least = 1e-6 * 0.5 * diameter_, most = 0.3 * 0.5 * diameter_;
     for (size_t k = 0; k < 4; k++) {
         freedom_ -= trace[k];
         if (adapt && rows[k] > 0.0) {
