@@ -19,9 +19,9 @@ from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
+from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
 
-FORMAT, VERSION = "pipefish-reconstruction", 1
 RING = 72  # vertices of tube.ply around the pipe
 COLMAP_THETA = math.radians(89)  # its functions divide by z
 COLMAP_ERROR_PX = 0.1

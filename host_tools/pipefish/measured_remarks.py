@@ -10,7 +10,8 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
-from pipefish.measure import Measurement, Residuals, mean_diameter
+from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
+from pipefish.measured_texts import clock_text
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
@@ -18,6 +19,9 @@ from pipefish.survey import Tracks
 THETA_BIN = math.radians(10)
 TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
 BIN_LEAST = 100  # observations, for a bin to be judged
+INVERT = math.radians(45)  # from six o'clock
+GAP_TOLD = math.radians(60)  # without points, at GAP_SHARE of a stretch's stations: worth a remark
+GAP_SHARE = 0.2
 SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 
 
@@ -75,6 +79,7 @@ def remark(m: Measurement) -> None:
             "pupil moves), "
             "and diameters may be off by more than their intervals."
         )
+    remarks += _invert_remark(m)
     if m.camera.covariance is None:
         remarks.append(
             "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
@@ -92,6 +97,41 @@ def remark(m: Measurement) -> None:
     if m.structure.repeated:
         remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
     m.remarks = remarks + m.remarks
+
+
+def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> tuple[str, float]:
+    """Where around the wall there are no points between two s of a stretch, in words, and how wide that is, radians."""
+    p, half = stretch.tube.points, 0.375 * stretch.tube.summary["d_mean"]
+    on = (p["s"] > low - half) & (p["s"] < high + half) & (p["weight"] > 0)
+    clock = np.sort(p["clock"][on])
+    if len(clock) < 2:
+        return "", 2 * math.pi
+    width = np.diff(np.append(clock, clock[0] + 2 * math.pi))
+    k = int(width.argmax())
+    middle = (clock[k] + width[k] / 2) % (2 * math.pi)
+    words = f", around {clock_text(middle)} o'clock"
+    if m.structure.down is not None and abs(middle - math.pi) < INVERT:
+        words += " (the invert: water or sediment?)"
+    return words, float(width[k])
+
+
+def _invert_remark(m: Measurement) -> list[str]:
+    """Of stretches whose ellipse stands on the rest of the wall, because part of it shows no points."""
+    out = []
+    for stretch in m.measured:
+        table = stretch.tube.stations
+        bare = (table["status"] == "ok") & (table["gap"] > GAP_TOLD)
+        if bare.mean() < GAP_SHARE:
+            continue
+        s = table["s"][bare]
+        words, _ = unseen_sector(m, stretch, float(s[0]), float(s[-1]))
+        ends, degrees = np.sort(stretch.chainage(s[[0, -1]])), math.degrees(np.median(table["gap"][bare]))
+        out.append(
+            f"From {ends[0]:.2f} to {ends[1]:.2f} the wall shows no points over {degrees:.0f} degrees, where it shows "
+            f"fewest{words}: diameters and ovality there are those of an ellipse through the rest, and "
+            "what lies below was not measured."
+        )
+    return out
 
 
 def not_measured(m: Measurement) -> list[dict[str, Any]]:
@@ -132,5 +172,7 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
                 "one_sided": "nothing: no wall seen over more than 220 degrees",
                 "too_few_points": "nothing: too few points on the wall",
             }[str(good)]
+            if good != "too_few_points":
+                what += unseen_sector(m, stretch, stations["s"][inside[0]], stations["s"][inside[-1]])[0]
             rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
     return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pipefish.errors import FormatError
-from pipefish.measured_files import FORMAT, VERSION
 
+FORMAT, VERSION = "pipefish-reconstruction", 1
 Z95 = 1.96
 
 # Limits that can be asked for: column, whether the value must stay at most or at least, factor to people's unit, unit.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import html
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,13 @@ class Report(Charts):
         note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
 
+    def date(self) -> str:
+        """When the first keyframe was taken."""
+        stamp = self.document["survey"]["first_time_unix_ns"]
+        if not stamp:
+            return "unknown"
+        return datetime.datetime.fromtimestamp(stamp / 1e9, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+
     def scale_source(self) -> str:
         """What the scale is from, in words."""
         words = {"diameter": "given diameter", "joints": "joint spacing"}
@@ -93,7 +101,9 @@ class Report(Charts):
             )
         )
         if "ovality_sigma" in s:
-            rows.append(("ovality at one station", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
+            rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
+            if camera is not None:
+                rows.append(("  systematic (camera)", f"± {Z95 * 100 * s['ovality_systematic']:.2f} points"))
         for text in scale_texts(self.document["scale"]):
             name, _, told = text.partition(": ")
             rows.append((f"lengths by the {name}, against the given ones", told))
@@ -168,6 +178,7 @@ class Report(Charts):
         ]
         survey = [
             ("survey", d["survey"]["name"] or "-"),
+            ("surveyed", self.date()),
             ("survey id", d["survey"]["survey_id"]),
             ("file", Path(d["survey"]["file"]).name),
             ("device", d["survey"]["software"] or "-"),
@@ -205,7 +216,11 @@ class Report(Charts):
         lead += f"DN{1000 * s['nominal']:.0f} pipe, " if s["nominal"] else "pipe, "
         lead += f"measured from {s['keyframes_with_pose']} keyframes and {s['points']} points of its wall."
         if self.document["status"] != "ok":
-            lead += " Parts were not measured: they are left blank and listed."
+            missing = s["stations"] - s["stations_with_ovality"]
+            lead += f" Parts were not measured ({missing} of {s['stations']} stations have no ovality, and gaps between"
+            lead += " stretches no station): they are left blank and listed."
+        if not self.document["scale"]["consistent"]:
+            lead += " What tells the scale disagrees: see what to know before a length is used."
         charts = [diameter, ovality, tube, *line, *quality]
         main, more = fill("report.html", values), {"wall": self.picture.data} if self.picture.data else {}
         return whole_page("Pipefish measurement", name, lead, main, charts, self.tiles(), **more)
