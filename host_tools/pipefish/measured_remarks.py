@@ -79,6 +79,8 @@ def remark(m: Measurement) -> None:
             "pupil moves), "
             "and diameters may be off by more than their intervals."
         )
+    if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
+        remarks.append(m.health.text)
     remarks += _invert_remark(m)
     if m.camera.covariance is None:
         remarks.append(

@@ -7,9 +7,11 @@ import html
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_texts import LIMITS, Z95, clock_text, length_text, scale_texts, size_parts, verdict
+from pipefish.measured_texts import LIMITS, Z95, clock_text, column, length_text, scale_texts, size_parts, verdict
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_wall import WallPicture, wall_picture
@@ -42,8 +44,12 @@ class Report(Charts):
             tiles.append((f"{1000 * s['d_mean']:.1f}", "mm", "mean diameter, as given: not measured"))
         digits = 1 if self.unit == "metre" else 3
         if "d_max" in s:
-            tiles.append((f"{self.factor * s['d_min']:.{digits}f}", self.short, "narrowest anywhere"))
-            tiles.append((f"{self.factor * s['d_max']:.{digits}f}", self.short, "widest anywhere"))
+            for name, word, worst in (("d_min", "narrowest", np.nanargmin), ("d_max", "widest", np.nanargmax)):
+                k = int(worst(column(self.document, name)))
+                at = length_text(column(self.document, "chainage")[k], self.unit, metres=True)
+                own = self.factor * Z95 * column(self.document, f"{name}_sigma")[k]
+                text = f"{word} anywhere, at {at}; ± {own:.{digits}f} repeatability (95 %)"
+                tiles.append((f"{self.factor * s[name]:.{digits}f}", self.short, text))
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
             mean = 100 * s["ovality_mean"]
             tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {mean:.2f} %"))
