@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 import pipefish as pf
+from pipefish.sectionsigma import shared_of
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests/python"))
@@ -219,7 +220,7 @@ def tube_figures(seed: int) -> dict[str, Any]:
     drive = tube_drive(seed, LENGTH)
     quality = pf.Encoder(scale_sigma=1e-5)
     rec = pf.reconstruct(drive.tracks, drive.camera, readings(drive, seed), encoder=quality)
-    tube = pf.fit_tube(rec.points, rec.own_covariance, rec.centres, nominal=DIAMETER)
+    tube = pf.fit_tube(rec.points, rec.own_covariance, rec.centres, nominal=DIAMETER, shared=shared_of(rec, 0))
     stations = {name: np.array(values) for name, values in tube.stations.items()}
     a, b = DIAMETER / 2 * (1 - OVALITY / 2), DIAMETER / 2 * (1 + OVALITY / 2)
     h = ((a - b) / (a + b)) ** 2

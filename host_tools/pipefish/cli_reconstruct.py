@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,18 @@ def _millimetres(text: str) -> float:
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"{text} is not a length above zero")
     return value / 1000
+
+
+def _known(text: str) -> Any:
+    """A length in millimetres with its tolerance, which is taken for 95 %: 1000, 1000+-2, 1000mm±2."""
+    from pipefish.scale import Z95, Known
+
+    number = r"([0-9]+(?:\.[0-9]*)?)\s*(?:mm)?"
+    found = re.fullmatch(rf"\s*{number}\s*(?:(?:\+-|\+/-|±)\s*{number})?\s*", text)
+    if not found or float(found[1]) <= 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length in mm such as 1000 or 1000+-2")
+    value = float(found[1]) / 1000
+    return value if found[2] is None else Known(value, float(found[2]) / 1000 / Z95)
 
 
 def _hour(text: str) -> float:
@@ -51,9 +64,20 @@ def add_reconstruct(commands: Any) -> None:
     p.add_argument("--profile", metavar="PROFILE", help="camera profile, or another program's [the survey's]")
     p.add_argument(
         "--diameter",
-        type=_millimetres,
-        metavar="MM",
-        help="known true inner diameter: the scale where there is no encoder, a check where there is one",
+        type=_known,
+        metavar="MM[+-MM]",
+        help="known true inner diameter (95 %%) [exact]: the scale where nothing else tells it, a check elsewhere",
+    )
+    p.add_argument(
+        "--joint-spacing",
+        type=_known,
+        metavar="MM[+-MM]",
+        help="from one joint to the next (95 %%) [+-1 %%]: with the joints that are found it tells the scale",
+    )
+    p.add_argument(
+        "--target",
+        metavar="FILE",
+        help="a flat target in the pipe, as `pipefish target` describes it: where it is seen it tells the scale",
     )
     p.add_argument("--nominal", type=_millimetres, metavar="MM", help="nominal diameter [the survey's]")
     p.add_argument(
@@ -114,6 +138,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
     from pipefish.measured_files import write_measurement
     from pipefish.progress import Progress
     from pipefish.survey import Survey
+    from pipefish.target import Target
 
     camera = None
     if args.line_time is not None and not abs(args.line_time) <= 1000.0:
@@ -127,6 +152,8 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
             Survey.open(args.survey),
             camera,
             diameter=args.diameter,
+            joint_spacing=args.joint_spacing,
+            target=Target.load(args.target) if args.target else None,
             nominal=args.nominal,
             method=args.method,
             line_time=None if args.line_time is None else 1e-6 * args.line_time,
@@ -141,7 +168,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
-    from pipefish.measured_texts import events_text, length_text, percent_text
+    from pipefish.measured_texts import events_text, length_text, percent_text, scale_texts
 
     s = document["summary"]
     unit = s["unit"]
@@ -172,6 +199,7 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
                 f"+- {shared} (95 %, systematic)",
             )
         )
+    rows += [("scale", told) for told in scale_texts(document["scale"])]
     rows.append(
         (
             "along the pipe",

@@ -16,9 +16,12 @@ from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
 from pipefish.rolling import shutter_of
-from pipefish.sectionsigma import diameter_sigma
+from pipefish.scale import Known, Scale, with_diameter
+from pipefish.scale_sources import beforehand, find_scale
+from pipefish.sectionsigma import diameter_sigma, shared_of
 from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
+from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
 
 T = TypeVar("T")
@@ -26,7 +29,6 @@ Tell = Callable[[float, str], None]  # fraction done, what is going on
 
 OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are not in the COLMAP model
 ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
-DISAGREE_SIGMA = 3.0
 # A tracker's stated covariance is that of one frame's noise. Along a track errors add up, each track its own: in
 # simulated pipes (concrete, brick) 0.3 to 0.5 px for each radian by which the point has moved away from the axis.
 TRACK_WALK_PX = 0.3
@@ -43,29 +45,10 @@ TRACK_COMMON = 3.0
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Where lengths come from.
-
-    source      "encoder", "diameter" (the given one: then no diameter has been measured), "none"
-    unit        "metre", or "diameter": lengths are in mean diameters of their stretch
-    sigma       relative, shared by all; 0 for a given diameter and without scale: there it is part of the definition
-    wheel, wheel_sigma   (true distance over the encoder's) - 1 as estimated; None without an encoder
-    check       a given diameter beside an encoder: given, measured, sigma, deviation (in sigmas), consistent
-    """
-
-    source: str
-    unit: str
-    sigma: float
-    wheel: float | None = None
-    wheel_sigma: float | None = None
-    check: dict[str, Any] | None = None
-
-
 @dataclass
 class Stretch:
     """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
-    mean diameter over all of it."""
+    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known)."""
 
     segment: int
     tube: Tube
@@ -73,6 +56,7 @@ class Stretch:
     origin: float
     sign: int
     d_mean_sigma: float = math.nan
+    camera: Any = 0.0
 
     def chainage(self, s: Any) -> Any:
         """Along the survey, from s along the tube."""
@@ -137,6 +121,17 @@ class Measurement:
     def systematic(self) -> float:
         """Relative sigma that all diameters share."""
         return math.hypot(self.scale.sigma, self.camera_sigma or 0.0)
+
+    @property
+    def up(self) -> np.ndarray:
+        """Against gravity, or up in the first keyframe."""
+        down = self.structure.down
+        return -down if down is not None else np.array([0.0, -1.0, 0.0])
+
+    def path(self, segment: int) -> np.ndarray:
+        """Camera centres in the order in which the tube's s grows: the way the camera looks."""
+        centres = self.structure.centres[self.structure.segment == segment]
+        return centres[::-1] if self.backwards else centres
 
     def frame_chainage(self) -> np.ndarray:
         """(F,) chainage of the structure's frames, by the encoder or along the path."""
@@ -223,7 +218,9 @@ def measure(
     survey: Survey,
     camera: Camera | None = None,
     *,
-    diameter: float | None = None,
+    diameter: float | Known | None = None,
+    joint_spacing: float | Known | None = None,
+    target: Target | None = None,
     nominal: float | None = None,
     method: str = "hierarchical",
     threads: int | None = None,
@@ -233,7 +230,9 @@ def measure(
     """Measures a survey.
 
     camera     None: the survey's profile
-    diameter   known true inner diameter, metres: the scale where there is no encoder, a check where there is one
+    diameter   known true inner diameter, metres: the scale where nothing else tells it, a check where something does
+    joint_spacing   from one joint to the next, metres; a plain number: to SPACING_SIGMA, shared by all pipes
+    target     of known size, somewhere in the pipe; not a sleeve
     nominal    nominal diameter, metres [the survey's], for what is defined against it
     line_time  of a rolling shutter, seconds from a row's exposure to the next one's [as the survey says]
     tell       is called with a fraction done and a word
@@ -242,9 +241,9 @@ def measure(
     from pipefish.measured_remarks import remark
 
     tell = tell or (lambda fraction, word: None)
-    for name, value in (("diameter", diameter), ("nominal", nominal)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ArgumentError(f"{name}: {value} is not a positive length")
+    known = beforehand(diameter, joint_spacing, target)
+    if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
+        raise ArgumentError(f"nominal: {nominal} is not a positive length")
     if len(survey.keyframes) < 3:
         raise PipefishError(
             f"{survey.path}: {len(survey.keyframes)} keyframes; three are the least that can be measured"
@@ -296,7 +295,7 @@ def measure(
         backwards=bool(ahead.sum() < 0),
         remarks=remarks,
     )
-    _scale(m, diameter, tell)
+    find_scale(m, known, threads, tell)
     _fit_stretches(m, threads, tell)
     if not m.measured:
         reasons = sorted({s.tube.reason for s in m.stretches})
@@ -306,7 +305,7 @@ def measure(
             f"no pipe around them: {'; '.join(reasons)}"
         )
     _sigmas(m)
-    _check_diameter(m, diameter)
+    _check_diameter(m, known.diameter)
     m.health = _while_telling(
         lambda: check_profile(
             weighed,
@@ -317,13 +316,13 @@ def measure(
             encoder=quality,
             attitude=attitude,
             attitude_sigma=attitude_sigma,
-            diameter=diameter if m.scale.source == "encoder" else None,
+            diameter=known.diameter.value if known.diameter and m.scale.source == "encoder" else None,
             threads=threads,
             shutter=shutter,
         ),
         lambda: tell(0.9, "profile"),
     )
-    remark(m, diameter)
+    remark(m)
     return m
 
 
@@ -388,88 +387,23 @@ def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Res
     return Residuals(k, j, item, residual, theta, whitened / max(spread, 0.5), spread)
 
 
-def _segment_path(m: Measurement, segment: int) -> np.ndarray:
-    """Camera centres in the order in which the tube's s grows: the way the camera looks."""
-    centres = m.structure.centres[m.structure.segment == segment]
-    return centres[::-1] if m.backwards else centres
-
-
-def _up(structure: Reconstruction) -> np.ndarray:
-    """Against gravity, or up in the first keyframe."""
-    return -structure.down if structure.down is not None else np.array([0.0, -1.0, 0.0])
-
-
-def _scale(m: Measurement, diameter: float | None, tell: Tell) -> None:
-    """Brings the structure into metres, or into diameters of each stretch."""
-    m.factors = [1.0] * len(m.structure.sigma)
-    if m.structure.unit == "metre":
-        sigma = float(m.structure.scale_sigma or 0.0)
-        m.scale = Scale("encoder", "metre", sigma, m.structure.wheel, m.structure.wheel_sigma)
-        return
-    m.encoder = None  # of no use: too few of its steps could be used
-    factors = []
-    for segment in range(len(m.structure.sigma)):
-        inside = m.structure.point_segment == segment
-        tube = fit_tube(
-            m.structure.points[inside],
-            m.structure.own_covariance[inside],
-            _segment_path(m, segment),
-            up=_up(m.structure),
-        )
-        size = tube.summary["d_mean"] if tube.status == "ok" else None
-        factors.append((diameter or 1.0) / size if size else 1.0)
-        tell(0.5, "scale")
-    m.structure, m.factors = rescaled(m.structure, factors), factors
-    m.scale = Scale("diameter", "metre", 0.0) if diameter else Scale("none", "diameter", 0.0)
-
-
-def rescaled(structure: Reconstruction, factors: list[float]) -> Reconstruction:
-    """The structure with each segment scaled about its first centre and put where the one before ended."""
-    poses, points = structure.poses.copy(), structure.points.copy()
-    covariance, pose_covariance = structure.covariance.copy(), structure.pose_covariance.copy()
-    own = structure.own_covariance.copy()
-    systematic = None if structure.systematic is None else structure.systematic.copy()
-    pose_systematic = None if structure.pose_systematic is None else structure.pose_systematic.copy()
-    centres, end = structure.centres, None
-    for segment, factor in enumerate(factors):
-        of_frame, of_point = structure.segment == segment, structure.point_segment == segment
-        start = centres[of_frame][0]
-        place = start if end is None else end
-        moved = place + factor * (centres[of_frame] - start)
-        poses[of_frame, :, 3] = -np.einsum("nij,nj->ni", poses[of_frame, :, :3], moved)
-        points[of_point] = place + factor * (points[of_point] - start)
-        covariance[of_point] *= factor**2
-        own[of_point] *= factor**2
-        stretch = np.diag([1.0] * 3 + [factor] * 3)
-        pose_covariance[of_frame] = stretch @ pose_covariance[of_frame] @ stretch
-        if systematic is not None and pose_systematic is not None:
-            systematic[of_point] *= factor**2
-            pose_systematic[of_frame] = stretch @ pose_systematic[of_frame] @ stretch
-        end = moved[-1]
-    return dataclasses.replace(
-        structure,
-        poses=poses,
-        points=points,
-        covariance=covariance,
-        own_covariance=own,
-        pose_covariance=pose_covariance,
-        systematic=systematic,
-        pose_systematic=pose_systematic,
-    )
-
-
 def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
     """A tube for each segment: across a gap nothing joins two of them but odometry, so no surface does."""
     structure, count = m.structure, len(m.structure.sigma)
     along = m.frame_chainage()
     for segment in range(count):
         inside, here = structure.point_segment == segment, np.flatnonzero(structure.segment == segment)
+        if m.factors[segment] == 0.0:
+            why = "nothing tells the scale of this stretch, as of others"
+            m.stretches.append(Stretch(segment, Tube("no_scale", why, {}), structure.frames[here], 0.0, 1))
+            continue
         tube = fit_tube(
             structure.points[inside],
             structure.own_covariance[inside],
-            _segment_path(m, segment),
+            m.path(segment),
             nominal=m.nominal if m.scale.unit == "metre" else None,
-            up=_up(structure),
+            up=m.up,
+            shared=shared_of(structure, segment, m.factors[segment]),
             threads=threads or 2,
             progress=lambda f, word, k=segment: tell(0.5 + 0.45 * (k + f) / count, word),
         )
@@ -509,10 +443,11 @@ def _sigmas(m: Measurement) -> None:
         d = stations["d_mean"]
         if exact.camera is not None:
             cameras[stretch.segment] = factor * np.interp(stations["s"], exact.s, exact.camera) / d
-        if m.scale.source != "encoder":  # the scale is given: of the wander along the path the tube's sigma tells
+            stretch.camera = cameras[stretch.segment]
+        if m.scale.diameter_from_prior:  # of the wander along the path the tube's sigma tells
             continue
-        wheel = m.scale.sigma
-        beyond = np.maximum(0, np.interp(stations["s"], exact.s, exact.random) ** 2 - (wheel * d) ** 2)
+        wheel = float(m.structure.scale_sigma or 0.0)  # 0 where there is none in the adjustment
+        beyond = np.maximum(0, (factor * np.interp(stations["s"], exact.s, exact.random)) ** 2 - (wheel * d) ** 2)
         own = np.hypot(stations["d_mean_sigma"], np.sqrt(beyond))
         span = stations["ovality_sigma"] * d  # of widest less narrowest
         stations["d_mean_sigma"], stations["circumference_sigma"] = own, np.pi * own
@@ -522,14 +457,20 @@ def _sigmas(m: Measurement) -> None:
         if stretch.tube.nominal:
             stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
         mean = stretch.tube.summary["d_mean"]
-        rest = math.sqrt(max(0.0, exact.mean_random**2 - (wheel * mean) ** 2))
+        rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
     m.camera_sigma = float(np.nanmedian(np.concatenate(list(cameras.values())))) if cameras else None
+    _systematic_columns(m)
+
+
+def _systematic_columns(m: Measurement) -> None:
     for stretch in m.measured:
-        stations = stretch.tube.stations
-        for name in [n for n in stations if n.endswith("_systematic")]:
-            shared = np.hypot(m.scale.sigma, cameras.get(stretch.segment, 0.0))
-            stations[name] = shared * stations[name.removesuffix("_systematic")]
+        stations, shared = stretch.tube.stations, np.hypot(m.scale.sigma, stretch.camera)
+        for name in ("d_mean", "d_area", "d_max", "d_min"):
+            stations[name + "_systematic"] = shared * stations[name]
+        half = 0.5 * stations["ovality_systematic"] * stations["d_mean"]
+        for name in ("d_max", "d_min"):
+            stations[name + "_systematic"] = np.hypot(stations[name + "_systematic"], half)
 
 
 def mean_diameter(m: Measurement) -> tuple[float, float]:
@@ -540,24 +481,10 @@ def mean_diameter(m: Measurement) -> tuple[float, float]:
     return value, math.sqrt(sum((w * s.d_mean_sigma) ** 2 for w, s in zip(weight, m.measured, strict=True)))
 
 
-def _check_diameter(m: Measurement, diameter: float | None) -> None:
-    if diameter is None or m.scale.source != "encoder":
+def _check_diameter(m: Measurement, known: Known | None) -> None:
+    """A known diameter beside what else tells the scale: held against what was measured."""
+    if known is None or m.scale.diameter_from_prior:
         return
     measured, random = mean_diameter(m)
-    sigma = math.hypot(random, m.systematic * measured)
-    deviation = (measured - diameter) / max(sigma, 1e-12)
-    check = {
-        "given": diameter,
-        "measured": measured,
-        "sigma": sigma,
-        "deviation": deviation,
-        "consistent": bool(abs(deviation) <= DISAGREE_SIGMA),
-    }
-    m.scale = dataclasses.replace(m.scale, check=check)
-    if not check["consistent"]:
-        m.remarks.insert(
-            0,
-            f"The encoder gives a mean diameter of {1000 * measured:.1f} mm, the given one is "
-            f"{1000 * diameter:.1f} mm: "
-            f"{abs(deviation):.1f} sigma apart. The values are the encoder's.",
-        )
+    m.scale = with_diameter(m.scale, known, measured, math.hypot(random / measured, m.camera_sigma or 0.0))
+    _systematic_columns(m)

@@ -19,9 +19,9 @@ from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
+from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
 
-FORMAT, VERSION = "pipefish-reconstruction", 1
 RING = 72  # vertices of tube.ply around the pipe
 COLMAP_THETA = math.radians(89)  # its functions divide by z
 COLMAP_ERROR_PX = 0.1
@@ -87,10 +87,9 @@ def summary(m: Measurement) -> dict[str, Any]:
     table = stations(m)
     d, oval = table["d_mean"], table["ovality"]
     value, sigma = mean_diameter(m)
-    from_prior = m.scale.source != "encoder"
     out: dict[str, Any] = {
         "unit": m.scale.unit,
-        "diameter_from_prior": from_prior,
+        "diameter_from_prior": m.scale.diameter_from_prior,
         "d_mean": value,
         "d_mean_sigma": sigma,
         "d_mean_systematic": m.systematic * value,
@@ -120,6 +119,7 @@ def summary(m: Measurement) -> dict[str, Any]:
             "ovality_most": float(oval[worst]),
             "ovality_most_at": float(table["chainage"][worst]),
             "ovality_sigma": float(np.nanmedian(table["ovality_sigma"])),
+            "ovality_systematic": float(np.nanmedian(table["ovality_systematic"])),
         }
     return out
 
@@ -160,7 +160,10 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "sigma": m.scale.sigma,
                 "wheel": m.scale.wheel,
                 "wheel_sigma": m.scale.wheel_sigma,
-                "check": m.scale.check,
+                "sources": m.scale.sources,
+                "consistent": m.scale.consistent,
+                "chi2": m.scale.chi2,
+                "freedom": m.scale.freedom,
             },
             "clock_zero": m.measured[0].tube.clock_zero,
             "camera": {

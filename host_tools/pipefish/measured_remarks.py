@@ -10,13 +10,18 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
-from pipefish.measure import Measurement, Residuals
+from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
+from pipefish.measured_texts import clock_text
+from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
 
 THETA_BIN = math.radians(10)
 TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
 BIN_LEAST = 100  # observations, for a bin to be judged
+INVERT = math.radians(45)  # from six o'clock
+GAP_TOLD = math.radians(60)  # without points, at GAP_SHARE of a stretch's stations: worth a remark
+GAP_SHARE = 0.2
 SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 
 
@@ -42,21 +47,21 @@ def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str
     return rows
 
 
-def remark(m: Measurement, diameter: float | None) -> None:
+def remark(m: Measurement) -> None:
     """What one should know, most serious first."""
-    remarks: list[str] = []
+    told = disagreement(m.scale)
+    remarks = [told] if told else []
     if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
         remarks.append(m.health.text)
     if m.scale.source == "none":
         remarks.append(
-            "There is no scale: no encoder, no known diameter. Lengths are in mean diameters; only ratios were "
-            "measured. "
-            "--diameter gives a scale."
+            "There is no scale: no encoder, no known length. Lengths are in mean diameters; only ratios were "
+            "measured. --joint-spacing or --target gives a scale, --diameter one for all but the diameter."
         )
-    if m.scale.source == "diameter" and diameter:
+    if m.scale.source == "diameter":
         remarks.append(
-            f"The scale is the given diameter of {1000 * diameter:.1f} mm. So the mean diameter was not measured; its "
-            "changes along the pipe, ovality and angles were."
+            f"The scale is the given diameter of {1000 * mean_diameter(m)[0]:.1f} mm. So the mean diameter was not "
+            "measured; its changes along the pipe, ovality and angles were."
         )
     worst = m.residuals.spread
     if worst > SIGMA_MOST:
@@ -74,6 +79,9 @@ def remark(m: Measurement, diameter: float | None) -> None:
             "pupil moves), "
             "and diameters may be off by more than their intervals."
         )
+    if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
+        remarks.append(m.health.text)
+    remarks += _invert_remark(m)
     if m.camera.covariance is None:
         remarks.append(
             "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
@@ -91,6 +99,41 @@ def remark(m: Measurement, diameter: float | None) -> None:
     if m.structure.repeated:
         remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
     m.remarks = remarks + m.remarks
+
+
+def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> tuple[str, float]:
+    """Where around the wall there are no points between two s of a stretch, in words, and how wide that is, radians."""
+    p, half = stretch.tube.points, 0.375 * stretch.tube.summary["d_mean"]
+    on = (p["s"] > low - half) & (p["s"] < high + half) & (p["weight"] > 0)
+    clock = np.sort(p["clock"][on])
+    if len(clock) < 2:
+        return "", 2 * math.pi
+    width = np.diff(np.append(clock, clock[0] + 2 * math.pi))
+    k = int(width.argmax())
+    middle = (clock[k] + width[k] / 2) % (2 * math.pi)
+    words = f", around {clock_text(middle)} o'clock"
+    if m.structure.down is not None and abs(middle - math.pi) < INVERT:
+        words += " (the invert: water or sediment?)"
+    return words, float(width[k])
+
+
+def _invert_remark(m: Measurement) -> list[str]:
+    """Of stretches whose ellipse stands on the rest of the wall, because part of it shows no points."""
+    out = []
+    for stretch in m.measured:
+        table = stretch.tube.stations
+        bare = (table["status"] == "ok") & (table["gap"] > GAP_TOLD)
+        if bare.mean() < GAP_SHARE:
+            continue
+        s = table["s"][bare]
+        words, _ = unseen_sector(m, stretch, float(s[0]), float(s[-1]))
+        ends, degrees = np.sort(stretch.chainage(s[[0, -1]])), math.degrees(np.median(table["gap"][bare]))
+        out.append(
+            f"From {ends[0]:.2f} to {ends[1]:.2f} the wall shows no points over {degrees:.0f} degrees, where it shows "
+            f"fewest{words}: diameters and ovality there are those of an ellipse through the rest, and "
+            "what lies below was not measured."
+        )
+    return out
 
 
 def not_measured(m: Measurement) -> list[dict[str, Any]]:
@@ -131,5 +174,7 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
                 "one_sided": "nothing: no wall seen over more than 220 degrees",
                 "too_few_points": "nothing: too few points on the wall",
             }[str(good)]
+            if good != "too_few_points":
+                what += unseen_sector(m, stretch, stations["s"][inside[0]], stations["s"][inside[-1]])[0]
             rows.append({"start": float(ends[0]), "end": float(ends[1]), "reason": str(good), "detail": what})
     return sorted(rows, key=lambda r: (r["start"] is None, r["start"] or 0.0))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pipefish.errors import FormatError
-from pipefish.measured_files import FORMAT, VERSION
 
+FORMAT, VERSION = "pipefish-reconstruction", 1
 Z95 = 1.96
 
 # Limits that can be asked for: column, whether the value must stay at most or at least, factor to people's unit, unit.
@@ -77,6 +77,19 @@ def events_text(e: dict[str, Any], unit: str) -> str:
     return ", ".join(p for p in (at, clock, *size_parts(e, unit)) if p)
 
 
+def scale_texts(scale: dict[str, Any]) -> list[str]:
+    """A line for each source that tells the scale, where there are several."""
+    if len(scale["sources"]) < 2:
+        return []
+    out = []
+    for row in scale["sources"]:
+        word = "agrees" if row["consistent"] else f"DISAGREES by {abs(row['deviation']):.1f} sigma"
+        role = "used" if row["used"] else "a check"
+        size = f"{100 * row['relative']:+.2f} ± {100 * Z95 * row['sigma']:.2f} %"
+        out.append(f"{row['name']}: {size}, {role}, {word} ({row['detail']})")
+    return out
+
+
 # ---- reading
 
 
@@ -111,10 +124,15 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
         return _verdict(name, bound, unit, "not measured", "there is no scale")
     value = factor * column(document, quantity)
     sigma = factor * column(document, f"{quantity}_sigma")
-    if quantity in ("d_max", "d_min"):
+    camera = column(document, "ovality_systematic")  # of (max - min) / mean
+    if quantity.startswith("ovality"):
+        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
+        share = {"ovality": 1.0, "ovality_nominal": over_nominal, "ovality_astm": 0.5}[quantity]
+        sigma = np.hypot(sigma, factor * share * camera)
+    elif quantity in ("d_max", "d_min"):
         sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
     elif quantity == "reduction_nominal":
-        sigma = np.hypot(sigma, factor * scale["systematic"]["relative"])
+        sigma = np.sqrt(sigma**2 + (factor * scale["systematic"]["relative"]) ** 2 + (0.5 * factor * camera) ** 2)
     if not np.isfinite(value).any():
         return _verdict(name, bound, unit, "not measured", "no station has it")
     excess = (value - bound) * (1 if side == "most" else -1)

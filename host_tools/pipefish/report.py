@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import datetime
 import html
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_texts import LIMITS, Z95, clock_text, length_text, size_parts, verdict
+from pipefish.measured_texts import LIMITS, Z95, clock_text, column, length_text, scale_texts, size_parts, verdict
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_wall import WallPicture, wall_picture
@@ -41,8 +44,12 @@ class Report(Charts):
             tiles.append((f"{1000 * s['d_mean']:.1f}", "mm", "mean diameter, as given: not measured"))
         digits = 1 if self.unit == "metre" else 3
         if "d_max" in s:
-            tiles.append((f"{self.factor * s['d_min']:.{digits}f}", self.short, "narrowest anywhere"))
-            tiles.append((f"{self.factor * s['d_max']:.{digits}f}", self.short, "widest anywhere"))
+            for name, word, worst in (("d_min", "narrowest", np.nanargmin), ("d_max", "widest", np.nanargmax)):
+                k = int(worst(column(self.document, name)))
+                at = length_text(column(self.document, "chainage")[k], self.unit, metres=True)
+                own = self.factor * Z95 * column(self.document, f"{name}_sigma")[k]
+                text = f"{word} anywhere, at {at}; ± {own:.{digits}f} repeatability (95 %)"
+                tiles.append((f"{self.factor * s[name]:.{digits}f}", self.short, text))
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
             mean = 100 * s["ovality_mean"]
             tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {mean:.2f} %"))
@@ -65,6 +72,20 @@ class Report(Charts):
         note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
 
+    def date(self) -> str:
+        """When the first keyframe was taken."""
+        stamp = self.document["survey"]["first_time_unix_ns"]
+        if not stamp:
+            return "unknown"
+        return datetime.datetime.fromtimestamp(stamp / 1e9, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+    def scale_source(self) -> str:
+        """What the scale is from, in words."""
+        words = {"diameter": "given diameter", "joints": "joint spacing"}
+        scale = self.document["scale"]
+        used = dict.fromkeys(r["name"] for r in scale["sources"] if r["used"]) or {scale["source"]: None}
+        return " and ".join(words.get(name, name) for name in used)
+
     def accuracy_rows(self) -> list[tuple[str, str]]:
         """Repeatability and systematic error side by side."""
         s = self.summary
@@ -76,7 +97,7 @@ class Report(Charts):
                 ("repeatability of the mean diameter", f"± {Z95 * 1000 * s['d_mean_sigma']:.2f} mm"),
                 ("repeatability of one station", f"± {Z95 * 1000 * s['station_sigma']:.2f} mm"),
                 ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
-                ("  of which scale (encoder)", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
+                (f"  of which scale ({self.scale_source()})", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
             ]
         camera = s["systematic"]["camera"]
         rows.append(
@@ -86,17 +107,12 @@ class Report(Charts):
             )
         )
         if "ovality_sigma" in s:
-            rows.append(("ovality at one station", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
-        check = self.document["scale"]["check"]
-        if check:
-            word = "agrees" if check["consistent"] else "DISAGREES"
-            rows.append(
-                (
-                    "known diameter against the encoder",
-                    f"{word}: {1000 * check['given']:.1f} mm given, {1000 * check['measured']:.1f} ± "
-                    f"{Z95 * 1000 * check['sigma']:.1f} mm measured",
-                )
-            )
+            rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
+            if camera is not None:
+                rows.append(("  systematic (camera)", f"± {Z95 * 100 * s['ovality_systematic']:.2f} points"))
+        for text in scale_texts(self.document["scale"]):
+            name, _, told = text.partition(": ")
+            rows.append((f"lengths by the {name}, against the given ones", told))
         return rows
 
     def events_html(self) -> str:
@@ -119,7 +135,6 @@ class Report(Charts):
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(heading, rows) of what stands at the end."""
         d, s, camera = self.document, self.summary, self.document["camera"]
-        source = {"encoder": "encoder", "diameter": "given diameter", "none": "none"}[d["scale"]["source"]]
         structure = d["structure"]
         gaps = [
             (
@@ -142,7 +157,7 @@ class Report(Charts):
             ("stations with ovality", f"{s['stations_with_ovality']} of {s['stations']}"),
             ("residuals", f"{d['quality']['residual_rms_px']:.3f} px rms per coordinate"),
             ("residuals over the tracker's stated noise", f"{d['quality']['residuals_over_noise']:.2f}"),
-            ("scale from", source),
+            ("scale from", self.scale_source()),
             ("clock zero", d["clock_zero"]),
             ("nominal diameter", f"{1000 * s['nominal']:.0f} mm" if s["nominal"] else "unknown"),
         ]
@@ -169,6 +184,7 @@ class Report(Charts):
         ]
         survey = [
             ("survey", d["survey"]["name"] or "-"),
+            ("surveyed", self.date()),
             ("survey id", d["survey"]["survey_id"]),
             ("file", Path(d["survey"]["file"]).name),
             ("device", d["survey"]["software"] or "-"),
@@ -206,7 +222,11 @@ class Report(Charts):
         lead += f"DN{1000 * s['nominal']:.0f} pipe, " if s["nominal"] else "pipe, "
         lead += f"measured from {s['keyframes_with_pose']} keyframes and {s['points']} points of its wall."
         if self.document["status"] != "ok":
-            lead += " Parts were not measured: they are left blank and listed."
+            missing = s["stations"] - s["stations_with_ovality"]
+            lead += f" Parts were not measured ({missing} of {s['stations']} stations have no ovality, and gaps between"
+            lead += " stretches no station): they are left blank and listed."
+        if not self.document["scale"]["consistent"]:
+            lead += " What tells the scale disagrees: see what to know before a length is used."
         charts = [diameter, ovality, tube, *line, *quality]
         main, more = fill("report.html", values), {"wall": self.picture.data} if self.picture.data else {}
         return whole_page("Pipefish measurement", name, lead, main, charts, self.tiles(), **more)

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipefish.structure import Reconstruction
 from pipefish.tube import SECTION, Tube
+from pipefish.tube_shared import Shared
 
 MOST = 60  # stations of a stretch that are computed; between them it is interpolated
 LEAST = 30  # points
@@ -31,6 +32,22 @@ class DiameterSigma:
     camera: np.ndarray | None
     mean_random: float
     mean_camera: float | None
+
+
+def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0) -> Shared:
+    """What the points of a segment share through the poses, at the weights of the adjustment. factor: by which the
+    structure was scaled since."""
+    first = int(np.searchsorted(structure.point_segment, segment))
+    weighed = structure.variance_factor[segment]
+
+    def whole(places: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return structure.functions_covariance(first + places, rows) * (factor**2 / weighed)
+
+    def camera(places: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return factor**2 * structure.functions_covariance(first + places, rows, systematic=True) - whole(places, rows)
+
+    own = structure.own_covariance[structure.point_segment == segment] / weighed
+    return Shared(own, whole, camera if structure.parts[segment][1] is not None else None)
 
 
 def diameter_function(tube: Tube, s: float, diameter: float) -> tuple[np.ndarray, np.ndarray]:

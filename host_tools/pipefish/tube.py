@@ -15,6 +15,7 @@ import numpy as np
 
 from pipefish import _engine
 from pipefish.errors import ArgumentError
+from pipefish.tube_shared import Common, Shared
 
 SECTION = 0.75  # length of the stretch that counts as one section, diameters
 KNOT = 0.5  # spacing of the spline's knots, diameters
@@ -44,8 +45,8 @@ class Tube:
       ovality                  (d_max - d_min) / d_mean;  ovality_nominal: the same over the nominal diameter
       ovality_astm             (d_mean - d_min) / d_mean (ASTM F1216);  ovality_astm_max: (d_max - d_mean) / d_mean
       reduction_nominal        (d_nominal - d_min) / d_nominal (EN 13508-2 BAA, relative to nominal)
-      ovality_lo, ovality_hi   95 % interval of `ovality`; e2: unclamped debiased squared ellipse amplitude, m^2 (for
-                               averages), e2_sigma
+      ovality_lo, ovality_hi   95 % interval of `ovality`, with ovality_systematic: what the camera leaves open
+      e2, e2_sigma             unclamped debiased squared ellipse amplitude, m^2 (for averages)
       <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
       curvature, curvature_sigma, inliers, gap, rms, roughness
     events: one dictionary a finding; see `pipefish.tube_findings`."""
@@ -170,6 +171,7 @@ def fit_tube(
     scale_sigma: float = 0.0,
     order: int = 0,
     spacing: float | None = None,
+    shared: Shared | None = None,
     threads: int = 2,
     progress: Callable[[float, str], None] | None = None,
 ) -> Tube:
@@ -184,6 +186,8 @@ def fit_tube(
     scale_sigma   relative standard deviation of the scale of the whole cloud: the systematic part of each sigma
     order     of the section's harmonics: 2 an ellipse, up to 6; 0: by BIC
     spacing   of the stations, metres [a quarter of the diameter]
+    shared    what the points have in common beyond `sigma`, as a reconstruction's do: in the sigmas of ovality, steps
+              and bends and in what counts as a joint
     progress  is called with a fraction done and a word
 
     Same bits for any number of threads. Raises ArgumentError for wrong shapes; a cloud that holds no tube gives a Tube
@@ -212,19 +216,22 @@ def fit_tube(
     breaks = tube_findings.break_candidates(coarse, nodes, diameter)
     tell(0.55, "fitting the surface")
     surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False)
-    kept = tube_findings.confirmed(surface, diameter, breaks)
+    known = np.flatnonzero(used)
+    common = Common(surface, shared, known, diameter)
+    kept = tube_findings.confirmed(surface, diameter, breaks, common)
     if len(kept) < len(breaks):
         surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False)
+        common = Common(surface, shared, known, diameter)
     tube = Tube("ok", "", {}, nominal=nominal, surface=surface, _up=up_vector)
     tube.clock_zero = "against gravity" if up_vector is not None else "-y of the points' frame at the start"
-    tube.stations = _stations(tube, spacing or STATION * diameter, scale_sigma)
+    tube.stations = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
     tube.summary = _summary(tube, len(cloud), used)
     if not np.isin(tube.stations["status"], MEASURED).any():
         worst = str(tube.stations["status"][0])
         return _none(worst, "", nominal)
     tube.points = _all_points(tube._places(surface.placed()), used)
     tell(0.9, "looking for what departs from it")
-    tube.events = tube_findings.events(tube)
+    tube.events = tube_findings.events(tube, common)
     tube.summary["events"] = len(tube.events)
     tell(1.0, "done")
     return tube
@@ -436,7 +443,7 @@ def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return seen, low, high
 
 
-def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.ndarray]:
+def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) -> dict[str, np.ndarray]:
     s, piece = [], []
     for k, (start, end) in enumerate(tube.surface.pieces):
         count = max(2, round((end - start) / spacing) + 1)
@@ -446,7 +453,9 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.nd
     f = tube.frames(s, piece)
     shape, k = f["shape"], f["shape"].shape[1]
     full = f["covariance"].reshape(len(s), k + 2, k + 2)
-    cov = full[:, 2:, 2:]
+    cov = full[:, 2:, 2:].copy()
+    together, camera = common.ellipses(s, piece, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]), f["ellipse"] > 0)
+    cov[:, 1:3, 1:3] += together
     out: dict[str, np.ndarray] = {"s": s, "piece": piece.astype(int)}
     out.update(zip("xyz", f["centre"].T, strict=True))
     out.update(zip(("tx", "ty", "tz"), f["tangent"].T, strict=True))
@@ -479,6 +488,8 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.nd
     out["clock_max_sigma"] = np.minimum(np.pi / 2, 0.5 * np.sqrt(trace / 2) / np.maximum(e, 1e-300))
     span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"])
     out["ovality"], out["ovality_sigma"] = span / d_mean, span_sigma / d_mean
+    by_ellipse = (gradient["d_max"] - gradient["d_min"])[:, 1:3]
+    out["ovality_systematic"] = np.sqrt(np.einsum("ni,nij,nj->n", by_ellipse, camera, by_ellipse)) / d_mean
     out["ovality_astm"] = (d_mean - values["d_min"]) / d_mean
     out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"]) / d_mean
     out["ovality_astm_max"] = (values["d_max"] - d_mean) / d_mean
@@ -488,7 +499,8 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float) -> dict[str, np.nd
     out["reduction_nominal"] = (nominal - values["d_min"]) / nominal
     out["reduction_nominal_sigma"] = out["d_min_sigma"] / nominal
     seen, low, high = _rice_table()
-    amplitude, one = (raw["max"] - raw["min"]) / d_mean, np.maximum(span_sigma / d_mean, 1e-300)
+    amplitude = (raw["max"] - raw["min"]) / d_mean
+    one = np.maximum(np.hypot(out["ovality_sigma"], out["ovality_systematic"]), 1e-300)
     inside = amplitude / one < seen[-1]
     out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - 1.96 * one)
     out["ovality_hi"] = np.where(inside, one * np.interp(amplitude / one, seen, high), amplitude + 1.96 * one)

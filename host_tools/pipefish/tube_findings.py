@@ -18,6 +18,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from pipefish.tube import Tube
+    from pipefish.tube_shared import Common
 
 FALSE_ALARMS = 0.01  # of one fit
 GROSS = 4.0  # standard deviations
@@ -87,11 +88,14 @@ def _ends(surface: Any, k: int) -> tuple[dict[str, np.ndarray], float]:
     return surface.stations([s, s], [k, k + 1]), s
 
 
-def _joint_test(surface: Any, k: int) -> dict[str, Any]:
+def _joint_test(surface: Any, k: int, common: Common) -> dict[str, Any]:
     f, s = _ends(surface, k)
     size = f["shape"].shape[1] + 2
     cov = f["covariance"].reshape(2, size, size).sum(0)
     turn = f["tangent_covariance"].reshape(2, 2, 2).sum(0)
+    shared = common.joint(k)
+    cov[:3, :3] += shared[:3, :3]
+    turn += shared[3:, 3:]
     axes = np.stack([f["first"][0], f["second"][0]])
     across = axes @ (f["centre"][1] - f["centre"][0])
     bend = axes @ (f["tangent"][1] - f["tangent"][0])
@@ -113,17 +117,17 @@ def _joint_test(surface: Any, k: int) -> dict[str, Any]:
     }
 
 
-def confirmed(surface: Any, diameter: float, breaks: list[float]) -> list[float]:
+def confirmed(surface: Any, diameter: float, breaks: list[float], common: Common) -> list[float]:
     """The breaks whose two sides really differ in the final fit."""
     length = surface.pieces[-1][1]
     limit = max(16.0, chi2_limit(FALSE_ALARMS * 0.25 * diameter / length, 5))
-    return [b for k, b in enumerate(breaks) if _joint_test(surface, k)["chi2"] > limit]
+    return [b for k, b in enumerate(breaks) if _joint_test(surface, k, common)["chi2"] > limit]
 
 
-def events(tube: Tube) -> list[dict[str, Any]]:
-    """All findings, along the pipe."""
+def events(tube: Tube, common: Common) -> list[dict[str, Any]]:
+    """All findings, along the pipe; common: what the points share."""
     rings = _rings(tube)
-    found = _joints(tube, rings) + _bends(tube) + _patches(tube, rings)
+    found = _joints(tube, rings, common) + _bends(tube, common) + _patches(tube, rings)
     return sorted(found, key=lambda e: e["s"])
 
 
@@ -180,10 +184,10 @@ def _poisson_limit(mean: float, p: float) -> int:
     return max(4, n)
 
 
-def _joints(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _joints(tube: Tube, rings: list[dict[str, Any]], common: Common) -> list[dict[str, Any]]:
     d, found, free = tube.summary["d_mean"], [], list(rings)
     for k in range(len(tube.surface.pieces) - 1):
-        test = _joint_test(tube.surface, k)
+        test = _joint_test(tube.surface, k, common)
         f = tube.frames([test["s"]], [k])
         shift = test["across"] @ np.stack([f["first"][0], f["second"][0]])
         near = [r for r in free if abs(r["s"] - test["s"]) < 0.3 * d]
@@ -221,7 +225,7 @@ def _joints(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _bends(tube: Tube) -> list[dict[str, Any]]:
+def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
     """Stretches whose curvature is more than 3 sigma and that turn by more than 2 degrees."""
     d, found = tube.summary["d_mean"], []
     for k, (start, end) in enumerate(tube.surface.pieces):
@@ -244,7 +248,9 @@ def _bends(tube: Tube) -> list[dict[str, Any]]:
             if angle < math.radians(2):
                 continue
             turn = f["tangent_covariance"].reshape(-1, 2, 2)
-            sigma = math.sqrt(max(0.0, (np.trace(turn[out_a]) + np.trace(turn[out_b])) / 2))
+            own = max(0.0, float(np.trace(turn[out_a]) + np.trace(turn[out_b])) / 2)
+            # The heading wanders with the poses from one end to the other: more than both ends by themselves.
+            sigma = math.sqrt(own + common.turn(k, (float(s[out_a]), float(s[out_b])), own / 2))
             half = (
                 np.flatnonzero(curvature[a:b] > 0.5 * np.median(np.sort(curvature[a:b])[-max(3, (b - a) // 2) :])) + a
             )

@@ -225,8 +225,8 @@ def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged
     survey = survey_of(drive, tmp_path / "a.mcap", gain=1.05)
     assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--diameter", "300", "--json"]) == 0
     document = document_of(tmp_path / "out")
-    check = document["scale"]["check"]
-    assert not check["consistent"] and check["deviation"] > 3
+    check = next(r for r in document["scale"]["sources"] if r["name"] == "diameter")
+    assert not check["consistent"] and check["deviation"] < -3 and not check["used"]
     assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
     assert "sigma apart" in " ".join(document["remarks"])
 
@@ -247,6 +247,23 @@ def test_a_stretch_without_texture_is_left_blank_and_the_rest_is_measured(tmp_pa
     chainage = np.array(document["stations"]["chainage"])
     assert chainage[second].max() == pytest.approx(4.4, abs=0.3)
     assert chainage[second].min() > chainage[first].max() - 0.6
+
+
+def test_an_invert_under_water_is_told_with_its_clock(tmp_path):
+    """No tracks over 100 degrees around six: an ellipse through the rest, said to be that. Over 170: no ellipse,
+    and the stretch without it names the clock."""
+    drive = tube_drive(21, 1.6, density=900.0)
+    below = np.arctan2(drive.points[:, 0], drive.points[:, 1])  # from straight down: y is down
+    for degrees, word in ((100, "the invert"), (170, "mean diameter only")):
+        dry = np.abs(below[drive.tracks.track]) > np.radians(degrees / 2)
+        survey = survey_of(drive, tmp_path / f"{degrees}.mcap", keep=dry, attitude=True)
+        assert main(["reconstruct", str(survey), "-o", str(tmp_path / str(degrees)), "--json"]) == 0
+        document = document_of(tmp_path / str(degrees))
+        told = [*document["remarks"], *(g["detail"] for g in document["not_measured"])]
+        found = [t for t in told if word in t]
+        assert found and any("the invert" in t for t in found), told
+        hour = int(re.search(r"around (\d+):", found[0])[1])
+        assert hour in (5, 6)
 
 
 def test_a_survey_driven_backwards_is_measured_and_says_so(drive, tmp_path):

@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import pipefish as pf
 from pipefish.measure import Measurement, mean_diameter, measure
-from pipefish.sectionsigma import diameter_function
+from pipefish.sectionsigma import diameter_function, shared_of
 from pipefish.survey import Survey
+from pipefish.tube import fit_tube
+from pipefish.tube_shared import Common
 from synthetic import write_survey
 from test_reconstruct_cli import objects_of
 from tube_tracks import tube_drive
@@ -79,3 +82,48 @@ def test_the_cameras_part_is_what_another_camera_would_measure(tmp_path):
     assert np.median(stated) == pytest.approx(np.median(moved), rel=0.4)
     assert (np.abs(stated - moved) < 0.5 * moved + 1e-4).all(), "station by station: it changes its sign on the way"
     assert m.camera_sigma == pytest.approx(np.median(camera)) and 0.05 * sigma < m.camera_sigma < 2 * sigma
+
+
+def test_the_cameras_part_of_ovality_is_what_another_camera_would_measure(tmp_path):
+    """A lens that is one sigma longer across than upright makes a pipe oval by about the stated systematic sigma, and
+    the interval knows it."""
+    sigma = 0.001
+    drive = tube_drive(60, 2.0, density=500.0)
+    f = drive.camera.f_u
+    known = dataclasses.replace(
+        drive.camera, covariance=(sigma * f) ** 2 * np.eye(2), covariance_parameters=("f_u", "f_v")
+    )
+    stretched = dataclasses.replace(drive.camera, f_u=f * (1 + sigma), f_v=f * (1 - sigma))
+    m = measured(tmp_path, 60, profile=known)
+    plain, other = (measured(tmp_path, 60, profile=p).measured[0].tube.stations for p in (None, stretched))
+    table = m.measured[0].tube.stations
+    moved = np.median(np.abs(np.interp(plain["s"], other["s"], other["ovality"]) - plain["ovality"]))
+    stated = np.median(table["ovality_systematic"])
+    assert 0.4 < stated / (moved / np.sqrt(2)) < 2.5, "two parameters of one sigma each"
+    wide = np.median(table["ovality_hi"] - table["ovality_lo"])
+    own = np.median(plain["ovality_hi"] - plain["ovality_lo"])
+    assert wide == pytest.approx(np.hypot(own, 2 * 1.96 * stated), rel=0.3)
+    assert (plain["ovality_systematic"] == 0).all(), "a profile without covariance says nothing"
+
+
+def test_a_bends_angle_knows_how_the_heading_wanders():
+    """Three drives through a bend of 17 degrees, each with noise of its own. What the poses share is most of the sigma:
+    by their own errors alone the two ends are known five times as well as the angle is."""
+    curvature, z, own = 0.1, [], []
+    for seed in range(71, 74):
+        drive = tube_drive(seed, 3.0, bend=curvature)
+        rec = pf.reconstruct(drive.tracks, drive.camera, drive.driven, encoder=pf.Encoder(scale_sigma=1e-5))
+        tube = fit_tube(rec.points, rec.own_covariance, rec.centres)
+        ends = (0.4, tube.length - 0.4)
+        frame, p = tube.frames(list(ends)), tube.points
+        by_ends = np.trace(frame["tangent_covariance"].reshape(-1, 2, 2), axis1=1, axis2=2).sum() / 2
+        common = Common(tube.surface, shared_of(rec, 0), np.arange(len(rec.points)), tube.summary["d_mean"])
+        sigma = np.sqrt(by_ends + common.turn(0, ends, by_ends / 2))
+        wall = drive.points[rec.track]
+        along, on = np.arctan2(wall[:, 2], 1 / curvature - wall[:, 0]), p["weight"] > 0
+        near = [on & (np.abs(p["s"] - s) < 0.2) for s in ends]
+        true = np.diff([np.polyfit(p["s"][k] - s, along[k], 1)[1] for s, k in zip(ends, near, strict=True)])[0]
+        z.append((np.arccos(frame["tangent"][0] @ frame["tangent"][1]) - true) / sigma)
+        own.append(np.sqrt(by_ends) / sigma)
+    assert 0.1 < np.sqrt(np.mean(np.square(z))) < 2.07, "chi-squared of 3, 99.5 %"
+    assert np.median(own) < 0.4

@@ -126,11 +126,13 @@ def tube_drive(
     wobble: float = 1.0,
     bend: float = 0.0,
     pan: float = 0.0,
+    joints: float = 0.0,
 ) -> Drive:
     """Frames every `step` metres; `density` points a metre of wall, seen between two angles from the axis (degrees).
 
     ovality: (max - min) / diameter, the long axis upright. wrong: share of observations at a random place nearby.
     bend: the tube's curvature, 1/m, to the side. pan: radians that the camera swings to either side, every half metre.
+    joints: metres from one open joint, 12 mm wide and 10 mm deep, to the next; the first at 0.3 m.
     """
     random = np.random.default_rng(seed)
     camera = camera or fisheye(95)
@@ -163,8 +165,15 @@ def tube_drive(
     count = int(density * (length + 0.8))
     z, phi = np.sort(random.uniform(-0.1, length + 0.7, count)), random.uniform(0, 2 * np.pi, count)
     a, b = diameter / 2 * (1 - ovality / 2), diameter / 2 * (1 + ovality / 2)
+    out = np.zeros(len(z))
+    if joints:
+        ring = np.arange(0.3, length + 0.6, joints)[:, None] + random.uniform(0, 0.012, (1, 30))
+        z, phi = np.append(z, ring.ravel()), np.append(phi, random.uniform(0, 2 * np.pi, ring.size))
+        order = np.argsort(z)
+        z, phi = z[order], phi[order]
+        out = np.where((z > 0.29) & ((z - 0.3) % joints < 0.012), 0.01, 0.0)
     axis, turn = along(z)
-    points = axis + turned(np.column_stack([a * np.cos(phi), b * np.sin(phi)]), turn)
+    points = axis + turned(np.column_stack([(a + out) * np.cos(phi), (b + out) * np.sin(phi)]), turn)
     low, high = np.radians(limits)
     reach = diameter / 2 / np.tan(low) + 0.1
     frame, track, pixels = [], [], []

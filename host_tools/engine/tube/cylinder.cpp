@@ -29,6 +29,12 @@ Eigen::Matrix<double, 3, 2> basis_across(const Vector3d &axis, const Vector3d &n
     return basis;
 }
 
+size_t azimuth_bin(double angle)
+{
+    const double turn = angle / (2.0 * std::numbers::pi) + 0.5;
+    return static_cast<size_t>(std::clamp(static_cast<int>(turn * AZIMUTH_BINS), 0, AZIMUTH_BINS - 1));
+}
+
 double widest_gap(std::span<const int> count)
 {
     const int bins = static_cast<int>(count.size());
@@ -47,8 +53,6 @@ double widest_gap(std::span<const int> count)
 
 namespace
 {
-
-constexpr int BINS = 60;
 
 // The optimiser's view of the fit: weights are fixed, so that it is plain least squares; the loop around reweights.
 class Problem
@@ -158,12 +162,11 @@ public:
 
     double gap() const
     {
-        std::array<int, BINS> count{};
+        std::array<int, AZIMUTH_BINS> count{};
         for (size_t k = 0; k < index_.size(); k++) {
             if (weight_[k] > 0.0) {
                 const Vector2d y = now_.basis.transpose() * (cloud_.points.col(index_[k]) - now_.centre);
-                const double turn = std::atan2(y[1], y[0]) / (2.0 * std::numbers::pi) + 0.5;
-                count[static_cast<size_t>(std::clamp(static_cast<int>(turn * BINS), 0, BINS - 1))]++;
+                count[azimuth_bin(std::atan2(y[1], y[0]))]++;
             }
         }
         return widest_gap(count);

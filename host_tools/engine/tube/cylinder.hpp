@@ -48,8 +48,13 @@ Cylinder fit_cylinder(const Cloud &cloud, std::span<const int> index, const Cyli
 // Two unit vectors across `axis`, the first as near as possible to `near`.
 Eigen::Matrix<double, 3, 2> basis_across(const Eigen::Vector3d &axis, const Eigen::Vector3d &near);
 
-// Widest sector without points, in steps of 6 degrees; `count[k]`: points in bin k of 60. Bins with less than a tenth
-// of the mean count as empty.
+constexpr int AZIMUTH_BINS = 60;
+
+// The bin of an angle of atan2, radians.
+size_t azimuth_bin(double angle);
+
+// Widest sector without points, in steps of 6 degrees; `count[k]`: points in bin k of AZIMUTH_BINS. Bins with less than
+// a tenth of the mean count as empty.
 double widest_gap(std::span<const int> count);
 
 } // namespace pipefish::tube
