@@ -191,7 +191,8 @@ def test_a_daemon_says_at_once_that_its_frames_are_too_large_to_be_sent(tmp_path
         out.write(f"YUV4MPEG2 W{width} H{height} F1:1 Ip A1:1 Cmono\n".encode())
         for _ in range(2):
             out.write(b"FRAME\n" + bytes(width * height))
-    (tmp_path / "survey.csv").write_text("sequence,time_ns\n0,1\n1,1000000001\n")
+    an_hour = 3_600_000_000_000  # so that the survey is not over when it is asked
+    (tmp_path / "survey.csv").write_text(f"sequence,time_ns\n0,1\n1,{an_hour}\n")
     daemon = Crawler(tmp_path, camera__speed="recorded", daemon__exit_when_done="false")
     daemon.start()
     try:
