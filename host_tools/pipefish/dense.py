@@ -323,9 +323,9 @@ def _triangulated(unroller: _Unroller, rays: tuple[Rays, Rays]) -> tuple[Floats,
 
 def _per_cell(
     key: NDArray[np.int64], value: Floats, sigma: Floats, share: float
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Median and sigma of it of each key that has 3 values or more; sigma as if a window's matches were one. share: of
-    a window, a match's own."""
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+    """Of each key that has 3 values or more the median, its sigma as if a window's matches were one, and the sigma of
+    one match, which is that of what they share. share: of a window, a match's own."""
     order = np.lexsort((value, key))
     key, value, sigma = key[order], value[order], sigma[order]
     start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
@@ -334,16 +334,17 @@ def _per_cell(
     mean_sigma = np.add.reduceat(sigma, start) / count
     keep = count >= 3
     effective = np.maximum(count * share, 1)
-    return key[start][keep], middle[keep], (mean_sigma / np.sqrt(effective))[keep]
+    return key[start][keep], middle[keep], (mean_sigma / np.sqrt(effective))[keep], mean_sigma[keep]
 
 
 def _fused(
-    key: NDArray[np.int64], value: Floats, sigma: Floats, cells: int, shared: float
+    key: NDArray[np.int64], value: Floats, sigma: Floats, one: Floats, cells: int, shared: float
 ) -> tuple[Floats, Floats, Any, float]:
     """Of each cell: the mean of the pairs that agree with their median within 3 sigma, its sigma, how many pairs; and
-    the scatter, by which sigmas are multiplied. shared: part of sigma that all pairs share."""
+    the scatter, by which sigmas are multiplied. one: sigma of one match; that share of it all pairs and matches have in
+    common."""
     order = np.lexsort((value, key))
-    key, value, sigma = key[order], value[order], sigma[order]
+    key, value, sigma, common = key[order], value[order], sigma[order], shared * one[order]
     if not len(key):
         return np.full(cells, np.nan), np.full(cells, np.nan), np.zeros(cells, int), 1.0
     start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
@@ -354,7 +355,7 @@ def _fused(
     normal = np.abs(value - median[group]) / (sigma * np.sqrt(1 - 1 / count[group]).clip(0.5))
     scatter = float(np.median(normal[telling[group]]) / 0.6745) if telling.any() else 1.0
     scatter = max(scatter, 0.1)
-    keep = np.abs(value - median[group]) <= 3 * math.hypot(scatter, shared) * sigma
+    keep = np.abs(value - median[group]) <= 3 * np.hypot(scatter * sigma, common)
     weight = np.where(keep, sigma**-2.0, 0)
     total = np.add.reduceat(weight, start)
     agree = np.add.reduceat(keep.astype(int), start)
@@ -362,11 +363,12 @@ def _fused(
     square = np.add.reduceat(weight * (value - mean[group]) ** 2, start) / np.maximum(agree - 1, 1)
     # Pairs share keyframes, so n of them tell half as much as n would; and a cell whose pairs scatter more than most is
     # believed.
-    variance = 2 * np.maximum(square, scatter**2) + shared**2 * agree
+    variance = 2 * np.maximum(square, scatter**2) / np.maximum(total, 1e-30)
+    variance += (np.add.reduceat(weight * common, start) / np.maximum(total, 1e-30)) ** 2
     good = (agree >= 2) & (2 * agree > count)
     out, error, pairs = np.full(cells, np.nan), np.full(cells, np.nan), np.zeros(cells, int)
     out[key[start][good]] = mean[good]
-    error[key[start][good]] = np.sqrt(variance[good] / total[good])
+    error[key[start][good]] = np.sqrt(variance[good])
     pairs[key[start]] = agree
     return out, error, pairs, scatter
 
@@ -412,9 +414,9 @@ def dense_wall(
     scale    pixels of the pictures to a cell of the unrolled ones: 2 takes a quarter of the time
     raw      keyframes are matched as they are, with maps fitted at each match, instead of unrolled: to check the one by
              the other. Slower, and the tube must be within a few hundredths of its radius, for seeds come from it
-    calibration_px   what all pairs share and no scatter tells: errors that the calibration leaves (zones of 0.1 px are
-             ordinary) and shading that moves with the lamp. In a simulated concrete pipe errors stay as they are from 2
-             pairs to 7, and 0.1 px makes sigmas true
+    calibration_px   what all pairs share and no scatter tells: errors that a calibration leaves. Where the image radius
+             waves by an amplitude a over the angle, two rays of a match, at unlike angles, differ by a (rms: the square
+             root of 2 of a wave's); 0.1 px is what zones of ordinary lenses come to
     threads  pairs at a time: do not change the result
     tell     is called with a fraction done
 
@@ -450,7 +452,7 @@ def dense_wall(
     looks = np.zeros(rows * columns, int)
     parts = []
 
-    def measured(pair: tuple[int, int]) -> tuple[NDArray[np.int64], Floats, Floats] | None:
+    def measured(pair: tuple[int, int]) -> tuple[NDArray[np.int64], Floats, Floats, Floats] | None:
         one, two = (views[k] for k in pair)
         rays = _raw_rays(unroller, one, two) if raw else _unrolled_rays(unroller, one, two, every)
         if rays is None:
@@ -475,7 +477,7 @@ def dense_wall(
             for i, j in batch:
                 looks += _in_view(unroller, views[i], views[j], rows, columns)
             parts += [part for part in pool.map(measured, batch) if part is not None]
-    joined = [np.concatenate(p) for p in zip(*parts, strict=True)] if parts else [np.empty(0, int), *[np.empty(0)] * 2]
+    joined = [np.concatenate(p) for p in zip(*parts, strict=True)] if parts else [np.empty(0, int), *[np.empty(0)] * 3]
     value, error, agree, scatter = _fused(*joined, rows * columns, calibration_px / MATCH_PX)
     shape = (rows, columns)
     found = DenseWall(
