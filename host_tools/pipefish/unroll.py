@@ -18,7 +18,8 @@ from pipefish.wall import Piece, Wall
 REACH = 1.1  # diameters from the eye up to which a keyframe shows the wall: one along the pipe
 NODE = 1 / 50  # diameters from node to node: between them pixels are interpolated, f / 8000 px off at most
 MOST_STEP = 16  # cells from node to node
-STRIP = 512  # cells of the pipe's length that are drawn at a time
+STRIP = 512  # cells of the pipe's length that are drawn at a time, and LONGEST_STRIP diameters at the most: each cell
+LONGEST_STRIP = 8  # of a strip is held against each of its keyframes
 SAMPLE_EVERY, SAMPLES_AROUND, SAMPLE_SIDE = 0.1, 12, 0.02  # of balancing: diameters, places, diameters
 SEAM = 0.02  # diameters over which a keyframe goes over into the next
 NICE = (1.0, 2.0, 5.0, 10.0)
@@ -140,9 +141,11 @@ class Unroller:
         columns = self.columns - first if columns is None else columns
         grey, seen = (np.zeros((self.rows, columns), np.uint8) for _ in range(2))
         out = Drawn(grey, seen, np.full(columns, -1), np.zeros(columns))
-        for at in range(0, columns, STRIP):
+        longest = int(LONGEST_STRIP * self.wall.diameter / self.cell) // MOST_STEP * MOST_STEP
+        strip = min(STRIP, max(MOST_STEP, longest))
+        for at in range(0, columns, strip):
             self._tell((first + at) / max(1, self.columns), "drawing")
-            count = min(STRIP, columns - at)
+            count = min(strip, columns - at)
             middle = self.chainage(first + at + np.arange(count))
             for piece in self.wall.pieces:
                 inside = np.flatnonzero((middle >= piece.start) & (middle < piece.end))
