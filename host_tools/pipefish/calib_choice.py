@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .calib_data import Array, CalibrationError
-from .calib_fit import Fit
+from .calib_fit import Fit, poses_apart
 from .calib_model import Model
 from .calib_report import covariance_of
 
@@ -24,15 +24,9 @@ _FOLD_TOLERANCE = 1e-4  # of the cost: a sixtieth of _GAIN in RMS
 
 
 def folds(fit: Fit, count: int = _FOLDS) -> Array:
-    """Fold of each frame (F,): like neighbours in time apart; copies of one image together; -1 for rejected."""
-    data = fit.data
-    alive = [f for f in range(data.frames) if fit.used[np.isin(data.view_of, np.flatnonzero(data.frame_of == f))].any()]
-    number = np.full(data.frames, -1)
-    seen: dict[bytes, int] = {}
-    for i, f in enumerate(alive):
-        first = int(np.flatnonzero(data.frame_of == f)[0])
-        number[f] = seen.setdefault(data.views[first].pixels.tobytes(), i % count)
-    return number
+    """Fold of each frame (F,): neighbours in time apart, frames of one pose together; -1 for rejected."""
+    number = poses_apart(fit)
+    return np.where(number < 0, -1, number % count)
 
 
 def held_out(fit: Fit, model: Model, number: Array) -> tuple[Array, Array]:
@@ -58,7 +52,7 @@ def held_out(fit: Fit, model: Model, number: Array) -> tuple[Array, Array]:
 
 
 def bound_of_gain(old: Array, new: Array, seed: int = 1) -> float:
-    """The gain of RMS that nine of ten resamplings of the frames exceed, as a share."""
+    """The gain of RMS that nine of ten resamplings of the poses exceed, as a share, from each one's sum of squares."""
     pick = np.random.default_rng(seed).integers(0, len(old), (_BOOTSTRAP, len(old)))
     ratio = np.sqrt(new[pick].sum(axis=1) / np.maximum(old[pick].sum(axis=1), 1e-300))
     return float(1 - np.quantile(ratio, 0.9))
@@ -78,12 +72,18 @@ def tries(state: Fit, candidates: list[Model], number: Array) -> Iterator[tuple[
 
 def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Model, list[dict[str, Any]]]:
     """The model that held-out views accept, from a settled p9 on a flat board, and the table of all that were tried."""
+    pose = poses_apart(fit)
     number = folds(fit)
     alive = number >= 0
+    poses = int(pose.max()) + 1
+
+    def by_pose(squares: Array) -> Array:
+        return np.bincount(pose[alive], weights=squares[alive], minlength=poses)
+
     state, model = fit.copy(), Model()
     squares, points = held_out(state, model, number)
     table = [_row(model, state, squares, points, 0.0, 0.0, True)]
-    if alive.sum() < 6:
+    if poses < 6:
         return (Model(shape="z2") if shape else model), table
     tried: set[Model] = {model}
     for turn in range(_ROUNDS):
@@ -93,7 +93,7 @@ def choose(fit: Fit, shape: bool, progress: Callable[[float], None]) -> tuple[Mo
         for i, (candidate, (trial, new)) in enumerate(zip(candidates, tries(state, candidates, number), strict=True)):
             progress((turn + (i + 1) / len(candidates)) / _ROUNDS)
             gain = 1 - math.sqrt(new.sum() / squares.sum())
-            bound = bound_of_gain(squares[alive], new[alive])
+            bound = bound_of_gain(by_pose(squares), by_pose(new))
             row = _row(candidate, trial, new, points, gain, bound, False)
             row["against"] = model.name
             table.append(row)

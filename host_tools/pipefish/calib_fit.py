@@ -20,6 +20,7 @@ THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median of the distance in units of sigma per axis
 _HUBER = 5.0  # sigma: the mild bend; real corners have tails that Gaussian noise has not
 _GROSS = 10.0  # sigma: a point beyond is no measurement of this corner
+_SAME_POSE = 0.01  # of the picture's diagonal: points that moved less between frames show one pose
 
 
 def errors_of(bundle: _engine.Bundle, data_pixels: Array) -> Array:
@@ -499,3 +500,29 @@ def handedness(data: Data, view: int) -> int:
     solved = np.linalg.lstsq(design, pixels, rcond=None)[0][:2]
     determinant = float(np.linalg.det(solved))
     return int(np.sign(determinant)) if abs(determinant) > 1e-9 * np.abs(solved).max() ** 2 else 0
+
+
+def poses_apart(fit: Fit) -> Array:
+    """Number of the pose that each frame shows (F,), -1 for rejected ones: frames in which the targets' points lie
+    nearly where they lie in an earlier one show the same, as in a burst. They are no independent witnesses."""
+    data = fit.data
+    alive = np.unique(data.frame_of[fit.used_views()])
+    number = np.full(data.frames, -1)
+    firsts: list[dict[tuple[int, int, bytes], Array]] = []
+    for f in alive:
+        shown = {
+            (int(data.camera_of[v]), int(data.board_of[v]), xyz.tobytes()): pixel
+            for v in np.flatnonzero(data.frame_of == f)
+            for xyz, pixel in zip(data.views[v].board_xyz, data.views[v].pixels, strict=True)
+        }
+        near = _SAME_POSE * min(math.hypot(*size) for size in data.size)
+        for k, first in enumerate(firsts):
+            common = [key for key in shown if key in first]
+            apart = [float(np.linalg.norm(shown[key] - first[key])) for key in common]
+            if 2 * len(common) >= min(len(shown), len(first)) and np.median(apart) < near:
+                number[f] = k
+                break
+        else:
+            number[f] = len(firsts)
+            firsts.append(shown)
+    return number

@@ -135,9 +135,18 @@ def load_views(
 def _refuse_sizes(files: Sequence[Path]) -> None:
     """Raises CalibrationError where pictures have several sizes, FormatError where one cannot be read: at once."""
     by_size: dict[tuple[int, int], list[Path]] = {}
+    damaged: list[FormatError] = []
     for file in files:
-        with _reading(file), Image.open(file) as opened:
-            by_size.setdefault(opened.size, []).append(file)
+        try:
+            with _reading(file), Image.open(file) as opened:
+                opened.load()
+                by_size.setdefault(opened.size, []).append(file)
+        except FormatError as error:
+            damaged.append(error)
+    if damaged:
+        names = ", ".join(Path(e.path or "").name for e in damaged[1:6]) + (", ..." if len(damaged) > 6 else "")
+        more = f" (and {len(damaged) - 1} more that cannot be read: {names})" if len(damaged) > 1 else ""
+        raise FormatError(damaged[0].path, None, f"{damaged[0].reason}{more}")
     if len(by_size) < 2:
         return
     (usual, most), *odd = sorted(by_size.items(), key=lambda item: -len(item[1]))

@@ -11,7 +11,7 @@ import numpy as np
 from . import _engine
 from .calib_circle import ImageEllipse
 from .calib_data import Array, CalibrationError
-from .calib_fit import Fit, angles, handedness
+from .calib_fit import Fit, angles, handedness, poses_apart
 from .camera import PARAMETERS, Camera
 from .errors import ProfileError
 
@@ -242,6 +242,10 @@ def coverage(
             f"next view: the board near pixel ({u:.0f}, {v:.0f}), {math.degrees(place['theta']):.0f} degrees off the "
             f"axis, tilted; the calibration is off by {sigma[worst]:.2g} px (1 sigma) there"
         )
+        if lit is None and camera.theta_covered and place["theta"] > camera.theta_covered:
+            advice += (
+                " (farther out than the target was ever seen: skip it if the lens shows nothing of the room there)"
+            )
     return {
         "theta_step": _THETA_STEP,
         "phi_bins": _PHI_BINS,
@@ -275,16 +279,15 @@ def uncertainty_map(
 
 
 def halves_difference(fit: Fit) -> list[dict[str, float]]:
-    """Calibrations from every other frame, compared where the targets' points are: their difference after the motion of
+    """Calibrations from every other pose, compared where the targets' points are: their difference after the motion of
     the scene that fits each best, and what their own uncertainties expect of it; a ratio much above 1 is model error.
     One entry a camera."""
     data = fit.data
-    frames = np.unique(data.frame_of[fit.used_views()])
-    frame_of_point = data.frame_of[data.view_of]
+    pose_of_point = poses_apart(fit)[data.frame_of[data.view_of]]
     cameras, uncertainties = [], []
     for half in range(2):
         part = fit.copy()
-        part.used = fit.used & np.isin(frame_of_point, frames[half::2])
+        part.used = fit.used & (pose_of_point % 2 == half)
         part.fit(fit.model, iterations=40, tolerance=1e-8)
         try:
             uncertainties.append(covariance_of(part))
@@ -359,16 +362,16 @@ def _camera_of(profile: Any, fit: Fit, index: int) -> Camera | None:
 
 def diameter_spread(fit: Fit, cameras: list[Camera]) -> list[list[float]]:
     """Standard deviations of pipes' mean diameters, millimetres, of each camera and each of DN, by how much they depend
-    on which views there are: the jackknife over five parts of the frames. It sees what the noise does not tell: a lens
-    or a target that is not what the model can be. [] for fewer than ten frames."""
-    frames = np.unique(fit.data.frame_of[fit.used_views()])
-    if len(frames) < 2 * JACKKNIFE:
+    on which views there are: the jackknife over five parts of the poses. It sees what the noise does not tell: a lens
+    or a target that is not what the model can be. [] for fewer than ten poses."""
+    pose = poses_apart(fit)
+    if pose.max() + 1 < 2 * JACKKNIFE:
         return []
-    frame_of_point = fit.data.frame_of[fit.data.view_of]
+    pose_of_point = pose[fit.data.frame_of[fit.data.view_of]]
     found = np.full((len(cameras), len(DN), JACKKNIFE), np.nan)
     for k in range(JACKKNIFE):
         part = fit.copy()
-        part.used = fit.used & ~np.isin(frame_of_point, frames[k::JACKKNIFE])
+        part.used = fit.used & (pose_of_point % JACKKNIFE != k)
         part.fit(fit.model, iterations=40, tolerance=1e-8)
         for c, camera in enumerate(cameras):
             if not (part.used & (fit.data.camera_of[fit.data.view_of] == c)).any():

@@ -135,7 +135,7 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
         picture = given.pictures[i]
         share(done / count)
         if done in (_LOOK, _GIVE_UP):
-            _refuse_other_size(given, sightings)
+            _refuse_other_size(given, sightings, least=done // 2)
         if done == _GIVE_UP and all(s.status == "none" for s in sightings):
             raise CalibrationError(
                 f"the target was found in none of {done} pictures, taken evenly from all {count} "
@@ -157,9 +157,9 @@ def search(given: Given, brightest: dict[int, npt.NDArray[np.uint8]], share: Cal
     return sorted(sightings, key=lambda s: (place[s.picture], s.board))
 
 
-def _refuse_other_size(given: Given, sightings: Sequence[Sighting]) -> None:
+def _refuse_other_size(given: Given, sightings: Sequence[Sighting], least: int = 3) -> None:
     if len(given.targets) == 1:
-        refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name)
+        refuse_other_size(given.targets[0].target, [s.seen for s in sightings], given.targets[0].name, least)
 
 
 def lit_around(brightest: npt.NDArray[np.uint8], views: Sequence[View]) -> ImageEllipse | None:
@@ -218,6 +218,8 @@ def refuse_wrong_size(given: Given, sightings: Sequence[Sighting]) -> None:
     """Raises CalibrationError where most pictures show all of a target but one outer row, and none shows half of that:
     the target has a row less than was said, and what was found of it is no target. It would look calibrated."""
     for board, target in enumerate(given.targets):
+        if target.target is not None and target.target.kind in ("charuco", "sleeve"):
+            continue  # marks tell which points are seen: a row may be covered
         xy = np.round(target.points[:, :2], 9)
         mine = [set(s.ids.tolist()) for s in sightings if s.board == board and s.usable]
         for axis, what in ((1, "row"), (0, "column")):
@@ -270,7 +272,7 @@ def settle_all(given: Given, sightings: list[Sighting], first: Calibration, shar
     added = 0
     for done, s in enumerate(open_):
         share(done / len(open_))
-        found, why = settle(s.picture.image(), target, s.ids, s.pixels, first, missed)
+        found, why = settle(s.picture.image(), target, s.ids, s.pixels, first, *missed)
         if found is None:
             s.reason = why
             continue

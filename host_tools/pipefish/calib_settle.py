@@ -29,7 +29,8 @@ _FIELD = 0.97  # of the angle up to which points have been found: beyond, the le
 _MARGIN = 0.5  # steps of the grid from the picture's edge: nearer, a point need not be found
 _MISSED = (0.02, 0.3)  # of the points that ought to be seen: what a first model's pictures may say of their share
 _STRAY = 0.2  # of the searches where nothing is that find something
-_SURE = math.log(1000)  # likelier than the next place, and than no target
+_SURE = math.log(10)  # likelier than the next place, and than no target
+_COVERED = 0.1  # of the points that ought to be seen: where more are missing, something is before the target
 _MISFIT = 3.0  # times the root mean square error of the views: the first model does not explain it
 _BESIDE_PX = 2.0  # a point of the guided search that stands so far from the picture's own is another one
 
@@ -96,17 +97,23 @@ def step_of(pixels: Array) -> float:
     return float(np.linalg.norm(np.ptp(pixels, axis=0)) / math.sqrt(2 * len(pixels)))
 
 
-def missed_share(first: Calibration, views: Sequence[View], targets: Sequence[Target3D]) -> float:
-    """Of the points that pictures of known place ought to show, the share that was not found."""
-    ought = lacking = 0
+def missed_share(first: Calibration, views: Sequence[View], targets: Sequence[Target3D]) -> tuple[float, float]:
+    """Of the points that pictures of known place ought to show, the share that was not found; and how likely a picture
+    is to have something before its target, by how many of these have (and one in ten beforehand): misses come together
+    then."""
+    ought = lacking = known_views = covered = 0
     for view, pose in zip(views, first.poses, strict=True):
         if np.isfinite(pose).all():
             points = targets[view.board].points
             seen = visible(first.cameras[view.camera], pose, points, step_of(view.pixels))
             known = {p.tobytes() for p in view.board_xyz}
-            ought += int(seen.sum())
-            lacking += sum(p.tobytes() not in known for p in points[seen])
-    return float(np.clip(lacking / max(ought, 1), *_MISSED))
+            missing = sum(p.tobytes() not in known for p in points[seen])
+            known_views += 1
+            covered += missing > _COVERED * seen.sum()
+            if missing <= _COVERED * seen.sum():
+                ought += int(seen.sum())
+                lacking += missing
+    return float(np.clip(lacking / max(ought, 1), *_MISSED)), (covered + 0.5) / (known_views + 5)
 
 
 def settle(
@@ -116,10 +123,11 @@ def settle(
     pixels: Array,
     first: Calibration,
     missed: float,
+    covered: float,
 ) -> tuple[Detection | None, str]:
     """The points that an ambiguous picture of a one-camera, one-target run shows: (found, ""), or (None, why not).
 
-    missed: of missed_share."""
+    missed, covered: of missed_share."""
     if target.kind == "sleeve" or len(ids) < _FEWEST:
         return None, f"{len(ids)} points, and which ones cannot be told"
     choices = places(target, ids)
@@ -142,7 +150,8 @@ def settle(
         stands = np.linalg.norm(where[place] - pixels, axis=1)
         seen[place[~(stands < _BESIDE_PX)]] = False
         hits, lacks = int(seen[ought].sum()), int((~seen & ought).sum())
-        score = hits * math.log((1 - missed) / _STRAY) + lacks * math.log(missed / (1 - _STRAY))
+        lost = max(lacks * math.log(missed / (1 - _STRAY)), math.log(covered))
+        score = hits * math.log((1 - missed) / _STRAY) + lost
         scores.append((score, found))
     scores.sort(key=lambda s: -s[0])
     best, found = scores[0]

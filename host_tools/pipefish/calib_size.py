@@ -9,13 +9,15 @@ from .calib_data import CalibrationError
 from .calib_input import Target3D
 from .target import Target
 
-_SURE = 3  # pictures at least that show a whole target smaller than described: fewer may show parts of it
+_SURE = 3  # pictures at least that show the same other size
 
 
-def refuse_other_size(target: Target | None, seen: Sequence[tuple[int, int]], name: str) -> None:
-    """Raises CalibrationError where most pictures show a target of another size. seen: Detection.seen of each picture.
+def refuse_other_size(target: Target | None, seen: Sequence[tuple[int, int]], name: str, least: int = _SURE) -> None:
+    """Raises CalibrationError where most pictures that show a grid, and at least `least`, show one of another size.
+    seen: Detection.seen of each picture.
 
-    Parts of a target are seen in another size each time; the same size in half of the pictures is the whole."""
+    Parts of a target are seen in another size each time; the same size in half of the pictures is the whole, unless
+    others show more of it."""
     if target is None or target.kind not in ("checkerboard", "circles", "asymmetric-circles"):
         return  # marks tell which points these are
     sizes = Counter(_like(size, target) for size in seen if min(size) >= 2)
@@ -23,8 +25,9 @@ def refuse_other_size(target: Target | None, seen: Sequence[tuple[int, int]], na
         return
     size, count = sizes.most_common(1)[0]
     want = target.points_shape
-    is_smaller = size[0] <= want[0] and size[1] <= want[1]
-    if size == want or 2 * count < sizes.total() or (is_smaller and (count < _SURE or sizes[want])):
+    smaller = size[0] <= want[0] and size[1] <= want[1]
+    part = smaller and any(more[0] > size[0] or more[1] > size[1] for more in sizes)
+    if size == want or 2 * count < sizes.total() or count < least or part:
         return
     raise CalibrationError(_text(target, size, count, len(seen), name))
 

@@ -23,7 +23,8 @@ def verdict(
     axis the target was seen; bend: of the target, as a share of its size.
 
     usable: for any pipe; dn_from, dn_to: millimetres, of the nominal diameters of `pipes` that hold; systematic_mm:
-    largest of these (95 %); pipes: one entry a diameter; reasons, cautions: sentences."""
+    largest of these (95 %); chosen: the model was, by held-out views; pipes: one entry a diameter;
+    reasons, cautions: sentences."""
     camera = report["cameras"][index]
     halves = camera.get("halves", {}).get("ratio")
     pipes = []
@@ -54,6 +55,7 @@ def verdict(
         "allowed_share": SHARE,
         "pipes": pipes,
     }
+    out["chosen"] = bool(report["models"])
     out["text"] = _text(out)
     out["reasons"], out["cautions"] = (
         _reasons(report, camera, held_out, halves),
@@ -82,7 +84,8 @@ def _text(out: dict[str, Any]) -> str:
     low = min(p["systematic_mm"] for p in out["pipes"] if p["usable"])
     high = out["systematic_mm"]
     range_ = f"{low:.2g} to {high:.2g}" if f"{low:.2g}" != f"{high:.2g}" else f"{high:.2g}"
-    return f"Usable for {pipes}: the calibration puts the mean diameter off by at most {range_} mm (95 %)."
+    what = "calibration puts" if out["chosen"] else "pictures' noise alone puts"
+    return f"Usable for {pipes}: the {what} the mean diameter off by at most {range_} mm (95 %)."
 
 
 def _reasons(report: dict[str, Any], camera: dict[str, Any], held_out: float | None, halves: float | None) -> list[str]:
@@ -108,6 +111,11 @@ def _cautions(
 ) -> list[str]:
     """What one should know before using it, and what to do about it."""
     said = []
+    if not out["chosen"]:
+        said.append(
+            f"the model {report['model']} was given, not chosen by views held out: what it cannot fit of this "
+            "lens is in no bound; --model auto compares"
+        )
     coverage = camera["coverage"]
     if held_out is None:
         said.append("no views could be held out to check it: take at least 6 views, better 20")

@@ -15,7 +15,10 @@ def run_homography(args: argparse.Namespace) -> Result:
 
     from pipefish.conics import ellipse_centre, homography_from_conics, load_conics, map_conics, match_conics
 
-    (first, one), (second, two) = load_conics(args.first), load_conics(args.second)
+    if (paired := _target_and_picture(args.first, args.second)) is not None:
+        (first, second), one, two = paired, True, True
+    else:
+        (first, one), (second, two) = load_conics(args.first), load_conics(args.second)
     for path, conics in ((args.first, first), (args.second, second)):
         if len(conics) < 2:
             raise FormatError(path, None, f"{len(conics)} conics, at least 2 are needed")
@@ -40,6 +43,22 @@ def run_homography(args: argparse.Namespace) -> Result:
             ("centres", f"{candidates[0]['centre_rms']:.4g} rms from where they are, in units of {args.second}")
         )
     return {"pairs": pairs, "candidates": candidates}, table(rows)
+
+
+def _target_and_picture(first: str, second: str) -> tuple[Any, Any] | None:
+    """Conics of a target and of a picture of it, each beside its own, where the two files are these."""
+    from pathlib import Path
+
+    from pipefish.conics import PICTURES, circles_of, discs_of_target, is_target, load_picture
+    from pipefish.target import Target
+
+    for target, picture in ((first, second), (second, first)):
+        if Path(picture).suffix.lower() in PICTURES and is_target(target):
+            described = Target.load(target)
+            seen, ids = discs_of_target(described, load_picture(picture))
+            sheet = circles_of(described)[ids]
+            return (sheet, seen) if target == first else (seen, sheet)
+    return None
 
 
 def add_homography(commands: Any) -> None:

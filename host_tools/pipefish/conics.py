@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipefish import _engine
-from pipefish.detect import Detection, grey
+from pipefish.detect import Detection, detect_target, grey
 from pipefish.errors import ArgumentError, FormatError
 from pipefish.target import Target
 
@@ -88,7 +88,7 @@ def ellipses_in(image: npt.ArrayLike) -> Array:
 def circles_of(target: Target) -> Array:
     """Conics (n, 3, 3) of a flat target's discs, in metres on the sheet. Raises ArgumentError."""
     if not target.has_circles or target.kind == "sleeve":
-        raise ArgumentError(f"target: a {target.kind} is no plane with circles")
+        raise ArgumentError(f"target: homographies need a plane with circles, not a {target.kind}")
     return np.array([ellipse((x, y), (target.radius_m,) * 2) for x, y in target.flat_points()])
 
 
@@ -145,11 +145,44 @@ def match_conics(C: npt.ArrayLike, C_prime: npt.ArrayLike) -> list[tuple[int, in
         if len(best) >= min(len(first), len(second)):
             break
     if len(best) < 4:
-        raise ArgumentError("conics: fewer than four ellipses correspond; give conics in the same order in files")
+        raise ArgumentError(
+            f"conics: of {len(first)} and {len(second)} ellipses, the largest, fewer than four correspond; give conics "
+            "in the same order in files, or a target's description"
+        )
     return best
 
 
+def discs_of_target(target: Target, image: npt.ArrayLike) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Conics (n, 3, 3) of a target's discs that a picture (H, W) shows, and which they are (n,): rows of circles_of().
+
+    Raises ArgumentError with the detector's reason where it does not find the target."""
+    circles_of(target)
+    found = detect_target(grey(image), target)
+    if found.outlines is None or not len(found.ids):
+        raise ArgumentError(f"the target is not found in the picture: {found.reason}")
+    outlines = [line[np.isfinite(line).all(axis=1)] for line in found.outlines]
+    whole = [k for k, line in enumerate(outlines) if len(line) >= 6]
+    return np.array([_engine.fit_ellipse(outlines[k]) for k in whole]).reshape(-1, 3, 3), found.ids[whole]
+
+
 # ---- files
+
+
+def is_target(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a target's description."""
+    path = Path(path)
+    return path.suffix.lower() == ".json" and '"pipefish-target"' in path.read_text(encoding="utf-8", errors="replace")
+
+
+def load_picture(path: str | os.PathLike[str]) -> npt.NDArray[np.uint8]:
+    """A picture (H, W) in grey. Raises FormatError, OSError."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("L"))
+    except UnidentifiedImageError:
+        raise FormatError(path, None, "not a picture") from None
 
 
 def load_conics(path: str | os.PathLike[str]) -> tuple[Array, bool]:
@@ -161,13 +194,7 @@ def load_conics(path: str | os.PathLike[str]) -> tuple[Array, bool]:
     """
     path = Path(path)
     if path.suffix.lower() in PICTURES:
-        from PIL import Image, UnidentifiedImageError
-
-        try:
-            with Image.open(path) as picture:
-                found = ellipses_in(np.asarray(picture.convert("L")))
-        except UnidentifiedImageError:
-            raise FormatError(path, None, "not a picture") from None
+        found = ellipses_in(load_picture(path))
         if len(found) < 3:
             raise FormatError(path, None, f"{len(found)} dark discs found, at least 3 are needed")
         return found, False

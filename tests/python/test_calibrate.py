@@ -13,6 +13,7 @@ from calib_scenes import RADII, Lens, bearing_error, board, random_lens, turn, v
 from pipefish import _engine, calibration
 from pipefish.calib_circle import ImageEllipse, find_image_ellipse
 from pipefish.calib_data import Data
+from pipefish.calib_fit import Fit, poses_apart
 from pipefish.calib_model import Model
 from pipefish.calib_report import _aligned, diameter_spread
 from pipefish.calibration import Calibration, CalibrationError, View, calibrate
@@ -584,6 +585,20 @@ def test_a_camera_that_one_part_of_the_views_holds_alone_has_no_spread() -> None
     result = calibrate([v for v in both if v.camera == 0], SIZE, "p9", "flat")
     spread = diameter_spread(fit, [result.camera, result.camera])
     assert np.isfinite(spread[0]).all() and np.isnan(spread[1]).all()
+
+
+def test_frames_of_one_pose_are_no_independent_witnesses():
+    """Bursts: each pose would be in every fold, and the spread of parts would be that of the noise alone."""
+    random = np.random.default_rng(4)
+    views, _ = views_of(random, LENS, 8, 0.1)
+    burst = [
+        pf.View(v.board_xyz, v.pixels + random.normal(0, 0.1, v.pixels.shape), name=f"{i}-{k}")
+        for i, v in enumerate(views)
+        for k in range(3)
+    ]
+    data = Data(burst, [(LENS.width, LENS.height)])
+    number = poses_apart(Fit(data))
+    assert number.tolist() == np.repeat(np.arange(8), 3).tolist()
 
 
 def test_what_is_lit_may_be_an_ellipse_or_be_cut_by_the_sensor() -> None:

@@ -190,6 +190,17 @@ def test_two_cameras_of_a_rig_get_a_profile_each_and_their_place(tmp_path, targe
     np.testing.assert_allclose(rig["cameras"][1]["quaternion_wxyz"], [math.cos(half), 0, math.sin(half), 0], atol=1e-3)
 
 
+def test_another_size_is_told_only_where_most_pictures_show_it():
+    board = pf.Target("checkerboard", 7, 10, 0.03)  # 9 x 6 inner corners
+    refuse_other_size(board, [(13, 8), (9, 6), (9, 6), (9, 6)], "b")  # one picture of another board
+    refuse_other_size(board, [(6, 5)] * 5 + [(9, 5), (8, 6), (7, 6), (7, 5)], "b")  # a board that is never whole
+    refuse_other_size(board, [(13, 8)] * 3 + [(0, 0)] * 7, "b", least=5)  # ten looked at: the others may show the board
+    with pytest.raises(CalibrationError, match="larger than described: 3 of 4"):
+        refuse_other_size(board, [(13, 8)] * 3 + [(9, 6)], "b")
+    with pytest.raises(CalibrationError, match="smaller than described: 4 of 4"):
+        refuse_other_size(board, [(8, 5)] * 4, "b")
+
+
 def test_the_verdict_follows_the_bounds_and_says_why():
     pipes = [
         {"dn_mm": 100, "sigma_mm": 0.5},
@@ -204,8 +215,10 @@ def test_the_verdict_follows_the_bounds_and_says_why():
         "halves": {"ratio": 2.0, "rms_px": 0.04, "expected_px": 0.02},
     }
     views = [{"used": True, "camera": 0, "points": 100}, {"used": False, "camera": 0, "points": 0}]
-    report = {"cameras": [camera], "views": views, "rms_px": 0.2}
+    report = {"cameras": [camera], "views": views, "rms_px": 0.2, "model": "p9", "models": [{"model": "p9"}]}
     found = verdict(report, 0.3, math.radians(50))
+    given = verdict(report | {"models": []}, 0.3, math.radians(50))
+    assert "noise alone" in given["text"] and "p9 was given" in given["cautions"][0] and "alone" not in found["text"]
     assert found["usable"] and (found["dn_from"], found["dn_to"]) == (300, 300)
     assert found["systematic_mm"] == pytest.approx(
         math.hypot(2.776 * 0.4, 0.3)
@@ -358,12 +371,12 @@ def test_which_size_a_target_has_is_told_by_half_of_the_pictures_not_by_parts_of
         CalibrationError, match=r"smaller than described: 3 of 5 pictures show 7 x 7 circles, .* --grid 7x7"
     ):
         refuse("circles", 9, 8, [(7, 7), (7, 7), (7, 7), (5, 5), (0, 0)])
-    with pytest.raises(CalibrationError, match=r"not the one described: 1 of 1 .*--grid 9x6"):
-        refuse("checkerboard", 12, 5, [(5, 8)])
+    with pytest.raises(CalibrationError, match=r"not the one described: 3 of 3 .*--grid 9x6"):
+        refuse("checkerboard", 12, 5, [(5, 8)] * 3)
     with pytest.raises(
         CalibrationError, match=r"Columns and rows are exchanged.*--grid 4x11 --spacing 40 -o mine.json"
     ):
-        refuse("asymmetric-circles", 11, 4, [(4, 11), (4, 11)])
+        refuse("asymmetric-circles", 11, 4, [(4, 11)] * 3)
 
 
 def test_copies_of_a_picture_are_left_out_and_named(pictures, tmp_path, capsys):
@@ -479,7 +492,7 @@ def test_a_place_that_is_no_better_than_another_is_refused():
     part = np.array([10, 11, 12, 13, 19, 20, 21, 22, 28, 29, 30, 31])
     pixels = np.stack([600 + 20.0 * (part % 9), 400 + 20.0 * (part // 9)], axis=1)
     blank = np.full((960, 1280), 128, dtype=np.uint8)
-    found, why = settle(blank, board, part, pixels, first, 0.05)
+    found, why = settle(blank, board, part, pixels, first, 0.05, 0.05)
     assert found is None and "places" in why
 
 

@@ -245,13 +245,43 @@ Detection from_grid(const cv::Mat &image, const Board &board, Grid grid, const s
     return out;
 }
 
+// The size of the board that a grid may be only a part of: OpenCV finds the size that it is asked for inside a larger
+// board too. Looked for at the middles of the four sides first: on a whole board there is nothing.
+std::array<int, 2> size_around(const cv::Mat &image, const Board &board, const Grid &grid)
+{
+    Site low = grid.begin()->first, high = low;
+    for (const auto &[site, point] : grid)
+        for (size_t k = 0; k < 2; k++) {
+            low[k] = std::min(low[k], site[k]);
+            high[k] = std::max(high[k], site[k]);
+        }
+    bool larger = false;
+    for (size_t k = 0; k < 2; k++)
+        for (const int beside : {low[k] - 1, high[k] + 1}) {
+            int found = 0;
+            for (const int step : {-1, 0, 1}) {
+                Site site;
+                site[k] = beside;
+                site[1 - k] = (low[1 - k] + high[1 - k]) / 2 + step;
+                const auto f = forecast(grid, site, 0, false);
+                found += f && search_point(image, board, f->at, f->cell, -1);
+            }
+            larger |= found >= 2;
+        }
+    return extent(larger ? own_checkerboard(image, 4 * board.at.size()) : grid, board);
+}
+
 Detection find_checkerboard(const cv::Mat &image, const Board &board)
 {
     Grid grid;
     if (opencv_checkerboard(image, board, grid)) {
         Grid better = refined(image, board, grid, 0, false);
-        if (10 * better.size() > 9 * board.flat.size())
-            return from_grid(image, board, better, {});
+        if (10 * better.size() > 9 * board.flat.size()) {
+            const auto seen = size_around(image, board, better);
+            Detection out = from_grid(image, board, better, {});
+            out.seen = seen;
+            return out;
+        }
     }
     grid = own_checkerboard(image, board.flat.size());
     grid = refined(image, board, grid, 0, true);
