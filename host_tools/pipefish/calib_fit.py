@@ -20,7 +20,7 @@ THETA_END = 3.1415926535897927  # PF_CAMERA_THETA_MAX
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median of the distance in units of sigma per axis
 _HUBER = 5.0  # sigma: the mild bend; real corners have tails that Gaussian noise has not
 _GROSS = 10.0  # sigma: a point beyond is no measurement of this corner
-_SAME_POSE = 0.01  # of the picture's diagonal: points that moved less between frames show one pose
+_SAME_POSE = 0.005  # of the picture's diagonal, a hand's tremor: points that moved less between frames show one pose
 
 
 def errors_of(bundle: _engine.Bundle, data_pixels: Array) -> Array:
