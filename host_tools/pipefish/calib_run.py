@@ -268,11 +268,11 @@ def settle_all(given: Given, sightings: list[Sighting], first: Calibration, shar
     target = given.targets[0].target
     if not open_ or target is None or len(given.cameras) > 1 or len(given.targets) > 1:
         return 0
-    missed = missed_share(first, views_of(given, sightings), given.targets)
+    odds = missed_share(first, views_of(given, sightings), given.targets)
     added = 0
     for done, s in enumerate(open_):
         share(done / len(open_))
-        found, why = settle(s.picture.image(), target, s.ids, s.pixels, first, *missed)
+        found, why = settle(s.picture.image(), target, s.ids, s.pixels, first, *odds)
         if found is None:
             s.reason = why
             continue
