@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import math
@@ -24,7 +25,7 @@ from pipefish.calib_input import Given, Picture, Target3D, load_target, load_vie
 from pipefish.calib_live import Guide
 from pipefish.calib_run import lit_around
 from pipefish.calib_run import run as run_pictures
-from pipefish.calib_settle import places, settle, turns_of
+from pipefish.calib_settle import missed_share, places, settle, turns_of
 from pipefish.calib_size import refuse_other_size
 from pipefish.calib_verdict import verdict
 from synthetic import BOOT, SURVEY, keyframe, start
@@ -494,6 +495,22 @@ def test_a_place_that_is_no_better_than_another_is_refused():
     blank = np.full((960, 1280), 128, dtype=np.uint8)
     found, why = settle(blank, board, part, pixels, first, 0.05, 0.05)
     assert found is None and "places" in why
+
+
+def test_something_before_the_target_is_known_by_misses_that_come_together():
+    """As independent misses half a covered board spoke a thousandfold for a wrong place on which it would be unseen."""
+    board = pf.Target("circles", 9, 9, 0.03)
+    views, _ = scenes.views_of(np.random.default_rng(3), LENS, 8, 0.1, points=board.points())
+    first = pf.calibrate(views, (1280, 960), "p9", "flat")
+    target = Target3D("dots", board.points(), board.radius_m, board)
+    missed, covered = missed_share(first, views, [target])
+    assert missed == pytest.approx(0.02) and covered == pytest.approx(0.5 / 13)
+    half = [
+        dataclasses.replace(v, board_xyz=v.board_xyz[40:], pixels=v.pixels[40:]) if i % 2 else v
+        for i, v in enumerate(views)
+    ]
+    missed, covered = missed_share(first, half, [target])
+    assert missed == pytest.approx(0.02) and covered == pytest.approx(4.5 / 13)  # four of eight
 
 
 def test_points_of_the_target_lie_inside_the_image_circle():
