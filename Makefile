@@ -73,10 +73,7 @@ fuzz-build: packages-test
 	@cmake --build --preset clang
 
 fuzz-smoke: fuzz-build
-	@for f in build/clang/tests/fuzz/fuzz_*; do test -x $$f -a -f $$f || continue; echo "$$f"; n=$${f##*fuzz_}; \
-	    rm -rf build/fuzz/$$n; mkdir -p build/fuzz/$$n; \
-	    $$f -runs=20000 -max_len=4096 -seed=1 -verbosity=0 build/fuzz/$$n $$(ls -d tests/fuzz/corpus/$$n 2>/dev/null) \
-	        2>build/fuzz.log || { cat build/fuzz.log; exit 1; }; done
+	@ls build/clang/tests/fuzz | grep '^fuzz_[a-z_]*$$' | xargs -n 1 -P 2 tests/fuzz/smoke build/clang/tests/fuzz
 
 # The protocols, in every state that small bounds reach (tests/proof).
 proof: packages-test
@@ -95,7 +92,7 @@ size: cross
 	@tools/size-table $(filter cortex-%,$(CROSS))
 
 pytest: build
-	@$(PY) -m pytest -q
+	@$(PY) -m pytest -q -n 2 --dist loadfile
 
 # Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
 # scenarios are skipped and say so.
