@@ -244,7 +244,9 @@ def test_sigterm_ends_the_survey_and_drains(tmp_path: Path, crawler: Crawler):
     assert crawler.wait() == 0
     [end] = store.ends
     assert end.reason == "terminated"
-    assert [k.index for k in store.keyframes] == list(range(end.keyframes))
+    # At a recording's own speed a slow disk costs keyframes, which the end names (a busy machine's disk is slow).
+    lost = [i for first, n in zip(end.lost_first, end.lost_count, strict=True) for i in range(first, first + n)]
+    assert sorted([k.index for k in store.keyframes] + lost) == list(range(end.keyframes))
 
 
 def test_what_could_not_be_sent_is_delivered_by_the_next_start_before_its_new_survey(crawler: Crawler):
