@@ -50,6 +50,9 @@ class Flasher:
         """Sends a profile in its binary form; it is stored when this returns, on trial. The device has read it back and
         tested itself with it. A connection that breaks, and a device that restarts, are waited for."""
         self.state()  # a device that keeps no profiles says so
+        why = self._client.answer_to(self._timeout_s, get_status=pb.Nothing()).status.looking_on
+        if why:
+            raise PipefishError(f"the device refuses the profile: {why}")
         name = hashlib.sha256(data).digest()
         self._delivery.stored = None
         self._client.link.send_object(name, KIND_PROFILE, data)

@@ -297,7 +297,7 @@ def plug_usb_camera(board, port: int) -> None:
 
 
 def see_vimc(survey, daemon: str, name: str) -> None:
-    """The kernel's virtual camera, whose pipeline libcamera puts together, through a daemon: a test pattern in colours."""
+    """The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours."""
     board = survey.board
     vimc = "camera.driver=libcamera camera.device=vimc camera.width=318 camera.height=240"
     extra = f"spool.path=/run/{name}.db daemon.status_file=/run/status.json status.interval_ms=100 daemon.drain_s=0"

@@ -130,6 +130,8 @@ typedef struct pf_msg_status {
     pf_msg_tracking tracking;
     bool has_network;
     pf_msg_network network;
+    uint32_t visitors;      /* hosts that look on while another has the device */
+    const char *looking_on; /* why who gets this may only look on; "" = he has the device */
 } pf_msg_status;
 
 typedef struct pf_msg_survey_end {
