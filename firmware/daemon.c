@@ -86,7 +86,6 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status, char *peer)
         .clock = c->clock,
         .tracking = c->tracking,
         .visitors = c->visitors,
-        .looking_on = "",
         .has_network = c->has_network,
         .network = {.peer = peer,
                     .role = c->peer_role >= PF_ROLE_VIEWER ? pf_role_text(c->peer_role) : "",

@@ -68,8 +68,7 @@ static void fill_status(pf_daemon *d, const pf_session *s, pf_msg_status *status
 {
     pf_daemon_status(d, status, peer);
     if (s->is_visitor)
-        status->looking_on = own_role(s) > PF_ROLE_VIEWER ? "another host is connected to the device"
-                                                          : "this host may only look on: its role is viewer";
+        status->looking_on = own_role(s) > PF_ROLE_VIEWER ? PF_LOOKING_BUSY : PF_LOOKING_VIEWER;
 }
 
 pf_status pf_request_status(pf_daemon *d, const pf_session *s, uint8_t *bytes, size_t *n)

@@ -28,7 +28,11 @@ TOPIC_STATUS, TOPIC_PREVIEW = 0, 1
 BACKOFF_S = (0.1, 5.0)  # first and longest pause before the line is opened again
 OUTPUT_CHUNK = 4096  # bytes given to the line at once: about 14 ms at 3 Mbaud; acknowledgements are small
 BUSY_S = 0.5  # pause before a device is asked again that another host has
-BUSY = "another host is connected to the device"  # as the device says it
+BUSY, VIEWER = 1, 2  # Status.looking_on
+LOOKING = {
+    BUSY: "another host is connected to the device",
+    VIEWER: "this host may only look on: its role is viewer",
+}
 IDLE_S = 0.5  # longest sleep: the caller's `until` is looked at this often
 
 
@@ -282,10 +286,11 @@ class Client:
             raise PipefishError(f"the device says: {reply.error}")
         return reply
 
-    def _leave(self, why: str) -> None:
+    def _leave(self, looking: int) -> None:
         """A device that another host has counts as not there, and is asked again. Raises TransportClosed, or
         PipefishError where waiting does not help."""
-        if why != BUSY:
+        why = LOOKING.get(looking, "this host may only look on")
+        if looking != BUSY:
             raise PipefishError(f"the device on {self.transport.name} says: {why}")
         self._backoff_s = BUSY_S
         self._down()

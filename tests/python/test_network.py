@@ -20,7 +20,7 @@ from crawler import Crawler, Store, find_daemon, wait_for_log, write_recording
 from pipefish import keys
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
-from pipefish.client import BUSY, Client, Handlers, NoDevice
+from pipefish.client import BUSY, VIEWER, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
 from pipefish.transport import Refused, TlsTransport
@@ -399,7 +399,7 @@ def test_a_viewer_looks_on_and_an_operator_takes_the_line(device: Crawler, tmp_p
     let_in(device, "operator", operator, "boss")
     with receiving(device):
         status = viewer.answer_to(5, get_status=pb.Nothing()).status
-    assert status.network.role == "operator" and "its role is viewer" in status.looking_on
+    assert status.network.role == "operator" and status.looking_on == VIEWER
     viewer.close()
 
 
