@@ -422,6 +422,8 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
         why = "tracker.window: must be odd";
     else if (c->tracker.cell != 0 && c->tracker.cell < 16)
         why = "tracker.cell: must be 0 or 16..256";
+    else if (c->camera.driver != PF_CAMERA_REPLAY && c->encoder.metres_per_count != 0 && c->gpio.encoder[0] == '\0')
+        why = "gpio.encoder: must be set for encoder.metres_per_count: no counts come without it";
     if (why != NULL)
         (void)snprintf(error, n, "%s: %s", file, why);
     return why == NULL;

@@ -85,6 +85,7 @@ void pf_daemon_status(pf_daemon *d, pf_msg_status *status, char *peer)
         .has_clock = c->has_clock,
         .clock = c->clock,
         .tracking = c->tracking,
+        .visitors = c->visitors,
         .has_network = c->has_network,
         .network = {.peer = peer,
                     .role = c->peer_role >= PF_ROLE_VIEWER ? pf_role_text(c->peer_role) : "",
@@ -194,10 +195,10 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
                   "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
                   ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64
                   ", \"malformed\": %" PRIu64 ", \"fragments_sent\": %" PRIu64 ", \"fragments_resent\": %" PRIu64
-                  ", \"objects_sent\": %" PRIu64 ", \"sessions\": %" PRIu64 ", \"rtt_us\": %u}",
+                  ", \"objects_sent\": %" PRIu64 ", \"sessions\": %" PRIu64 ", \"rtt_us\": %u, \"visitors\": %u}",
                   s->link_up ? "true" : "false", s->link.bytes_out, s->link.bytes_in, s->link.frames_out,
                   s->link.frames_in, s->link.crc_errors, s->link.malformed, s->link.fragments_sent,
-                  s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us);
+                  s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us, s->visitors);
     print_text(out, "spool_trouble", store->trouble);
     if (s->telemetry.has_encoder)
         (void)fprintf(out, ",\n  \"encoder_count\": %" PRId64, s->telemetry.encoder_count);

@@ -43,6 +43,7 @@ typedef struct pf_counters {
     pf_msg_tracking tracking;
     bool link_up;
     pf_link_stats link;
+    uint32_t visitors; /* hosts that look on */
     bool has_clock;
     pf_msg_clock_sync clock;
     bool has_network; /* the transport refuses whom it does not know */

@@ -54,7 +54,12 @@ static bool open_device(pf_guard *g, const char *path, uint32_t hang_s, char *er
         return true;
     g->device = open(path, O_WRONLY | O_CLOEXEC);
     if (g->device < 0 || ioctl(g->device, WDIOC_SETTIMEOUT, &seconds) != 0) {
-        (void)snprintf(error, n, "daemon.watchdog: %s: %s", path, strerror(errno));
+        const int why = errno;
+        if (g->device >= 0 && why == EINVAL && ioctl(g->device, WDIOC_GETTIMEOUT, &seconds) == 0)
+            (void)snprintf(error, n, "daemon.watchdog_s = %u: %s cannot wait that long (it is at %d s now)", hang_s,
+                           path, seconds);
+        else
+            (void)snprintf(error, n, "daemon.watchdog: %s: %s", path, strerror(why));
         if (g->device >= 0) {
             (void)!write(g->device, "V", 1);
             (void)close(g->device);

@@ -338,7 +338,9 @@ static bool open_transport(pf_daemon *d, char *error, size_t n)
             &(pf_tls_config){c->link.address, (uint16_t)c->link.port, SILENCES * c->link.keepalive_ms, d->trust}, error,
             n);
     else
-        status = pf_tcp_listen(&d->transport, &(pf_tcp_config){c->link.address, (uint16_t)c->link.port}, error, n);
+        status = pf_tcp_listen(
+            &d->transport, &(pf_tcp_config){c->link.address, (uint16_t)c->link.port, SILENCES * c->link.keepalive_ms},
+            error, n);
     if (status != PF_OK)
         pf_trust_close(d->trust);
     return status == PF_OK;

@@ -15,6 +15,7 @@
 
 #define PREVIEW_OVERHEAD 128u /* most bytes of a preview message without its JPEG: six numbers and their tags */
 #define NEXT_TIMEOUT_MS  100u /* how long a stop may go unnoticed while the camera is silent */
+#define UNCOUNTED_MAX    30u  /* frames without an encoder count after which that is said */
 #define START_MAX        (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
 
 #define SHOTS PF_CAMERA_HELD_MAX /* the tracker's reference, the frame being tracked, the one that is being taken */
@@ -38,6 +39,7 @@ struct pf_pipeline {
     uint8_t stretched[256];                   /* grey levels of the camera -> 0..255 */
     uint32_t preview_quality, preview_shrink; /* of the last preview */
     uint32_t next_index;
+    uint32_t uncounted; /* frames from the start on that came without an encoder count */
     uint32_t boots;
     char break_reason[PF_BREAK_REASON_MAX]; /* "" = tracks go on */
 };
@@ -235,6 +237,18 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
 
 /* ---- one frame */
 
+/* An encoder that is in the settings, and not in the recording or on the board, costs the survey its scale. */
+static void warn_of_silence(pf_pipeline *p, bool has_encoder)
+{
+    if (has_encoder || p->uncounted >= UNCOUNTED_MAX || p->daemon->config.encoder.metres_per_count == 0)
+        p->uncounted = UNCOUNTED_MAX; /* it was told, or there is nothing to tell */
+    else if (++p->uncounted == UNCOUNTED_MAX)
+        pf_log(PF_LOG_WARNING,
+               "encoder.metres_per_count is set, but %u frames came without an encoder count: keyframes by common "
+               "tracks only, and the survey has no scale of its own",
+               UNCOUNTED_MAX);
+}
+
 static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
 {
     pf_daemon *d = p->daemon;
@@ -256,6 +270,7 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
     if (!m.has_encoder)
         m.has_encoder =
             d->gpio.ops->encoder(d->gpio.self, frame->time_ns, &m.encoder_count, &m.encoder_missed) == PF_OK;
+    warn_of_silence(p, m.has_encoder);
     if (!m.has_lamp && d->gpio.ops->lamp(d->gpio.self, &lamp) == PF_OK) {
         m.has_lamp = true;
         m.lamp = (float)lamp;

@@ -1,5 +1,5 @@
 /* In place of session.cpp where there was no libcamera to build with. */
-#include "camera_libcamera/session.h"
+#include "camera_libcamera/libcamera.h"
 
 pf_status pf_session_libcamera(pf_session_io *io, pf_failure *failure)
 {

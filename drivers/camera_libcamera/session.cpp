@@ -1,6 +1,6 @@
 /* libcamera, versions 0.0.3 and 0.3 (the calls below are those that both compile): finds a camera, maps its buffers,
  * and hands filled ones over from libcamera's own thread. */
-#include "camera_libcamera/session.h"
+#include "camera_libcamera/libcamera.h"
 
 #include <algorithm>
 #include <array>
@@ -30,6 +30,8 @@ namespace
 {
 
 using namespace libcamera;
+
+const int GAIN_UNIT = 64; /* gains in a session count in 64ths */
 
 /* libcamera's formats (Linux's DRM codes, which name the bytes of a word from the top) by our names. */
 struct FormatName {
@@ -216,10 +218,15 @@ void Session::describeControls(const pf_session_wish &wish, pf_session_info &inf
     }
     if (hasGain_) {
         const ControlInfo &range = all.at(controls::AnalogueGain.id());
-        info.gain = {std::max(int64_t{1}, static_cast<int64_t>(range.min().get<float>() * PF_SESSION_GAIN_UNIT)),
-                     static_cast<int64_t>(range.max().get<float>() * PF_SESSION_GAIN_UNIT), 1};
+        info.gain = {std::max(int64_t{1}, static_cast<int64_t>(range.min().get<float>() * GAIN_UNIT)),
+                     static_cast<int64_t>(range.max().get<float>() * GAIN_UNIT), 1};
         hasGain_ = info.gain.min < info.gain.max;
     }
+    info.time_unit_us = 1;
+    info.gain_unit = GAIN_UNIT;
+    /* It does not tell what is set: a tenth of the longest exposure is a start that a few steps correct. */
+    info.time_now = info.time.max / 10;
+    info.gain_now = info.gain.min;
     info.has_time = hasTime_;
     info.has_gain = hasGain_;
     info.frame_rate = 0;
@@ -390,7 +397,7 @@ void Session::set(bool isAutomatic, int64_t time, int64_t gain)
     if (hasTime_)
         next_.set(controls::ExposureTime, static_cast<int32_t>(time));
     if (hasGain_)
-        next_.set(controls::AnalogueGain, static_cast<float>(gain) / PF_SESSION_GAIN_UNIT);
+        next_.set(controls::AnalogueGain, static_cast<float>(gain) / GAIN_UNIT);
 }
 
 void Session::keep(uint32_t i)

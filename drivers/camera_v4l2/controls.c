@@ -1,8 +1,6 @@
 /* Exposure and gain of a V4L2 camera. */
 #include "camera_v4l2/v4l2.h"
 
-#include <math.h>
-
 static bool query(pf_v4l2 *c, uint32_t id, pf_v4l2_control *control, pf_exposure_range *range)
 {
     struct v4l2_queryctrl q = {.id = id};
@@ -27,89 +25,44 @@ static int64_t get(pf_v4l2 *c, uint32_t id, int64_t fallback)
 }
 
 /* Microseconds of a line of the sensor, for cameras whose exposure counts lines; 0 = it does not tell. */
-static double line_us(pf_v4l2 *c)
+static double line_us(pf_v4l2 *c, uint32_t width)
 {
     struct v4l2_ext_control rate = {.id = V4L2_CID_PIXEL_RATE};
     struct v4l2_ext_controls controls = {.which = V4L2_CTRL_WHICH_CUR_VAL, .count = 1, .controls = &rate};
     int64_t blank = get(c, V4L2_CID_HBLANK, -1);
     if (blank < 0 || c->io.ioctl(c->io.self, c->fd, VIDIOC_G_EXT_CTRLS, &controls) != 0 || rate.value64 <= 0)
         return 0;
-    return (double)(blank + c->info.width) * 1e6 / (double)rate.value64;
+    return (double)(blank + width) * 1e6 / (double)rate.value64;
 }
 
-static void find(pf_v4l2 *c)
+void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info)
 {
-    pf_exposure *e = &c->exposure;
     c->time_control.is_there = c->gain_control.is_there = false;
-    c->time_unit_us = 0;
-    e->time = e->gain = (pf_exposure_range){1, 1, 1};
-    if (query(c, V4L2_CID_EXPOSURE_ABSOLUTE, &c->time_control, &e->time))
-        c->time_unit_us = 100;
-    else if (query(c, V4L2_CID_EXPOSURE, &c->time_control, &e->time))
-        c->time_unit_us = line_us(c);
-    if (!query(c, V4L2_CID_ANALOGUE_GAIN, &c->gain_control, &e->gain))
-        (void)query(c, V4L2_CID_GAIN, &c->gain_control, &e->gain);
-    if (c->time_unit_us > 0 && c->exposure_max_us > 0) {
-        int64_t most = (int64_t)((double)c->exposure_max_us / c->time_unit_us);
-        if (most < e->time.max)
-            e->time.max = most > e->time.min ? most : e->time.min;
-    }
+    c->is_manual = false;
+    info->time_unit_us = 0;
+    info->gain_unit = 1;
+    if (query(c, V4L2_CID_EXPOSURE_ABSOLUTE, &c->time_control, &info->time))
+        info->time_unit_us = 100;
+    else if (query(c, V4L2_CID_EXPOSURE, &c->time_control, &info->time))
+        info->time_unit_us = line_us(c, info->width);
+    if (!query(c, V4L2_CID_ANALOGUE_GAIN, &c->gain_control, &info->gain))
+        (void)query(c, V4L2_CID_GAIN, &c->gain_control, &info->gain);
+    info->has_time = c->time_control.is_there;
+    info->has_gain = c->gain_control.is_there;
+    info->time_now = info->has_time ? get(c, c->time_control.id, info->time.min) : 0;
+    info->gain_now = info->has_gain ? get(c, c->gain_control.id, info->gain.min) : 0;
 }
 
-static void set_both(pf_v4l2 *c)
+void pf_v4l2_controls_set(pf_v4l2 *c, int64_t time, int64_t gain)
 {
+    if (!c->is_manual) { /* whatever of its own automatics the camera has */
+        (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL);
+        (void)set(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0);
+        (void)set(c, V4L2_CID_AUTOGAIN, 0);
+        c->is_manual = true;
+    }
     if (c->time_control.is_there)
-        (void)set(c, c->time_control.id, c->exposure.time_now);
+        (void)set(c, c->time_control.id, time);
     if (c->gain_control.is_there)
-        (void)set(c, c->gain_control.id, c->exposure.gain_now);
-}
-
-pf_status pf_v4l2_controls_open(pf_v4l2 *c)
-{
-    pf_exposure *e = &c->exposure;
-    find(c);
-    if (c->mode == PF_EXPOSURE_FIXED &&
-        ((c->exposure_us > 0 && c->time_unit_us <= 0) || (c->gain > 0 && !c->gain_control.is_there)))
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: has no control for the %s that is to be fixed", c->device,
-                       c->exposure_us > 0 && c->time_unit_us <= 0 ? "exposure" : "gain");
-    if (c->mode == PF_EXPOSURE_DEVICE || (!c->time_control.is_there && !c->gain_control.is_there)) {
-        c->time_control.is_there = c->gain_control.is_there = false;
-        return PF_OK;
-    }
-    /* Whatever of its own automatics the camera has. */
-    (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL);
-    (void)set(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0);
-    (void)set(c, V4L2_CID_AUTOGAIN, 0);
-    if (!c->has_exposure) {
-        int64_t time = c->time_control.is_there ? get(c, c->time_control.id, e->time.min) : 1;
-        int64_t gain = c->gain_control.is_there ? get(c, c->gain_control.id, e->gain.min) : 1;
-        if (c->mode == PF_EXPOSURE_FIXED && c->exposure_us > 0)
-            time = llround((double)c->exposure_us / c->time_unit_us);
-        if (c->mode == PF_EXPOSURE_FIXED && c->gain > 0)
-            gain = llround(c->gain);
-        e->holds = c->mode == PF_EXPOSURE_HOLD;
-        pf_exposure_init(e, time, gain);
-        c->has_exposure = true;
-    }
-    set_both(c);
-    return PF_OK;
-}
-
-void pf_v4l2_controls_judge(pf_v4l2 *c, const pf_image *image)
-{
-    if ((c->mode != PF_EXPOSURE_AUTO && c->mode != PF_EXPOSURE_HOLD) ||
-        (!c->time_control.is_there && !c->gain_control.is_there))
-        return;
-    if (pf_exposure_judge(&c->exposure, image))
-        set_both(c);
-}
-
-void pf_v4l2_controls_report(const pf_v4l2 *c, pf_telemetry *t)
-{
-    t->has_exposure = c->time_control.is_there && c->time_unit_us > 0;
-    if (t->has_exposure)
-        t->exposure_us = (uint32_t)llround((double)c->exposure.time_now * c->time_unit_us);
-    t->has_gain = c->gain_control.is_there;
-    if (t->has_gain)
-        t->gain = (double)c->exposure.gain_now;
+        (void)set(c, c->gain_control.id, gain);
 }

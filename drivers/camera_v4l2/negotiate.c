@@ -54,9 +54,9 @@ static pf_status query_type(pf_v4l2 *c)
     else if (can & V4L2_CAP_VIDEO_CAPTURE_MPLANE)
         c->type = V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE;
     else
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: does not capture video", c->device);
+        return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: does not capture video", c->device);
     if (!(can & V4L2_CAP_STREAMING))
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: has no streaming buffers", c->device);
+        return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: has no streaming buffers", c->device);
     return PF_OK;
 }
 
@@ -89,7 +89,8 @@ static bool can_make(pf_v4l2 *c, const pf_pixel_format *format, uint32_t width, 
 }
 
 /* Our first format that the camera makes at the size, of those fast enough if there is one. */
-static const pf_pixel_format *choose(pf_v4l2 *c, uint32_t width, uint32_t height, char *has, size_t has_n)
+static const pf_pixel_format *choose(pf_v4l2 *c, const pf_session_wish *wish, uint32_t width, uint32_t height,
+                                     char *has, size_t has_n)
 {
     const pf_pixel_format *listed[ENUMERATED_MAX], *fallback = NULL;
     uint32_t n = 0, known;
@@ -108,10 +109,10 @@ static const pf_pixel_format *choose(pf_v4l2 *c, uint32_t width, uint32_t height
         bool is_listed = false;
         for (uint32_t i = 0; i < n; i++)
             is_listed = is_listed || listed[i] == &ours[k];
-        if (!is_listed || (c->wanted != NULL && c->wanted != &ours[k]) || !can_make(c, &ours[k], width, height))
+        if (!is_listed || (wish->format != NULL && wish->format != &ours[k]) || !can_make(c, &ours[k], width, height))
             continue;
-        double rate = c->frame_rate > 0 ? best_rate(c, ours[k].fourcc, width, height) : 0;
-        if (rate == 0 || rate >= c->frame_rate * RATE_SLACK)
+        double rate = wish->frame_rate > 0 ? best_rate(c, ours[k].fourcc, width, height) : 0;
+        if (rate == 0 || rate >= wish->frame_rate * RATE_SLACK)
             return &ours[k];
         if (fallback == NULL)
             fallback = &ours[k];
@@ -119,73 +120,57 @@ static const pf_pixel_format *choose(pf_v4l2 *c, uint32_t width, uint32_t height
     return fallback;
 }
 
-/* Sets the rate, where the camera lets it be set, and notes what it is. */
-static void set_rate(pf_v4l2 *c)
+/* Sets the rate, where the camera lets it be set; what it is then. */
+static double set_rate(pf_v4l2 *c, double wish)
 {
     struct v4l2_streamparm p = {.type = c->type};
-    if (c->frame_rate > 0) {
-        p.parm.capture.timeperframe = (struct v4l2_fract){1000, (uint32_t)(c->frame_rate * 1000 + 0.5)};
+    const struct v4l2_fract *t = &p.parm.capture.timeperframe;
+    double rate = 0;
+    if (wish > 0) {
+        p.parm.capture.timeperframe = (struct v4l2_fract){1000, (uint32_t)(wish * 1000 + 0.5)};
         (void)c->io.ioctl(c->io.self, c->fd, VIDIOC_S_PARM, &p);
     }
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_G_PARM, &p) == 0 && p.parm.capture.timeperframe.numerator > 0)
-        c->info.frame_rate =
-            (double)p.parm.capture.timeperframe.denominator / (double)p.parm.capture.timeperframe.numerator;
-    else
-        c->info.frame_rate = c->frame_rate;
-    if (!(c->info.frame_rate > 0.01 && c->info.frame_rate < 10000))
-        c->info.frame_rate = c->frame_rate;
+    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_G_PARM, &p) == 0 && t->numerator > 0)
+        rate = (double)t->denominator / (double)t->numerator;
+    return rate > 0.01 && rate < 10000 ? rate : wish;
 }
 
-/* A camera that has come back must give what the tracker was opened for. */
-static pf_status check_size(pf_v4l2 *c, uint32_t width, uint32_t height)
-{
-    if (c->info.width != 0 && (width != c->info.width || height != c->info.height))
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: gives %u x %u now, before it gave %u x %u", c->device,
-                       width, height, c->info.width, c->info.height);
-    if (width < 1 || height < 1 || width > PF_IMAGE_SIZE_MAX || height > PF_IMAGE_SIZE_MAX)
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: frames of %u x %u: must be 1..%u", c->device, width,
-                       height, PF_IMAGE_SIZE_MAX);
-    return PF_OK;
-}
-
-pf_status pf_v4l2_negotiate(pf_v4l2 *c)
+pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_info *info)
 {
     char has[6 * ENUMERATED_MAX];
     pf_status status = query_type(c);
     if (status != PF_OK)
         return status;
     struct v4l2_format f = {.type = c->type};
-    shape s = {0};
-    if (c->width == 0) {
+    uint32_t width = wish->width, height = wish->height;
+    if (width == 0) {
         status = pf_v4l2_call(c, VIDIOC_G_FMT, &f, "has no format yet");
         if (status != PF_OK)
             return status;
-        s = read_shape(c, &f);
+        shape set = read_shape(c, &f);
+        width = set.width;
+        height = set.height;
     }
-    uint32_t width = c->width != 0 ? c->width : s.width, height = c->height != 0 ? c->height : s.height;
-    status = check_size(c, width, height);
-    if (status != PF_OK)
-        return status;
-    const pf_pixel_format *format = choose(c, width, height, has, sizeof has);
+    const pf_pixel_format *format = choose(c, wish, width, height, has, sizeof has);
     if (has[0] == '\0') /* a receiver without a signal, a loopback that nobody writes to */
-        return pf_fail(&c->failure, PF_ERR_AGAIN, "%s: has no format now", c->device);
+        return pf_fail(c->failure, PF_ERR_AGAIN, "%s: has no format now", c->device);
     if (format == NULL)
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: cannot make frames of %u x %u%s%s; it has:%s", c->device,
-                       width, height, c->wanted ? " as " : " in a format that is read",
-                       c->wanted ? c->wanted->name : "", has);
+        return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: cannot make frames of %u x %u%s%s; it has:%s", c->device,
+                       width, height, wish->format ? " as " : " in a format that is read",
+                       wish->format ? wish->format->name : "", has);
     f = make_format(c, format->fourcc, width, height);
     status = pf_v4l2_call(c, VIDIOC_S_FMT, &f, "the format cannot be set");
     if (status != PF_OK)
         return status;
-    s = read_shape(c, &f);
-    uint32_t row = pf_pixel_format_row(format, width);
-    c->stride = s.stride > row ? s.stride : row;
+    shape s = read_shape(c, &f);
     if (s.fourcc != format->fourcc || s.width != width || s.height != height || s.field != V4L2_FIELD_NONE)
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: promised %s %u x %u, set %.4s %u x %u", c->device,
+        return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: promised %s %u x %u, set %.4s %u x %u", c->device,
                        format->name, width, height, (const char *)&s.fourcc, s.width, s.height);
-    c->format = format;
-    c->info.width = width;
-    c->info.height = height;
-    set_rate(c);
+    uint32_t row = pf_pixel_format_row(format, width);
+    info->format = format;
+    info->width = width;
+    info->height = height;
+    info->stride = s.stride > row ? s.stride : row;
+    info->frame_rate = set_rate(c, wish->frame_rate);
     return PF_OK;
 }

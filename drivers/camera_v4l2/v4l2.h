@@ -2,11 +2,7 @@
 #ifndef PIPEFISH_V4L2_H
 #define PIPEFISH_V4L2_H
 
-#include "camera_common/convert.h"
-#include "camera_common/exposure.h"
-#include "camera_common/timing.h"
-#include "common/failure.h"
-#include "pipefish/drivers/camera.h"
+#include "camera_common/session.h"
 
 #include <linux/videodev2.h>
 
@@ -30,86 +26,41 @@ extern const pf_v4l2_io pf_v4l2_kernel;
 pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_camera_config *config, const pf_v4l2_io *io, char *error,
                             size_t n);
 
-#define PF_V4L2_BUFFERS_MIN (PF_CAMERA_HELD_MAX + 1) /* with fewer nothing would be left to fill */
-#define PF_V4L2_BUFFERS_MAX 32u
-#define PF_V4L2_STREAMS     (PF_CAMERA_HELD_MAX + 1) /* a live one, and old ones of which frames are held still */
-
 typedef struct pf_v4l2_buffer {
-    struct pf_v4l2_stream *stream;
     uint8_t *memory;
     size_t size;
     bool is_queued, is_held;
 } pf_v4l2_buffer;
-
-/* The buffers of one opening of the device: their memory outlives it for as long as frames are held. */
-typedef struct pf_v4l2_stream {
-    uint32_t n, held;
-    bool is_live;
-    pf_v4l2_buffer buffer[PF_V4L2_BUFFERS_MAX];
-} pf_v4l2_stream;
-
-/* Grey pixels of a format that has to be converted. */
-typedef struct pf_v4l2_scratch {
-    uint8_t *pixels;
-    bool is_held;
-} pf_v4l2_scratch;
 
 typedef struct pf_v4l2_control {
     bool is_there;
     uint32_t id;
 } pf_v4l2_control;
 
+/* A session (camera_common/session.h) on one device. */
 typedef struct pf_v4l2 {
-    pf_camera_info info;
     pf_v4l2_io io;
-    char *device;
-    const pf_pixel_format *wanted; /* NULL = any */
-    uint32_t width, height;        /* configured; 0 = as the device is set */
-    uint32_t buffers;
-    double frame_rate;
-    pf_exposure_mode mode;
-    uint32_t exposure_us, exposure_max_us;
-    double gain;
-    int fd; /* -1 = not there */
-    bool is_started, is_streaming;
+    const char *device; /* the wish's */
+    int fd;             /* -1 = not open */
+    bool is_streaming;
     uint32_t type; /* V4L2_BUF_TYPE_VIDEO_CAPTURE or its _MPLANE */
-    const pf_pixel_format *format;
-    uint32_t stride;
-    pf_v4l2_stream stream[PF_V4L2_STREAMS], *live;
-    pf_v4l2_scratch scratch[PF_CAMERA_HELD_MAX];
-    uint32_t held;
-    void *turbo;
+    uint32_t n;
+    pf_v4l2_buffer buffer[PF_SESSION_BUFFERS_MAX];
+    pf_v4l2_buffer kept[PF_CAMERA_HELD_MAX]; /* of devices that were closed, our own memory by now */
     pf_v4l2_control time_control, gain_control;
-    double time_unit_us; /* 0 = unknown */
-    pf_exposure exposure;
-    bool has_exposure; /* values were set before: a camera that comes back gets them again */
-    pf_numbering numbering;
-    pf_recovery recovery;
-    uint64_t damaged;
-    uint64_t left_ns; /* when next() returned last */
-    pf_failure failure;
+    bool is_manual;      /* its own automatics have been switched off */
+    pf_failure *failure; /* of the call that is under way */
 } pf_v4l2;
 
 /* ioctl with the device's name in the failure. */
 pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const char *what);
 
-/* negotiate.c: size, format, rate of an open device. Fills format, stride, type and info, or says why not. */
-pf_status pf_v4l2_negotiate(pf_v4l2 *c);
+/* negotiate.c: format, size and rate of an open device. Fills those of *info, or says why not. PF_ERR_AGAIN: it has no
+ * picture to give yet. */
+pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_info *info);
 
-/* controls.c: finds the controls of an open device and sets them as configured. */
-pf_status pf_v4l2_controls_open(pf_v4l2 *c);
-void pf_v4l2_controls_judge(pf_v4l2 *c, const pf_image *image);
-void pf_v4l2_controls_report(const pf_v4l2 *c, pf_telemetry *telemetry);
-
-/* stream.c: the buffers of an open, negotiated device. */
-pf_status pf_v4l2_stream_begin(pf_v4l2 *c);
-pf_status pf_v4l2_stream_restart(pf_v4l2 *c);
-void pf_v4l2_stream_end(pf_v4l2 *c);
-void pf_v4l2_stream_queue(pf_v4l2 *c); /* gives the kernel all buffers that nobody holds */
-void pf_v4l2_stream_release(pf_v4l2 *c, pf_v4l2_buffer *buffer);
-
-/* Takes the oldest filled buffer. PF_OK; PF_ERR_AGAIN (none); PF_ERR_CHECKSUM (one with an error: it is queued again);
- * PF_ERR_CLOSED (unplugged); PF_ERR_IO (the queue has failed). */
-pf_status pf_v4l2_stream_take(pf_v4l2 *c, pf_v4l2_buffer **buffer, struct v4l2_buffer *taken, size_t *n);
+/* controls.c: finds the controls of a negotiated device, and sets them. */
+void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info);
+void pf_v4l2_controls_set(pf_v4l2 *c, int64_t time, int64_t gain);
 
 #endif

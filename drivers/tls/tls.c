@@ -1,5 +1,5 @@
-/* Mutual TLS 1.3 by OpenSSL. One epoll descriptor holds the listener, the guests whose handshake is under way, and the
- * connection: it is what the daemon polls, and it becomes readable for all of them. */
+/* Mutual TLS 1.3 by OpenSSL. One epoll descriptor holds the listener, the guests whose handshake is under way, the host
+ * that has the line, and the visitors that look on: it is what the daemon polls, and it becomes readable for all. */
 #include "common/listener.h"
 #include "tls/gate.h"
 #include "trust/private.h"
@@ -23,6 +23,7 @@
 #define FINGERPRINT_IN_ERROR 16                   /* digits */
 
 typedef struct guest {
+    struct tls *owner;
     int fd; /* -1 = free */
     SSL *ssl;
     bool is_counted; /* among the refused, by its key */
@@ -32,13 +33,14 @@ typedef struct guest {
     pf_role role;
     char name[PF_PEER_NAME_MAX];
     uint32_t events; /* that epoll watches */
+    bool is_new;     /* a visitor whom nobody has taken over yet */
 } guest;
 
 typedef struct tls {
     SSL_CTX *context;
     pf_trust *trust;
     int epoll, listener;
-    guest guests[GUESTS_MAX], host; /* host.fd -1 = nobody */
+    guest guests[GUESTS_MAX], host, visitors[PF_VISITORS_MAX]; /* host.fd -1 = nobody */
     uint64_t silence_ns, heard_ns, recheck_ns;
     pf_gate gate;
     pf_transport_stats stats;
@@ -53,12 +55,12 @@ static uint64_t now_ns(void)
     return (uint64_t)t.tv_sec * 1000000000u + (uint64_t)t.tv_nsec;
 }
 
-static void watch(tls *t, guest *g, uint32_t events)
+static void watch(guest *g, uint32_t events)
 {
     struct epoll_event e = {.events = events};
     if (g->events == events)
         return;
-    if (epoll_ctl(t->epoll, g->events == 0 ? EPOLL_CTL_ADD : EPOLL_CTL_MOD, g->fd, &e) == 0)
+    if (epoll_ctl(g->owner->epoll, g->events == 0 ? EPOLL_CTL_ADD : EPOLL_CTL_MOD, g->fd, &e) == 0)
         g->events = events;
 }
 
@@ -67,8 +69,7 @@ static void drop(guest *g)
     SSL_free(g->ssl);
     if (g->fd >= 0)
         (void)close(g->fd); /* which also ends its watch */
-    memset(g, 0, sizeof *g);
-    g->fd = -1;
+    *g = (guest){.owner = g->owner, .fd = -1};
 }
 
 /* ---- who may come in */
@@ -161,58 +162,78 @@ static pf_status take_guests(tls *t, uint64_t now)
             t->stats.refused_often++;
             continue;
         }
-        *g = (guest){.fd = fd, .ssl = ssl, .deadline_ns = now + HANDSHAKE_NS};
+        *g = (guest){.owner = t, .fd = fd, .ssl = ssl, .deadline_ns = now + HANDSHAKE_NS};
         memcpy(g->address, address, sizeof g->address);
         SSL_set_accept_state(ssl);
         SSL_set_app_data(ssl, g);
-        watch(t, g, EPOLLIN);
+        watch(g, EPOLLIN);
     }
     return PF_OK;
 }
 
 /* Says no more, but lets the peer read what was said: a close with bytes unread would destroy it on the way. */
-static void send_away(tls *t, guest *g, uint64_t now)
+static void send_away(guest *g, uint64_t now)
 {
     (void)shutdown(g->fd, SHUT_WR);
     g->is_leaving = true;
     g->deadline_ns = now + LEAVING_NS;
-    watch(t, g, EPOLLIN);
+    watch(g, EPOLLIN);
 }
 
-static void see_off(tls *t, guest *g, uint64_t now)
+static void see_off(guest *g, uint64_t now)
 {
     uint8_t bytes[4096];
     ssize_t k = recv(g->fd, bytes, sizeof bytes, 0);
     if (k == 0 || (k < 0 && errno != EAGAIN && errno != EINTR) || now >= g->deadline_ns)
         drop(g);
-    (void)t;
 }
 
-/* A guest that has proved its key: it becomes the host, or is told that there is one. */
-static bool welcome(tls *t, guest *g, uint64_t now)
+/* Whether the line is another's: of a host that is heard. One with the same key may be the same program that lost its
+ * way, so it need not be silent for so long: while it is well it is heard every quarter of that time. */
+static bool is_taken(const tls *t, const guest *g, uint64_t now)
 {
-    if (t->host.fd >= 0 && memcmp(t->host.key, g->key, 32) != 0 && now - t->heard_ns < t->silence_ns) {
-        t->stats.refused_busy++;
-        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "%s wanted in while %s is there", g->name, t->host.name);
-        (void)SSL_shutdown(g->ssl);
-        send_away(t, g, now);
-        return false;
-    }
-    drop(&t->host);
-    t->host = *g;
+    bool is_same = memcmp(t->host.key, g->key, 32) == 0;
+    return t->host.fd >= 0 && now - t->heard_ns < (is_same ? t->silence_ns * 3 / 8 : t->silence_ns);
+}
+
+static void seat(guest *place, guest *g)
+{
+    drop(place);
+    *place = *g;
     g->ssl = NULL;
     g->fd = -1;
-    SSL_set_app_data(t->host.ssl, &t->host);
-    t->heard_ns = now;
-    t->stats.sessions++;
-    return true;
+    SSL_set_app_data(place->ssl, place);
+}
+
+/* A guest that has proved its key: it becomes the host, or looks on, or is told that there is no room for it. */
+static bool welcome(tls *t, guest *g, uint64_t now)
+{
+    if (g->role > PF_ROLE_VIEWER && !is_taken(t, g, now)) {
+        seat(&t->host, g);
+        t->heard_ns = now;
+        t->stats.sessions++;
+        return true;
+    }
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++) {
+        if (t->visitors[i].fd >= 0)
+            continue;
+        seat(&t->visitors[i], g);
+        t->visitors[i].is_new = true;
+        t->stats.sessions++;
+        return false;
+    }
+    t->stats.refused_busy++;
+    (void)pf_fail(&t->failure, PF_ERR_CLOSED, "%s wanted to look on, as %u do already", g->name, PF_VISITORS_MAX);
+    (void)SSL_shutdown(g->ssl);
+    send_away(g, now);
+    return false;
 }
 
 /* One step of a handshake. True: it became the host. */
 static bool serve_guest(tls *t, guest *g, uint64_t now)
 {
     if (g->is_leaving) {
-        see_off(t, g, now);
+        see_off(g, now);
         return false;
     }
     ERR_clear_error();
@@ -222,7 +243,7 @@ static bool serve_guest(tls *t, guest *g, uint64_t now)
         return welcome(t, g, now);
     if (why == SSL_ERROR_WANT_READ || why == SSL_ERROR_WANT_WRITE) {
         if (now < g->deadline_ns) {
-            watch(t, g, why == SSL_ERROR_WANT_WRITE ? EPOLLIN | EPOLLOUT : EPOLLIN);
+            watch(g, why == SSL_ERROR_WANT_WRITE ? EPOLLIN | EPOLLOUT : EPOLLIN);
             return false;
         }
         t->stats.refused_late++;
@@ -234,83 +255,92 @@ static bool serve_guest(tls *t, guest *g, uint64_t now)
     }
     ERR_clear_error();
     pf_gate_note_failure(&t->gate, g->address, now);
-    send_away(t, g, now);
+    send_away(g, now);
     return false;
 }
 
-/* ---- the host that is there */
+/* ---- those that are there */
 
-static pf_status hang_up(tls *t, const char *why)
+static pf_status hang_up(guest *g, const char *why)
 {
-    drop(&t->host);
+    tls *t = g->owner;
+    drop(g);
     return pf_fail(&t->failure, PF_ERR_CLOSED, "%s", why);
 }
 
 /* A key that was revoked while its host is there ends the session. So does another role: what it may do is settled when
  * a session begins. */
-static void recheck(tls *t, uint64_t now)
+static void recheck(guest *g)
 {
-    if (t->host.fd < 0 || now < t->recheck_ns)
+    if (g->fd < 0 || pf_trust_role(g->owner->trust, g->key, g->name) == g->role)
+        return;
+    (void)SSL_shutdown(g->ssl);
+    (void)hang_up(g, "the host's role was changed");
+}
+
+static void recheck_all(tls *t, uint64_t now)
+{
+    if (now < t->recheck_ns)
         return;
     t->recheck_ns = now + RECHECK_NS;
-    if (pf_trust_role(t->trust, t->host.key, t->host.name) != t->host.role) {
-        (void)SSL_shutdown(t->host.ssl);
-        (void)hang_up(t, "the host's role was changed");
-    }
+    recheck(&t->host);
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
+        recheck(&t->visitors[i]);
 }
 
 /* Bytes that OpenSSL has already decrypted make no descriptor readable: the watch for room, which there nearly always
  * is, stands for them. */
-static void rewatch(tls *t, bool is_full)
+static void rewatch(guest *g, bool is_full)
 {
-    watch(t, &t->host, is_full || SSL_pending(t->host.ssl) > 0 ? EPOLLIN | EPOLLOUT : EPOLLIN);
+    watch(g, is_full || SSL_pending(g->ssl) > 0 ? EPOLLIN | EPOLLOUT : EPOLLIN);
 }
 
 /* What an SSL_read or SSL_write of `k` came to. True: it may be tried again later. */
-static bool may_go_on(tls *t, int k, bool *is_full)
+static bool may_go_on(guest *g, int k, bool *is_full)
 {
-    int why = SSL_get_error(t->host.ssl, k);
+    int why = SSL_get_error(g->ssl, k);
     *is_full = why == SSL_ERROR_WANT_WRITE;
     return why == SSL_ERROR_WANT_READ || why == SSL_ERROR_WANT_WRITE;
 }
 
 static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *done)
 {
-    tls *t = self;
+    guest *g = self;
     bool is_full = false;
     *done = 0;
-    if (t->host.fd < 0)
+    if (g->fd < 0)
         return PF_ERR_CLOSED;
     if (capacity == 0)
         return PF_OK;
     ERR_clear_error();
-    int k = SSL_read(t->host.ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
+    int k = SSL_read(g->ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
     if (k > 0) {
         *done = (size_t)k;
-        t->heard_ns = now_ns();
-    } else if (!may_go_on(t, k, &is_full)) {
-        return hang_up(t, "the other side closed the connection");
+        if (g == &g->owner->host)
+            g->owner->heard_ns = now_ns();
+    } else if (!may_go_on(g, k, &is_full)) {
+        return hang_up(g, "the other side closed the connection");
     }
-    rewatch(t, is_full);
+    rewatch(g, is_full);
     return PF_OK;
 }
 
 static pf_status tls_write(void *self, const uint8_t *bytes, size_t n, size_t *done)
 {
-    tls *t = self;
+    guest *g = self;
     bool is_full = false;
     *done = 0;
-    if (t->host.fd < 0)
+    if (g->fd < 0)
         return PF_ERR_CLOSED;
     if (n == 0)
         return PF_OK;
     ERR_clear_error();
-    int k = SSL_write(t->host.ssl, bytes, n > 65536 ? 65536 : (int)n);
+    int k = SSL_write(g->ssl, bytes, n > 65536 ? 65536 : (int)n);
     if (k > 0)
         *done = (size_t)k;
-    else if (!may_go_on(t, k, &is_full))
-        return hang_up(t, "the connection broke");
-    rewatch(t, is_full);
+    else if (!may_go_on(g, k, &is_full))
+        return hang_up(g, "the connection broke");
+    rewatch(g, is_full);
     return PF_OK;
 }
 
@@ -318,58 +348,88 @@ static pf_status tls_write(void *self, const uint8_t *bytes, size_t n, size_t *d
 
 static int tls_fd(void *self)
 {
-    tls *t = self;
-    return t->epoll;
+    guest *g = self;
+    return g->owner->epoll;
 }
 
 static pf_status tls_service(void *self, bool *fresh)
 {
-    tls *t = self;
+    guest *g = self;
+    tls *t = g->owner;
     uint64_t now = now_ns();
     *fresh = false;
+    if (g != &t->host)
+        return g->fd >= 0 ? PF_OK : PF_ERR_CLOSED;
     pf_status status = take_guests(t, now);
     for (int i = 0; i < GUESTS_MAX; i++)
         if (t->guests[i].fd >= 0 && serve_guest(t, &t->guests[i], now))
             *fresh = true;
-    recheck(t, now);
+    recheck_all(t, now);
     if (t->host.fd >= 0)
         return PF_OK;
     *fresh = false;
     return status == PF_OK ? PF_ERR_AGAIN : status;
 }
 
+static const pf_transport_ops tls_ops;
+
+static bool tls_visitor(void *self, pf_transport *visitor)
+{
+    guest *g = self;
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++) {
+        guest *v = &g->owner->visitors[i];
+        if (!v->is_new)
+            continue;
+        v->is_new = false;
+        visitor->self = v;
+        visitor->ops = &tls_ops;
+        return true;
+    }
+    return false;
+}
+
 static size_t tls_room(void *self)
 {
-    tls *t = self;
-    return pf_tcp_queue_room(t->host.fd);
+    guest *g = self;
+    return pf_tcp_queue_room(g->fd);
 }
 
 static pf_role tls_peer(void *self, const char **name, const pf_transport_stats **stats)
 {
-    tls *t = self;
-    *stats = &t->stats;
-    *name = t->host.name;
-    return t->host.role;
+    guest *g = self;
+    *stats = &g->owner->stats;
+    *name = g->name;
+    return g->role;
 }
 
 static const char *tls_name(void *self)
 {
-    tls *t = self;
-    return t->name;
+    guest *g = self;
+    return g->owner->name;
 }
 
 static const char *tls_error(void *self)
 {
-    tls *t = self;
-    return t->failure.text;
+    guest *g = self;
+    return g->owner->failure.text;
+}
+
+static void leave(guest *g)
+{
+    if (g->fd >= 0)
+        (void)SSL_shutdown(g->ssl);
+    drop(g);
 }
 
 static void tls_close(void *self)
 {
-    tls *t = self;
-    if (t->host.fd >= 0)
-        (void)SSL_shutdown(t->host.ssl);
-    drop(&t->host);
+    guest *g = self;
+    tls *t = g->owner;
+    leave(g);
+    if (g != &t->host)
+        return;
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
+        leave(&t->visitors[i]);
     for (int i = 0; i < GUESTS_MAX; i++)
         drop(&t->guests[i]);
     if (t->listener >= 0)
@@ -395,26 +455,31 @@ static pf_status open_sockets(tls *t, const pf_tls_config *config)
     return PF_OK;
 }
 
+static const pf_transport_ops tls_ops = {
+    .fd = tls_fd,
+    .service = tls_service,
+    .visitor = tls_visitor,
+    .read = tls_read,
+    .write = tls_write,
+    .room = tls_room,
+    .peer = tls_peer,
+    .name = tls_name,
+    .error = tls_error,
+    .close = tls_close,
+};
+
 pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, char *error, size_t n)
 {
-    static const pf_transport_ops ops = {
-        .fd = tls_fd,
-        .service = tls_service,
-        .read = tls_read,
-        .write = tls_write,
-        .room = tls_room,
-        .peer = tls_peer,
-        .name = tls_name,
-        .error = tls_error,
-        .close = tls_close,
-    };
     pf_failure failure = {""};
     tls *t = calloc(1, sizeof *t);
     if (t == NULL)
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "tls: no memory"), error, n);
-    t->epoll = t->listener = t->host.fd = -1;
+    t->epoll = t->listener = -1;
+    t->host = (guest){.owner = t, .fd = -1};
     for (int i = 0; i < GUESTS_MAX; i++)
-        t->guests[i].fd = -1;
+        t->guests[i] = t->host;
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
+        t->visitors[i] = t->host;
     t->trust = config->trust;
     t->silence_ns = config->silence_ms * UINT64_C(1000000);
     pf_status status = open_sockets(t, config);
@@ -422,10 +487,10 @@ pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, ch
         status = open_context(t);
     if (status != PF_OK) {
         pf_failure_copy(&t->failure, status, error, n);
-        tls_close(t);
+        tls_close(&t->host);
         return status;
     }
-    transport->self = t;
-    transport->ops = &ops;
+    transport->self = &t->host;
+    transport->ops = &tls_ops;
     return PF_OK;
 }

@@ -182,6 +182,16 @@ def run_show(args: argparse.Namespace) -> Result:
     return written, f"{written['file']} ({written['kind']}, {size_text(float(str(written['bytes'])))})"
 
 
+def hosts_text(status: Any) -> str:
+    """Who is connected, as the one who asks sees it."""
+    others = status.visitors - bool(status.looking_on)
+    name = f" ({status.network.peer}, {status.network.role})" if status.network.peer else ""
+    has = f"another host has the device{name}; this one looks on" if status.looking_on else "this one has the device"
+    if status.looking_on and not status.link.up:
+        has = "nobody has the device; this one looks on"
+    return has + (f", {others} more look on" if others else "")
+
+
 def run_status(args: argparse.Namespace) -> Result:
     from google.protobuf.json_format import MessageToDict
 
@@ -209,6 +219,7 @@ def run_status(args: argparse.Namespace) -> Result:
         ("survey", info.survey_id.hex()),
         ("state", status.state),
         ("up for", seconds_text(status.uptime_ns / 1e9)),
+        ("hosts", hosts_text(status)),
         (
             "frames",
             f"{status.frames} at {status.fps:.1f}/s, {status.frames_dropped} dropped",

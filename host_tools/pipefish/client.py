@@ -27,6 +27,12 @@ TOPIC_STATUS, TOPIC_PREVIEW = 0, 1
 
 BACKOFF_S = (0.1, 5.0)  # first and longest pause before the line is opened again
 OUTPUT_CHUNK = 4096  # bytes given to the line at once: about 14 ms at 3 Mbaud; acknowledgements are small
+BUSY_S = 0.5  # pause before a device is asked again that another host has
+BUSY, VIEWER = 1, 2  # Status.looking_on
+LOOKING = {
+    BUSY: "another host is connected to the device",
+    VIEWER: "this host may only look on: its role is viewer",
+}
 IDLE_S = 0.5  # longest sleep: the caller's `until` is looked at this often
 
 
@@ -35,7 +41,12 @@ class NoDevice(PipefishError):
 
 
 class Handlers:
-    """What a client that only asks does with what arrives; override what matters. The device keeps its objects."""
+    """What a client that only asks does with what arrives; override what matters. The device keeps its objects.
+
+    may_look_on   it is of use also while another host has the device, which then refuses all that changes anything
+    """
+
+    may_look_on = True
 
     def on_up(self, event: Any) -> None:
         """The device answers; event.peer_boot_id is its boot id."""
@@ -59,6 +70,7 @@ class Handlers:
 class ObjectHandlers(Handlers, abc.ABC):
     """What a client does that takes the device's objects too: so many at once, so many bytes at most each."""
 
+    may_look_on = False
     receive_slots = 4
     max_object = 8 << 20  # a keyframe of a 20-megapixel camera stays well below
 
@@ -111,6 +123,7 @@ class Client:
         self._retry_ns = 0
         self._backoff_s = BACKOFF_S[0]
         self.down_since_ns = time.monotonic_ns()
+        self._waited_since_ns = self.down_since_ns  # as it was before the device last came up
 
     def open(self) -> None:
         """Opens the line. Raises TransportClosed if that fails now; `run` and `step` then try again."""
@@ -189,6 +202,7 @@ class Client:
     def _serve(self, event: Any) -> None:
         match event.type:
             case x if x == UP:
+                self._waited_since_ns = self.down_since_ns
                 self.up, self.boot = True, event.peer_boot_id
                 self._backoff_s = BACKOFF_S[0]
                 self.handlers.on_up(event)
@@ -235,7 +249,10 @@ class Client:
     def _latest(self, topic: int, data: bytes) -> None:
         try:
             if topic == TOPIC_STATUS:
-                self.handlers.on_status(pb.Status.FromString(data))
+                status = pb.Status.FromString(data)
+                if status.looking_on and not self.handlers.may_look_on:
+                    self._leave(status.looking_on)
+                self.handlers.on_status(status)
             elif topic == TOPIC_PREVIEW:
                 self.handlers.on_preview(pb.Preview.FromString(data))
         except DecodeError:
@@ -268,6 +285,17 @@ class Client:
         if reply.error:
             raise PipefishError(f"the device says: {reply.error}")
         return reply
+
+    def _leave(self, looking: int) -> None:
+        """A device that another host has counts as not there, and is asked again. Raises TransportClosed, or
+        PipefishError where waiting does not help."""
+        why = LOOKING.get(looking, "this host may only look on")
+        if looking != BUSY:
+            raise PipefishError(f"the device on {self.transport.name} says: {why}")
+        self._backoff_s = BUSY_S
+        self._down()
+        self.down_since_ns = self._waited_since_ns
+        raise TransportClosed(f"{self.transport.name}: {why}", reason=why)
 
     def _down(self) -> None:
         if self.up:

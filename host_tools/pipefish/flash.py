@@ -6,7 +6,7 @@ import hashlib
 import time
 
 from pipefish import pipefish_pb2 as pb
-from pipefish.client import Client, Handlers, NoDevice
+from pipefish.client import BUSY, LOOKING, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 
 KIND_PROFILE = 4  # pf_object_kind
@@ -50,6 +50,8 @@ class Flasher:
         """Sends a profile in its binary form; it is stored when this returns, on trial. The device has read it back and
         tested itself with it. A connection that breaks, and a device that restarts, are waited for."""
         self.state()  # a device that keeps no profiles says so
+        if self._client.answer_to(self._timeout_s, get_status=pb.Nothing()).status.looking_on == BUSY:
+            raise PipefishError(f"the device refuses the profile: {LOOKING[BUSY]}")
         name = hashlib.sha256(data).digest()
         self._delivery.stored = None
         self._client.link.send_object(name, KIND_PROFILE, data)

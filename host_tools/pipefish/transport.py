@@ -284,7 +284,11 @@ class TlsTransport(TcpTransport):
         except OSError as error:
             raise self._failed(error) from error
         if not data:
-            why = "the device closed the connection" if self._heard else "another host is connected to the device"
+            why = (
+                "the device closed the connection"
+                if self._heard
+                else "other hosts are connected to the device, as many as it takes"
+            )
             raise TransportClosed(f"{self.name}: {why}", reason=why)
         self._heard = True
         return bytes(data)

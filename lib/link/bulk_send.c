@@ -61,11 +61,6 @@ uint32_t pf_link_free_send_slots(const pf_link *link)
     return n;
 }
 
-void pf_link_hold_objects(pf_link *link, bool is_held)
-{
-    link->is_held = is_held;
-}
-
 static void pop_closed(pf_sender *s)
 {
     while (s->tx_tail != s->tx_next && !flight(s, s->tx_tail)->open)
@@ -138,7 +133,7 @@ static pf_send_slot *next_signal(const pf_link *link, uint64_t *at)
         }
     }
     /* No more than the peer has room for; a peer without slots only talks, and the objects wait for another. */
-    if (oldest_new != NULL && !link->is_held && known < link->session.peer_slots) {
+    if (oldest_new != NULL && known < link->session.peer_slots) {
         best = oldest_new;
         *at = 0;
     }

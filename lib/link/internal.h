@@ -223,7 +223,6 @@ struct pf_link {
     pf_sender sender;
     pf_receiver receiver;
     int32_t credit;          /* bytes of bulk sent since, less those of latest: above zero it is the turn of latest */
-    bool is_held;            /* no object is offered */
     bool delimiter_due;      /* a leading zero ends whatever half frame the peer holds */
     uint32_t in_size;        /* a full buffer is more than any frame has */
     pf_link_event events[4]; /* a frame raises one at most, and input waits until it is taken; DOWN may join it */

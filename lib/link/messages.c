@@ -262,6 +262,8 @@ static void set_status(pipefish_v1_Status *out, const pf_msg_status *in)
     if (in->has_profile)
         out->profile = profile_message(&in->profile);
     set_tracking(&out->tracking, &in->tracking);
+    out->visitors = in->visitors;
+    out->looking_on = in->looking_on;
     out->has_network = in->has_network;
     if (in->has_network)
         out->network = (pipefish_v1_Status_Network){.peer = text(in->network.peer),

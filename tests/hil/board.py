@@ -14,6 +14,7 @@ import subprocess
 import threading
 import time
 import tty
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -236,6 +237,22 @@ class Board:
         self.power_cut()
         assert code == 0, f"QEMU failed with code {code}"
         return time.monotonic() - start
+
+    def bring_newer_libcamera(self) -> bool:
+        """Puts the daemon that was built with libcamera 0.3 on the board, as /mnt/newer/run. False: there is none."""
+        daemon, libraries = PROGRAMS / "tests/hil/pipefishd-newer", CACHE / "libcamera-0.3/usr"
+        if not daemon.exists():
+            warnings.warn("NO LIBCAMERA 0.3: tools/board-image could not get Debian's backports", stacklevel=2)
+            return False
+        folder = self.share / "newer"
+        shutil.copytree(libraries / "lib/aarch64-linux-gnu", folder, symlinks=False)
+        shutil.copytree(libraries / "share/libcamera", folder / "share")
+        shutil.copy(daemon, folder)
+        (folder / "run").write_text(
+            "export LD_LIBRARY_PATH=/mnt/newer LIBCAMERA_IPA_MODULE_PATH=/mnt/newer/libcamera "
+            'LIBCAMERA_IPA_CONFIG_PATH=/mnt/newer/share\nexec /mnt/newer/pipefishd-newer "$@"\n'
+        )
+        return True
 
     def close(self) -> None:
         self.power_cut()

@@ -20,7 +20,7 @@ from crawler import Crawler, Store, find_daemon, wait_for_log, write_recording
 from pipefish import keys
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
-from pipefish.client import Client, Handlers, NoDevice
+from pipefish.client import BUSY, VIEWER, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
 from pipefish.transport import Refused, TlsTransport
@@ -126,6 +126,12 @@ def own_certificate(path: Path, since: str, until: str) -> str:
     return keys.certificate_key(certificate.public_bytes(Encoding.DER))
 
 
+class Watcher(Store):
+    """A host that would take objects, and is content with looking on."""
+
+    may_look_on = True
+
+
 def test_an_operator_takes_the_whole_survey_and_the_device_says_who_he_is(device: Crawler):
     let_in(device, "operator")
     store = Store(device.port, TlsTransport)
@@ -139,7 +145,7 @@ def test_an_operator_takes_the_whole_survey_and_the_device_says_who_he_is(device
 
 def test_a_viewer_sees_the_status_and_can_make_the_device_forget_nothing(device: Crawler):
     let_in(device, "viewer")
-    store = Store(device.port, TlsTransport)
+    store = Watcher(device.port, TlsTransport)
     with store.client() as client:
         client.answer_to(5, get_status=pb.Nothing())
         with pytest.raises(PipefishError, match="role operator"):
@@ -166,7 +172,7 @@ def test_objects_that_an_operator_left_halfway_are_not_offered_to_a_viewer(devic
         client.run(lambda: slow.arrivals, 10)
     viewer = another_user(tmp_path / "viewer", monkeypatch)
     let_in(device, "viewer", viewer, "visitor")
-    store = Store(device.port, TlsTransport)
+    store = Watcher(device.port, TlsTransport)
     with store.client() as client:
         client.answer_to(5, get_status=pb.Nothing())
         end = time.monotonic() + 1
@@ -319,40 +325,123 @@ def test_an_address_that_failed_five_times_waits_while_others_come_in(device: Cr
     client.close()
 
 
-def test_a_second_host_is_told_that_the_line_is_taken_and_the_first_goes_on(device: Crawler, tmp_path, monkeypatch):
-    let_in(device, "operator")
-    first = open_client(device)
-    first.run(lambda: first.up, 5)
+@contextlib.contextmanager
+def serving(*clients: Client):
+    """Serves what the clients hear, in a thread."""
     running = True
 
     def serve() -> None:
         while running:
-            first.step(0.05)
+            for client in clients:
+                client.step(0.05 / len(clients))
 
     thread = threading.Thread(target=serve)
     thread.start()
     try:
-        other = another_user(tmp_path / "other", monkeypatch)
-        let_in(device, "operator", other, "second")
-        second = open_client(device)
-        with pytest.raises(NoDevice, match="another host is connected"):
-            second.run(lambda: second.up, 1.5)
-        second.close()
+        yield
     finally:
         running = False
         thread.join()
-    assert first.up and first.reconnections == 0
-    assert network(device, refused_busy=1)
-    first.close()
+
+
+@contextlib.contextmanager
+def receiving(device: Crawler):
+    """An operator who keeps the line; what he has received."""
+    store = Store(device.port, TlsTransport)
+    with store.client() as client:
+        client.run(lambda: client.up, 5)
+        with serving(client):
+            yield store
+        assert client.up and client.reconnections == 0, "who looks on has disturbed him"
+
+
+def test_others_look_on_while_a_host_receives_and_can_change_nothing(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "operator")
+    with receiving(device) as store:
+        other = another_user(tmp_path / "other", monkeypatch)
+        let_in(device, "calibrator", other, "second")
+        second = open_client(device)
+        reply = second.answer_to(5, get_status=pb.Nothing())
+        assert reply.status.looking_on == BUSY and reply.status.network.peer == "tester"
+        for what in ({"set_lamp": 0.5}, {"stop_survey": pb.Nothing()}, {"revert_profile": pb.Nothing()}):
+            with pytest.raises(PipefishError, match="another host is connected to the device: until it has gone"):
+                second.answer_to(5, **what)
+        second.close()
+        with Flasher(TlsTransport("127.0.0.1", device.port), 5) as flasher:
+            assert not flasher.state().problem
+            with pytest.raises(PipefishError, match="refuses the profile: another host is connected"):
+                flasher.send(b"whatever it is")
+        watcher = Watcher(device.port, TlsTransport)
+        with watcher.client() as client:
+            client.run(lambda: len(watcher.statuses) > 1, 10)
+        assert not watcher.objects
+        taker = Store(device.port, TlsTransport)
+        with pytest.raises(NoDevice, match="another host is connected"), taker.client() as client:
+            client.run(lambda: taker.objects, 1.2)
+    # He has gone: the same host that was told so is served now.
+    with taker.client() as client:
+        client.run(lambda: client.up and taker.statuses, 10)
+    assert len(store.objects) > 5 and network(device)["refused_busy"] == 0
+
+
+def test_the_same_host_looks_on_while_it_receives(device: Crawler, capsys):
+    let_in(device, "operator")
+    with receiving(device):
+        assert main(["status", f"tls://127.0.0.1:{device.port}"]) == 0
+        assert "looks on" in capsys.readouterr().out
+
+
+def test_a_viewer_looks_on_and_an_operator_takes_the_line(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "viewer")
+    viewer = open_client(device)
+    viewer.run(lambda: viewer.up, 5)
+    operator = another_user(tmp_path / "operator", monkeypatch)
+    let_in(device, "operator", operator, "boss")
+    with receiving(device):
+        status = viewer.answer_to(5, get_status=pb.Nothing()).status
+    assert status.network.role == "operator" and status.looking_on == VIEWER
+    viewer.close()
+
+
+def test_more_than_three_who_look_on_are_sent_away_and_harm_nobody(device: Crawler):
+    let_in(device, "operator")
+    with receiving(device):
+        lookers = [open_client(device) for _ in range(3)]
+        with serving(*lookers):
+            network(device, sessions=4)
+            more = open_client(device)
+            with pytest.raises(NoDevice, match="as many as it takes"):
+                more.run(lambda: more.up, 1.2)
+            more.close()
+            assert network(device, refused_busy=1)["sessions"] == 4
+            assert device.status()["link"]["visitors"] == 3 and all(client.up for client in lookers)
+        for client in lookers:
+            client.close()
+    end = time.monotonic() + 5
+    while device.status()["link"]["visitors"]:
+        assert time.monotonic() < end, "the device does not notice that they have gone"
+        time.sleep(0.05)
+
+
+def test_a_revoked_key_ends_looking_on_too(device: Crawler, tmp_path, monkeypatch):
+    let_in(device, "operator")
+    with receiving(device):
+        other = another_user(tmp_path / "other", monkeypatch)
+        let_in(device, "viewer", other, "second")
+        second = open_client(device)
+        second.run(lambda: second.up, 5)
+        let_in(device, "revoked", other, "second")
+        second.run(lambda: not second.up, 5)
+        second.close()
 
 
 def test_a_host_that_lost_its_way_takes_its_own_place_over(device: Crawler):
     let_in(device, "operator")
     lost = open_client(device)
     lost.run(lambda: lost.up, 5)
-    again = open_client(device)  # the device has not noticed yet that the first has gone
-    again.run(lambda: again.up, 5)
-    again.close()
+    again = Store(device.port, TlsTransport)  # the device has not noticed yet that the first has gone
+    with again.client() as client:
+        client.run(lambda: again.objects, 5)
     lost.close()
 
 

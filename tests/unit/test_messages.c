@@ -502,6 +502,8 @@ static void test_largest_status_fits_a_control_message(void)
     s.has_network = true;
     s.network.peer = name + sizeof name - 48; /* as long as a host's name may be */
     s.network.role = "calibrator";
+    s.visitors = 3;
+    s.looking_on = PF_LOOKING_VIEWER;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_reply(&reply, out, sizeof out, &n));
 
     pf_msg_profile_state state = {true, true, s.profile, s.profile, problem, {UINT32_MAX, UINT32_MAX}};

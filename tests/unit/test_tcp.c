@@ -31,7 +31,7 @@ static uint16_t port_of_name(void)
 
 static void open_listener(const char *address)
 {
-    pf_tcp_config config = {address, 0};
+    pf_tcp_config config = {.address = address};
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error), error);
     TEST_ASSERT_TRUE(port_of_name() != 0);
 }
@@ -107,26 +107,94 @@ static void test_connect_disconnect_reconnect(void)
     }
 }
 
-/* Proves: a second client waits, undisturbed, until the first has left; then its bytes are all there. */
-static void test_second_client_waits(void)
+static pf_transport take_visitor(void)
+{
+    pf_transport visitor = {NULL, NULL};
+    bool fresh;
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_FALSE(fresh);
+    TEST_ASSERT_TRUE(line.ops->visitor(line.self, &visitor));
+    TEST_ASSERT_FALSE(line.ops->visitor(line.self, &visitor));
+    return visitor;
+}
+
+static void expect_bytes(const pf_transport *t, const char *bytes)
+{
+    uint8_t got[16];
+    size_t n = 0, k, wanted = strlen(bytes);
+    for (int i = 0; i < 1000 && n < wanted; i++, n += k) {
+        TEST_ASSERT_EQUAL_INT(PF_OK, t->ops->read(t->self, got + n, sizeof got - n, &k));
+        if (k == 0)
+            (void)usleep(1000);
+    }
+    TEST_ASSERT_EQUAL_MEMORY(bytes, got, wanted);
+}
+
+/* Proves: others that come while a client has the line look on, three at most, each with a stream of its own, and the
+ * first is undisturbed; when it has gone the next one has the line, after the first's last bytes. */
+static void test_others_look_on(void)
 {
     uint8_t byte;
     size_t n;
+    bool fresh;
+    pf_transport visitor[3];
+    int client[3];
     open_listener("127.0.0.1");
-    int first = connect_client(), second;
+    int first = connect_client();
     accept_client();
-    second = connect_client();
-    TEST_ASSERT_EQUAL_INT(6, write(second, "second", 6));
+    for (int i = 0; i < 3; i++) {
+        client[i] = connect_client();
+        visitor[i] = take_visitor();
+    }
+    int fourth = connect_client();
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_EQUAL_INT(0, recv(fourth, &byte, 1, 0)); /* sent away */
+    close(fourth);
+    TEST_ASSERT_EQUAL_INT(6, write(client[1], "second", 6));
     TEST_ASSERT_EQUAL_INT(5, write(first, "first", 5));
     expect_read("first");
-    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->read(line.self, &byte, 1, &n));
-    TEST_ASSERT_EQUAL_size_t(0, n);
+    expect_bytes(&visitor[1], "second");
+    TEST_ASSERT_EQUAL_INT(PF_OK, visitor[2].ops->write(visitor[2].self, (const uint8_t *)"x", 1, &n));
+    TEST_ASSERT_EQUAL_INT(1, recv(client[2], &byte, 1, 0));
+    close(client[0]);
+    for (int i = 0; i < 1000 && visitor[0].ops->read(visitor[0].self, &byte, 1, &n) == PF_OK; i++)
+        (void)usleep(1000);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, visitor[0].ops->service(visitor[0].self, &fresh));
+    for (int i = 0; i < 3; i++)
+        visitor[i].ops->close(visitor[i].self);
+
+    TEST_ASSERT_EQUAL_INT(4, write(first, "last", 4));
     close(first);
-    wait_readable();
+    int next = connect_client();
+    (void)usleep(10000);
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_FALSE(fresh);
+    expect_read("last");
     TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, line.ops->read(line.self, &byte, 1, &n));
     accept_client();
-    expect_read("second");
-    close(second);
+    TEST_ASSERT_EQUAL_INT(4, write(next, "next", 4));
+    expect_read("next");
+    close(next);
+    close(client[1]);
+    close(client[2]);
+}
+
+/* Proves: a client that is silent for too long loses the line to the next. */
+static void test_a_silent_client_makes_room(void)
+{
+    pf_tcp_config config = {.address = "127.0.0.1", .silence_ms = 20};
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error));
+    int silent = connect_client();
+    accept_client();
+    (void)usleep(30000);
+    int next = connect_client();
+    accept_client();
+    TEST_ASSERT_EQUAL_INT(4, write(next, "next", 4));
+    expect_read("next");
+    close(next);
+    close(silent);
 }
 
 /* Proves: with a client that does not read, room falls to nothing instead of queueing without end, writing never
@@ -170,14 +238,14 @@ static void test_other_addresses_are_refused(void)
     static const char *const others[] = {"0.0.0.0", "192.168.1.1", "128.0.0.1", "::", "fe80::1", "::ffff:127.0.0.1"};
     static const char *const no_addresses[] = {"", "localhost", "127.0.0", "127.0.0.1:80", NULL};
     for (size_t i = 0; i < sizeof others / sizeof others[0]; i++) {
-        pf_tcp_config config = {others[i], 0};
+        pf_tcp_config config = {.address = others[i]};
         TEST_ASSERT_EQUAL_INT_MESSAGE(PF_ERR_UNSUPPORTED, pf_tcp_listen(&line, &config, error, sizeof error),
                                       others[i]);
         TEST_ASSERT_NOT_NULL(strstr(error, "tls"));
         TEST_ASSERT_NOT_NULL(strstr(error, others[i]));
     }
     for (size_t i = 0; i < sizeof no_addresses / sizeof no_addresses[0]; i++) {
-        pf_tcp_config config = {no_addresses[i], 0};
+        pf_tcp_config config = {.address = no_addresses[i]};
         TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, pf_tcp_listen(&line, &config, error, sizeof error));
     }
     TEST_ASSERT_NULL(line.self);
@@ -188,7 +256,7 @@ static void test_taken_port(void)
 {
     pf_transport second = {NULL, NULL};
     open_listener("127.0.0.1");
-    pf_tcp_config config = {"127.0.0.1", port_of_name()};
+    pf_tcp_config config = {.address = "127.0.0.1", .port = port_of_name()};
     TEST_ASSERT_EQUAL_INT(PF_ERR_IO, pf_tcp_listen(&second, &config, error, sizeof error));
     TEST_ASSERT_NOT_NULL(strstr(error, line.ops->name(line.self)));
     int client = connect_client();
@@ -202,7 +270,7 @@ static void test_taken_port(void)
 /* Proves: IPv6's loopback works, and is named as people write it. */
 static void test_ipv6(void)
 {
-    pf_tcp_config config = {"::1", 0};
+    pf_tcp_config config = {.address = "::1"};
     pf_status status = pf_tcp_listen(&line, &config, error, sizeof error);
     if (status == PF_ERR_IO)
         TEST_IGNORE_MESSAGE("no IPv6 on this machine: not tested");
@@ -222,7 +290,8 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_connect_disconnect_reconnect);
-    RUN_TEST(test_second_client_waits);
+    RUN_TEST(test_others_look_on);
+    RUN_TEST(test_a_silent_client_makes_room);
     RUN_TEST(test_room_bounds_the_queue);
     RUN_TEST(test_other_addresses_are_refused);
     RUN_TEST(test_taken_port);

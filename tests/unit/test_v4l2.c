@@ -19,7 +19,7 @@ typedef struct fake_format {
 /* One camera at /dev/video0. */
 static struct {
     uint64_t now, next_frame, period;
-    bool is_plugged, is_open, is_streaming, is_silent, restart_helps, has_error;
+    bool is_plugged, is_open, is_streaming, is_silent, restart_helps, has_error, is_busy;
     fake_format formats[FORMATS];
     uint32_t n_formats, width, height, fourcc, sequence, n_buffers, restarts;
     bool is_queued[SLOTS], is_done[SLOTS];
@@ -156,6 +156,9 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
             (struct v4l2_fract){(uint32_t)(k.period / MS), 1000};
         return 0;
     case VIDIOC_REQBUFS:
+        errno = EBUSY;
+        if (k.is_busy)
+            return -1;
         k.n_buffers = 6;
         ((struct v4l2_requestbuffers *)argument)->count = k.n_buffers;
         k.base = k.n_maps;
@@ -410,6 +413,19 @@ static void test_a_camera_that_is_not_there_yet_is_waited_for(void)
     release(&frame);
 }
 
+static void test_a_camera_that_another_program_uses_is_waited_for(void)
+{
+    pf_frame frame;
+    k.is_busy = true;
+    start();
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 500, &frame));
+    TEST_ASSERT_NOT_NULL(strstr(camera.ops->error(camera.self), "busy"));
+    TEST_ASSERT_FALSE(k.is_open);
+    k.is_busy = false;
+    frame = next_within(1000);
+    release(&frame);
+}
+
 static void test_a_stall_is_over_within_two_seconds_by_stop_and_start(void)
 {
     pf_camera_stats stats;
@@ -494,15 +510,17 @@ static void test_damaged_frames_are_left_out_with_a_gap(void)
     TEST_ASSERT_EQUAL_UINT64(0, stats.restarts);
 }
 
-/* Every system call from the start of capture on fails once, with each of the errors that drivers give. */
+/* Every system call from opening on fails once, with each of the errors that drivers give. */
 static void test_any_single_call_may_fail_and_frames_still_come(void)
 {
     static const int errors[] = {EIO, EINVAL, EBUSY, ENOMEM, ENODEV, EPIPE};
     for (size_t e = 0; e < sizeof errors / sizeof errors[0]; e++) {
-        for (int at = 1; at < 90; at++) {
+        for (int at = 1; at < 110; at++) {
             pf_frame held = {0}, frame;
             setUp();
+            k.is_plugged = false;
             start();
+            k.is_plugged = true;
             k.calls = 0;
             k.fail_at = at;
             k.fail_with = errors[e];
@@ -536,6 +554,7 @@ int main(void)
     RUN_TEST(test_the_best_format_that_is_fast_enough_is_chosen);
     RUN_TEST(test_what_the_camera_cannot_do_is_said_with_what_it_can);
     RUN_TEST(test_a_camera_that_is_not_there_yet_is_waited_for);
+    RUN_TEST(test_a_camera_that_another_program_uses_is_waited_for);
     RUN_TEST(test_a_stall_is_over_within_two_seconds_by_stop_and_start);
     RUN_TEST(test_a_failed_queue_is_restarted_at_once);
     RUN_TEST(test_held_frames_outlive_an_unplugged_camera);

@@ -149,10 +149,6 @@ pf_status pf_link_send_object(pf_link *link, const uint8_t name[PF_LINK_NAME_SIZ
 pf_status pf_link_cancel_object(pf_link *link, const uint8_t name[PF_LINK_NAME_SIZE]);
 uint32_t pf_link_free_send_slots(const pf_link *link);
 
-/* Offers nothing while it is held: for a peer that may look on, but whose "stored" must not count. To be called before
- * a peer is heard, as after pf_link_reset: what is offered already goes on. */
-void pf_link_hold_objects(pf_link *link, bool is_held);
-
 typedef enum pf_link_answer {
     PF_ANSWER_ACCEPT = 1, /* offer: send it */
     PF_ANSWER_STORED = 2, /* offer or object: I have it durably */

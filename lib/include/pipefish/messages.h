@@ -109,6 +109,13 @@ typedef struct pf_msg_profile {
     uint32_t starts_left;
 } pf_msg_profile;
 
+/* Why a host may only look on. */
+typedef enum pf_msg_looking {
+    PF_LOOKING_NO = 0, /* he has the device */
+    PF_LOOKING_BUSY,   /* another host has it */
+    PF_LOOKING_VIEWER, /* his role is no more */
+} pf_msg_looking;
+
 typedef struct pf_msg_status {
     pf_msg_time time;
     uint8_t survey_id[16];
@@ -130,6 +137,8 @@ typedef struct pf_msg_status {
     pf_msg_tracking tracking;
     bool has_network;
     pf_msg_network network;
+    uint32_t visitors;         /* hosts that look on while another has the device */
+    pf_msg_looking looking_on; /* who gets this */
 } pf_msg_status;
 
 typedef struct pf_msg_survey_end {

@@ -103,8 +103,8 @@ typedef struct pf_replay_config {
 pf_status pf_replay_open(pf_camera_source *source, const pf_replay_config *config, char *error, size_t n);
 
 /* A camera of the kernel's V4L2 (pf_v4l2_open), read where the kernel put the pixels wherever the format has grey
- * bytes. It may be unplugged and come back under the same path (best one of /dev/v4l/by-path); a stream that falls
- * silent is restarted.
+ * bytes and there are buffers enough. It may be unplugged and come back under the same path (best one of
+ * /dev/v4l/by-path); a stream that falls silent is restarted.
  */
 typedef enum pf_exposure_mode {
     PF_EXPOSURE_AUTO = 0, /* ours, for a camera that carries its own lamp, where the camera can be set */
@@ -119,7 +119,8 @@ typedef struct pf_camera_config {
     double frame_rate;      /* 1/s; 0 = as the device is set */
     const char *format; /* GREY, NV12, NM12, NV21, YU12, Y10P, Y12P, Y10, Y12, YUYV, UYVY, RGB3, BGR3, MJPG, JPEG; NULL
                            or "" = the best that the camera has */
-    uint32_t buffers;   /* 4..32; 0 = 6: the held ones, and three that the camera can fill while nobody looks */
+    uint32_t buffers;   /* 2..32; 0 = 6: the held ones, and three that the camera can fill while nobody looks; of fewer
+                           none can be spared, and frames are copied */
     pf_exposure_mode mode;
     uint32_t exposure_us;                       /* FIXED; 0 = as it is */
     double gain;                                /* FIXED, in the camera's units; 0 = as it is */
@@ -127,13 +128,12 @@ typedef struct pf_camera_config {
     uint32_t circle_u, circle_v, circle_radius; /* what AUTO and HOLD look at, pixels; radius 0 = the whole picture */
 } pf_camera_config;
 
-/* On failure *source is untouched and error[n] says what. PF_OK; PF_ERR_IO (absent, in use); PF_ERR_ARGUMENT;
- * PF_ERR_UNSUPPORTED (it has no such size or format: the text lists what it has). */
+/* On failure *source is untouched and error[n] says what. PF_OK; PF_ERR_IO (absent or in use, and no size is given; not
+ * readable); PF_ERR_ARGUMENT; PF_ERR_UNSUPPORTED (it has no such size or format: the text lists what it has). */
 pf_status pf_v4l2_open(pf_camera_source *source, const pf_camera_config *config, char *error, size_t n);
 
 /* A camera of libcamera's, for sensors whose pipeline the kernel alone does not put together. It may be unplugged and
- * come back under the same id. Frames are read where the kernel put them where libcamera gives six buffers; of fewer
- * none could be spared, and they are copied. NM12, Y10P, Y12P and JPEG are V4L2's only; exposure_us and gain are in
+ * come back under the same id. NM12, Y10P, Y12P and JPEG are V4L2's only; exposure_us and gain are in
  * microseconds and as a factor. Results as above; PF_ERR_UNSUPPORTED also where it was built without libcamera. */
 pf_status pf_libcamera_open(pf_camera_source *source, const pf_camera_config *config, char *error, size_t n);
 

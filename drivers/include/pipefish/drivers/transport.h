@@ -5,6 +5,7 @@
 #include "pipefish/base.h"
 
 #define PF_TRANSPORT_RETRY_MS 250u
+#define PF_VISITORS_MAX       3u /* that may look on while another host has the line */
 
 /* What the host at the other end may do; each may also do what those before it may. */
 typedef enum pf_role {
@@ -54,6 +55,11 @@ typedef struct pf_transport_ops {
      * everything, and has no name (""). *stats is NULL where nobody is refused. PF_ROLE_NONE: nobody. */
     pf_role (*peer)(void *self, const char **name, const pf_transport_stats **stats);
 
+    /* Hands over a connection that may only look on, for another host has the line or its role is no more: a transport
+     * of its own, which ends with its close() and must not outlive this one. Its descriptor is this one's; its service
+     * accepts nobody, PF_ERR_CLOSED: it is over. False: nobody new. NULL: a line that has room for one. */
+    bool (*visitor)(void *self, struct pf_transport *visitor);
+
     const char *(*name)(void *self);  /* "serial /dev/ttyS0 3000000", "tcp 127.0.0.1:7447" */
     const char *(*error)(void *self); /* last failure in words */
     void (*close)(void *self);
@@ -70,11 +76,13 @@ typedef struct pf_serial_config {
  * PF_ERR_UNSUPPORTED (not a terminal, or not at this rate). */
 pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config, char *error, size_t n);
 
-/* Listens; one client at a time, the next waits. Nothing is encrypted: only loopback addresses are accepted
- * (pf_tls_listen is for the others). */
+/* Listens; one client has the line, others that come meanwhile look on; the next of them has it when the first has gone
+ * or been silent for `silence_ms`. Nothing is encrypted: only loopback addresses are accepted (pf_tls_listen is for the
+ * others). */
 typedef struct pf_tcp_config {
     const char *address; /* "127.0.0.1", "::1" */
     uint16_t port;       /* 0 = any; name() tells which */
+    uint32_t silence_ms; /* 0 = no limit */
 } pf_tcp_config;
 
 /* On failure *transport is untouched and error[n] says what. PF_OK; PF_ERR_IO (port taken); PF_ERR_ARGUMENT (not a

@@ -1,7 +1,7 @@
-/* A camera of libcamera's: waits for frames, sets the exposure, and brings the camera back when it stalls or is
- * unplugged. What libcamera itself does is in session.cpp. */
+/* The driver of every camera that is not a recording: waits for frames, sets the exposure, and brings the camera back
+ * when it stalls or is unplugged. What the system itself does is its session's affair. */
+#include "camera_common/session.h"
 #include "camera_common/timing.h"
-#include "camera_libcamera/session.h"
 
 #include <math.h>
 #include <stdio.h>
@@ -9,8 +9,9 @@
 #include <string.h>
 #include <turbojpeg.h>
 
-#define DEFAULT_BUFFERS 6u
-#define SPARE_BUFFERS   3u /* left to be filled while all that may be held are; with fewer, frames are copied */
+#define SPARE_BUFFERS 3u /* left to be filled while all that may be held are; with fewer, frames are copied */
+
+#define DEFAULT_BUFFERS (PF_CAMERA_HELD_MAX + SPARE_BUFFERS)
 
 /* A frame that the daemon has: a buffer of the camera's, or a copy. */
 typedef struct held {
@@ -70,18 +71,23 @@ static pf_status begin_exposure(driver *c)
 {
     const pf_session_info *s = &c->session;
     pf_exposure *e = &c->exposure;
+    const bool can_time = s->has_time && s->time_unit_us > 0, is_fixed = c->mode == PF_EXPOSURE_FIXED;
     e->time = s->has_time ? s->time : (pf_exposure_range){1, 1, 1};
     e->gain = s->has_gain ? s->gain : (pf_exposure_range){1, 1, 1};
-    if (s->has_time && c->exposure_max_us > 0 && c->exposure_max_us < e->time.max)
-        e->time.max = c->exposure_max_us > e->time.min ? c->exposure_max_us : e->time.min;
-    if (c->mode == PF_EXPOSURE_FIXED && ((c->exposure_us > 0 && !s->has_time) || (c->gain > 0 && !s->has_gain)))
+    if (can_time && c->exposure_max_us > 0) {
+        int64_t most = (int64_t)((double)c->exposure_max_us / s->time_unit_us);
+        if (most < e->time.max)
+            e->time.max = most > e->time.min ? most : e->time.min;
+    }
+    if (is_fixed && ((c->exposure_us > 0 && !can_time) || (c->gain > 0 && !s->has_gain)))
         return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: has no control for the %s that is to be fixed", s->id,
-                       c->exposure_us > 0 && !s->has_time ? "exposure" : "gain");
+                       c->exposure_us > 0 && !can_time ? "exposure" : "gain");
     if (!c->has_exposure) {
-        bool is_fixed = c->mode == PF_EXPOSURE_FIXED;
-        /* libcamera does not tell what is set: a tenth of the longest exposure is a start that a few steps correct. */
-        int64_t time = is_fixed && c->exposure_us > 0 ? c->exposure_us : e->time.max / 10;
-        int64_t gain = is_fixed && c->gain > 0 ? llround(c->gain * PF_SESSION_GAIN_UNIT) : e->gain.min;
+        int64_t time = s->has_time ? s->time_now : 1, gain = s->has_gain ? s->gain_now : 1;
+        if (is_fixed && c->exposure_us > 0)
+            time = llround((double)c->exposure_us / s->time_unit_us);
+        if (is_fixed && c->gain > 0)
+            gain = llround(c->gain * s->gain_unit);
         e->holds = c->mode == PF_EXPOSURE_HOLD;
         pf_exposure_init(e, time, gain);
         c->has_exposure = true;
@@ -101,8 +107,9 @@ static pf_status check_size(driver *c)
     if (s->width < 1 || s->height < 1 || s->width > PF_IMAGE_SIZE_MAX || s->height > PF_IMAGE_SIZE_MAX)
         return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: frames of %u x %u: must be 1..%u", s->id, s->width,
                        s->height, PF_IMAGE_SIZE_MAX);
-    if (s->buffers < 2) /* one is copied from while the other is filled */
-        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: gives %u buffers; 2 are needed", s->id, s->buffers);
+    if (s->buffers < PF_SESSION_BUFFERS_MIN)
+        return pf_fail(&c->failure, PF_ERR_UNSUPPORTED, "%s: gives %u buffers; %u are needed", s->id, s->buffers,
+                       PF_SESSION_BUFFERS_MIN);
     return PF_OK;
 }
 
@@ -119,8 +126,8 @@ static pf_status attach(driver *c)
         detach(c);
         return status;
     }
-    c->info.width = c->session.width;
-    c->info.height = c->session.height;
+    c->info.width = c->wish.width = c->session.width; /* one that is plugged in again may be set otherwise */
+    c->info.height = c->wish.height = c->session.height;
     c->info.frame_rate = c->session.frame_rate > 0 ? c->session.frame_rate : c->wish.frame_rate;
     if (c->info.frame_rate > 0)
         c->numbering.period_ns = c->recovery.period_ns = (uint64_t)(1e9 / c->info.frame_rate);
@@ -187,11 +194,25 @@ static pf_status copy_frame(driver *c, const pf_session_frame *f, uint8_t *to)
 
 static void report_exposure(const driver *c, const pf_session_frame *f, pf_telemetry *t)
 {
+    const pf_session_info *s = &c->session;
     bool is_set = sets_exposure(c);
-    t->has_exposure = f->exposure_us > 0 || (is_set && c->session.has_time);
-    t->exposure_us = f->exposure_us > 0 ? f->exposure_us : (uint32_t)(t->has_exposure ? c->exposure.time_now : 0);
-    t->has_gain = f->gain > 0 || (is_set && c->session.has_gain);
-    t->gain = f->gain > 0 ? f->gain : t->has_gain ? (double)c->exposure.gain_now / PF_SESSION_GAIN_UNIT : 0;
+    t->has_exposure = f->exposure_us > 0 || (is_set && s->has_time && s->time_unit_us > 0);
+    t->has_gain = f->gain > 0 || (is_set && s->has_gain);
+    t->exposure_us = f->exposure_us;
+    t->gain = f->gain;
+    if (t->has_exposure && f->exposure_us == 0)
+        t->exposure_us = (uint32_t)llround((double)c->exposure.time_now * s->time_unit_us);
+    if (t->has_gain && !(f->gain > 0))
+        t->gain = (double)c->exposure.gain_now / s->gain_unit;
+}
+
+/* The middle of the exposure, as far as the session tells. */
+static uint64_t middle_of(const pf_session_frame *f, const pf_telemetry *t)
+{
+    uint64_t half = t->has_exposure ? (uint64_t)t->exposure_us * 500u : 0;
+    if (f->stamp_ns == 0 || f->is_stamp_first)
+        return f->stamp_ns == 0 ? 0 : f->stamp_ns + half;
+    return f->stamp_ns > half ? f->stamp_ns - half : f->stamp_ns;
 }
 
 /* Makes a frame of a filled buffer. PF_ERR_CHECKSUM: it is damaged, and the camera has it back. */
@@ -218,9 +239,8 @@ static pf_status make_frame(driver *c, const pf_session_frame *f, held *h, pf_fr
     frame->image = h->is_copy ? (pf_image){h->copy, s->width, s->height, s->width}
                               : (pf_image){h->pixels, s->width, s->height, s->stride};
     report_exposure(c, f, &frame->telemetry);
-    uint64_t half = frame->telemetry.has_exposure ? (uint64_t)frame->telemetry.exposure_us * 500u : 0;
-    pf_numbering_take(&c->numbering, f->sequence, f->stamp_ns > half ? f->stamp_ns - half : f->stamp_ns, now_ns(c),
-                      &frame->sequence, &frame->time_ns);
+    pf_numbering_take(&c->numbering, f->sequence, middle_of(f, &frame->telemetry), now_ns(c), &frame->sequence,
+                      &frame->time_ns);
     return PF_OK;
 }
 
@@ -248,11 +268,13 @@ static pf_status wait_for_frame(driver *c, uint64_t end, held *h, pf_frame *fram
                 c->io.set(c->io.self, false, c->exposure.time_now, c->exposure.gain_now);
             return PF_OK;
         }
-        if (status == PF_ERR_CHECKSUM) /* a sign of life */ {
+        if (status == PF_ERR_CHECKSUM) {
             c->damaged++;
-            pf_recovery_frame(&c->recovery, now);
+            pf_recovery_frame(&c->recovery, now); /* damaged, but not silent */
         } else if (status == PF_ERR_CLOSED) {
             pf_recovery_unplug(&c->recovery);
+        } else if (status == PF_ERR_IO) {
+            pf_recovery_error(&c->recovery);
         }
         if (now >= end)
             return PF_ERR_AGAIN;
@@ -348,31 +370,33 @@ static void camera_close(void *self)
 
 static pf_status check(driver *c, const pf_camera_config *config)
 {
+    const char *name = c->info.source;
     if ((config->width == 0) != (config->height == 0))
-        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "libcamera: width and height go together");
-    if (config->buffers > PF_SESSION_BUFFERS_MAX)
-        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "libcamera: %u buffers: must be at most %u", config->buffers,
-                       PF_SESSION_BUFFERS_MAX);
+        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: width and height go together", name);
+    if (config->buffers != 0 && (config->buffers < PF_SESSION_BUFFERS_MIN || config->buffers > PF_SESSION_BUFFERS_MAX))
+        return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: %u buffers: must be %u..%u", name, config->buffers,
+                       PF_SESSION_BUFFERS_MIN, PF_SESSION_BUFFERS_MAX);
     if (config->format != NULL && config->format[0] != '\0') {
         c->wish.format = pf_pixel_format_named(config->format);
         if (c->wish.format == NULL)
-            return pf_fail(&c->failure, PF_ERR_ARGUMENT, "libcamera: format %s is not read", config->format);
+            return pf_fail(&c->failure, PF_ERR_ARGUMENT, "%s: format %s is not read", name, config->format);
     }
     return PF_OK;
 }
 
-static pf_status open_parts(driver *c, const pf_camera_config *config)
+static pf_status open_parts(driver *c, const pf_camera_config *config, const char *kind)
 {
+    const char *device = config->device != NULL ? config->device : "";
+    /* Not the camera's own name: a survey goes on over restarts, whether the camera is there at the start or not. */
+    (void)snprintf(c->info.source, sizeof c->info.source, "%s%s%s", kind, device[0] ? " " : "", device);
     pf_status status = check(c, config);
     if (status != PF_OK)
         return status;
-    c->device = strdup(config->device != NULL ? config->device : "");
+    c->device = strdup(device);
     c->turbo = tjInitDecompress();
     if (c->device == NULL || c->turbo == NULL)
-        return pf_fail(&c->failure, PF_ERR_SPACE, "libcamera: no memory");
+        return pf_fail(&c->failure, PF_ERR_SPACE, "%s: no memory", kind);
     c->wish.device = c->device;
-    /* Not the camera's own name: a survey goes on over restarts, whether the camera is there at the start or not. */
-    (void)snprintf(c->info.source, sizeof c->info.source, "libcamera%s%s", c->device[0] ? " " : "", c->device);
     pf_recovery_init(&c->recovery, 0, now_ns(c));
     pf_numbering_init(&c->numbering, 0);
     status = attach(c);
@@ -386,13 +410,13 @@ static pf_status open_parts(driver *c, const pf_camera_config *config)
     for (uint32_t i = 0; i < PF_CAMERA_HELD_MAX; i++) {
         c->held[i].copy = malloc((size_t)c->info.width * c->info.height);
         if (c->held[i].copy == NULL)
-            return pf_fail(&c->failure, PF_ERR_SPACE, "libcamera: no memory for frames");
+            return pf_fail(&c->failure, PF_ERR_SPACE, "%s: no memory for frames", kind);
     }
     return PF_OK;
 }
 
-pf_status pf_libcamera_open_with(pf_camera_source *source, const pf_camera_config *config, const pf_session_io *io,
-                                 char *error, size_t n)
+pf_status pf_camera_open(pf_camera_source *source, const pf_camera_config *config, const pf_session_io *io,
+                         const char *kind, char *error, size_t n)
 {
     static const pf_camera_source_ops ops = {.info = camera_info,
                                              .start = camera_start,
@@ -406,7 +430,7 @@ pf_status pf_libcamera_open_with(pf_camera_source *source, const pf_camera_confi
     driver *c = calloc(1, sizeof *c);
     if (c == NULL) {
         io->end(io->self);
-        return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "libcamera: no memory"), error, n);
+        return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "%s: no memory", kind), error, n);
     }
     c->io = *io;
     c->wish.width = config->width;
@@ -420,7 +444,7 @@ pf_status pf_libcamera_open_with(pf_camera_source *source, const pf_camera_confi
     c->exposure.circle_u = config->circle_u;
     c->exposure.circle_v = config->circle_v;
     c->exposure.circle_radius = config->circle_radius;
-    pf_status status = open_parts(c, config);
+    pf_status status = open_parts(c, config, kind);
     if (status != PF_OK) {
         pf_failure_copy(&c->failure, status, error, n);
         camera_close(c);
@@ -429,14 +453,4 @@ pf_status pf_libcamera_open_with(pf_camera_source *source, const pf_camera_confi
     source->self = c;
     source->ops = &ops;
     return PF_OK;
-}
-
-pf_status pf_libcamera_open(pf_camera_source *source, const pf_camera_config *config, char *error, size_t n)
-{
-    pf_failure failure = {""};
-    pf_session_io io;
-    pf_status status = pf_session_libcamera(&io, &failure);
-    if (status != PF_OK)
-        return pf_failure_copy(&failure, status, error, n);
-    return pf_libcamera_open_with(source, config, &io, error, n);
 }

@@ -1,9 +1,8 @@
-/* The libcamera driver on a camera made up here. Proves: frames are used where they lie if there are buffers enough and
- * stay whole while they are held, whatever becomes of the camera; a silent, refusing or unplugged camera comes back by
- * itself; numbers show what was lost; exposure reaches its target. Does not prove: that libcamera behaves so
- * (tests/hil). */
-#include "camera_common/timing.h"
-#include "camera_libcamera/session.h"
+/* The driver that V4L2's and libcamera's cameras share, on a session made up here. Proves: frames are used where they
+ * lie if there are buffers enough and stay whole while they are held, whatever becomes of the camera; a silent,
+ * refusing or unplugged camera comes back by itself; numbers show what was lost; exposure reaches its target. Does not
+ * prove: that the systems behave so (test_v4l2.c, tests/hil). */
+#include "camera_common/session.h"
 #include "unity.h"
 
 #include <stdlib.h>
@@ -18,7 +17,7 @@ enum { FREE = 0, QUEUED, FILLED, HELD };
 /* One camera, a frame each period while it is plugged in, started and not silent. */
 static struct {
     uint64_t now, next, period;
-    bool is_plugged, is_open, is_started, is_silent, stays_silent, has_controls, is_over;
+    bool is_plugged, is_open, is_started, is_silent, stays_silent, has_controls, is_stamp_first, is_over;
     uint32_t buffers, sequence, starts, opens;
     int refuse_starts, refuse_opens, damaged; /* so many of the next */
     const char *format;
@@ -63,7 +62,11 @@ static pf_status fake_open(void *self, const pf_session_wish *wish, pf_session_i
                               .has_time = k.has_controls,
                               .has_gain = k.has_controls,
                               .time = {10, 100000, 1},
-                              .gain = {64, 1024, 1}};
+                              .gain = {64, 1024, 1},
+                              .time_now = 1000,
+                              .gain_now = 64,
+                              .time_unit_us = 1,
+                              .gain_unit = 64};
     uint32_t row = pf_pixel_format_row(info->format, W);
     info->stride = row == W ? STRIDE : row;
     memset(k.state, 0, sizeof k.state);
@@ -110,7 +113,7 @@ static void fill(void)
             memset(k.memory[i], level > 255 ? 255 : (int)level, BYTES);
         }
         k.number[i] = number;
-        k.stamp[i] = k.now;
+        k.stamp[i] = k.next;
         k.state[i] = FILLED;
         return;
     }
@@ -138,6 +141,7 @@ static pf_status fake_take(void *self, uint32_t timeout_ms, pf_session_frame *fr
                                         .pixels = k.memory[oldest],
                                         .n = BYTES,
                                         .stamp_ns = k.stamp[oldest],
+                                        .is_stamp_first = k.is_stamp_first,
                                         .is_damaged = k.damaged > 0 && k.damaged--};
             return PF_OK;
         }
@@ -224,7 +228,7 @@ static const pf_session_io session = {.now = fake_now,
 
 static pf_status open_camera(const pf_camera_config *config)
 {
-    return pf_libcamera_open_with(&camera, config, &session, error, sizeof error);
+    return pf_camera_open(&camera, config, &session, "fake", error, sizeof error);
 }
 
 static void open_and_start(const pf_camera_config *config)
@@ -329,10 +333,16 @@ static void test_numbers_and_times(void)
     TEST_ASSERT_TRUE(a.telemetry.gain == 2);
     TEST_ASSERT_EQUAL_INT64(128, k.gain);
     release(&a);
+    k.is_stamp_first = true;
+    k.now = k.next + 5 * MS; /* it comes later than it is stamped */
+    a = next();
+    TEST_ASSERT_EQUAL_UINT64(k.next - k.period + 4 * MS, a.time_ns);
+    release(&a);
+    k.is_stamp_first = false;
     k.sequence += 3;
     k.damaged = 1;
     a = next();
-    TEST_ASSERT_EQUAL_UINT64(5, a.sequence);
+    TEST_ASSERT_EQUAL_UINT64(6, a.sequence);
     TEST_ASSERT_EQUAL_UINT64(1, stats().damaged);
     release(&a);
 }

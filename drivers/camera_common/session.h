@@ -1,7 +1,7 @@
-/* What the libcamera driver needs of libcamera, as pointers to functions: the library is C++ and wants a real camera,
- * the driver's decisions are C and are tested with one made up. All calls come from one thread. */
-#ifndef PIPEFISH_LIBCAMERA_SESSION_H
-#define PIPEFISH_LIBCAMERA_SESSION_H
+/* What the camera driver (camera.c) needs of a system's cameras, as pointers to functions: V4L2 and libcamera offer it,
+ * and so does a camera made up by a test. The driver decides, a session does. All calls come from one thread. */
+#ifndef PIPEFISH_CAMERA_SESSION_H
+#define PIPEFISH_CAMERA_SESSION_H
 
 #include "camera_common/convert.h"
 #include "camera_common/exposure.h"
@@ -11,12 +11,13 @@
 extern "C" {
 #endif
 
+#define PF_SESSION_BUFFERS_MIN 2u /* one is copied from while the other is filled */
 #define PF_SESSION_BUFFERS_MAX 32u
-#define PF_SESSION_GAIN_UNIT   64 /* gains in the ranges below count in 64ths */
 
 typedef struct pf_session_wish {
-    const char *device; /* a part of the camera's id; "" = the first */
-    uint32_t width, height, buffers;
+    const char *device;     /* V4L2: its path; libcamera: a part of the camera's id, "" = the first */
+    uint32_t width, height; /* 0 = as the camera is set */
+    uint32_t buffers;
     double frame_rate;             /* 0 = the camera's own */
     const pf_pixel_format *format; /* NULL = the best it has */
 } pf_session_wish;
@@ -28,14 +29,18 @@ typedef struct pf_session_info {
     double frame_rate; /* 0 = unknown */
     const pf_pixel_format *format;
     bool has_time, has_gain;      /* controls that can be set */
-    pf_exposure_range time, gain; /* microseconds; 64ths */
+    pf_exposure_range time, gain; /* in the control's own units */
+    int64_t time_now, gain_now;   /* as they are set, or a start that a few steps correct */
+    double time_unit_us;          /* microseconds of a unit; 0 = unknown */
+    double gain_unit;             /* what telemetry and settings count as 1, in units */
 } pf_session_info;
 
 typedef struct pf_session_frame {
     uint32_t buffer, sequence;
     uint8_t *pixels;
-    size_t n;          /* bytes filled */
-    uint64_t stamp_ns; /* 0 = none */
+    size_t n;            /* bytes filled */
+    uint64_t stamp_ns;   /* 0 = none */
+    bool is_stamp_first; /* of the start of the exposure; else of its end */
     bool is_damaged;
     uint32_t exposure_us; /* as the frame says; 0 = it does not */
     double gain;          /* likewise */
@@ -53,13 +58,15 @@ typedef struct pf_session_io {
     pf_status (*start)(void *self, pf_failure *failure);
     void (*stop)(void *self);
 
-    /* The oldest filled buffer; it is held from now on. PF_OK; PF_ERR_AGAIN; PF_ERR_CLOSED (unplugged). */
+    /* The oldest filled buffer; it is held from now on. PF_OK; PF_ERR_AGAIN; PF_ERR_CLOSED (unplugged); PF_ERR_IO (the
+     * queue has failed). */
     pf_status (*take)(void *self, uint32_t timeout_ms, pf_session_frame *frame, pf_failure *failure);
 
     /* Gives a held buffer back to be filled. */
     void (*give)(void *self, uint32_t buffer);
 
-    /* Goes with the next frames to be begun. Whatever is not has_ in the info is left alone. */
+    /* Goes with the next frames to be begun. Whatever is not has_ in the info is left alone; is_automatic: the camera
+     * is to do it itself. */
     void (*set)(void *self, bool is_automatic, int64_t time, int64_t gain);
 
     /* Before close(): a held buffer's memory stays, as our own, until it is dropped. */
@@ -70,12 +77,10 @@ typedef struct pf_session_io {
     void (*end)(void *self);   /* frees everything, self included */
 } pf_session_io;
 
-/* libcamera itself. PF_OK, PF_ERR_IO. */
-pf_status pf_session_libcamera(pf_session_io *io, pf_failure *failure);
-
-/* As pf_libcamera_open, on any session; it is the driver's from now on, also when this fails. */
-pf_status pf_libcamera_open_with(pf_camera_source *source, const pf_camera_config *config, const pf_session_io *io,
-                                 char *error, size_t n);
+/* A camera driver on any session, which is the driver's from now on, also when this fails; `kind` ("v4l2") begins its
+ * name. Otherwise as pf_v4l2_open. */
+pf_status pf_camera_open(pf_camera_source *source, const pf_camera_config *config, const pf_session_io *io,
+                         const char *kind, char *error, size_t n);
 
 #ifdef __cplusplus
 }

@@ -1,0 +1,86 @@
+#include "session.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#define READ_MAX 65536u /* bytes taken in one round */
+
+pf_status pf_session_open(pf_session *s, const pf_link_config *config)
+{
+    size_t size = pf_link_workspace_size(config);
+    memset(s, 0, sizeof *s);
+    if (size == 0)
+        return PF_ERR_ARGUMENT;
+    s->workspace = aligned_alloc(16, (size + 15) / 16 * 16);
+    if (s->workspace == NULL)
+        return PF_ERR_SPACE;
+    return pf_link_init(&s->link, config, s->workspace, size);
+}
+
+void pf_session_close(pf_session *s)
+{
+    free(s->workspace);
+    s->workspace = NULL;
+}
+
+void pf_session_events(pf_session *s, pf_session_take *take, void *context, uint64_t now)
+{
+    pf_link_event event;
+    while (pf_link_next_event(s->link, &event))
+        take(context, s, &event, now);
+}
+
+void pf_session_reset(pf_session *s, pf_session_take *take, void *context, uint64_t now)
+{
+    s->has_stream = false;
+    s->out_at = s->out_n = 0;
+    pf_link_reset(s->link, now);
+    pf_session_events(s, take, context, now);
+}
+
+bool pf_session_read(pf_session *s, pf_session_take *take, void *context, uint64_t now)
+{
+    uint8_t bytes[4096];
+    size_t total = 0, n = 0;
+    while (s->has_stream && total < READ_MAX) {
+        size_t at = 0;
+        if (s->transport.ops->read(s->transport.self, bytes, sizeof bytes, &n) != PF_OK)
+            return false;
+        if (n == 0)
+            break;
+        while (at < n) {
+            at += pf_link_input(s->link, bytes + at, n - at, now);
+            pf_session_events(s, take, context, now);
+        }
+        total += n;
+    }
+    (void)pf_link_input(s->link, NULL, 0, now); /* a full line gets no output, and silence must be noticed */
+    pf_session_events(s, take, context, now);
+    return true;
+}
+
+bool pf_session_write(pf_session *s, uint64_t now, bool *is_full)
+{
+    pf_transport *t = &s->transport;
+    *is_full = false;
+    while (s->has_stream) {
+        size_t done = 0;
+        if (s->out_at == s->out_n) {
+            size_t room = t->ops->room(t->self);
+            *is_full = room < PF_LINK_FRAME_MAX;
+            if (*is_full)
+                return true;
+            s->out_at = 0;
+            s->out_n = pf_link_output(s->link, s->out, room < sizeof s->out ? room : sizeof s->out, now);
+            if (s->out_n == 0)
+                return true;
+        }
+        if (t->ops->write(t->self, s->out + s->out_at, s->out_n - s->out_at, &done) != PF_OK)
+            return false;
+        s->out_at += done;
+        *is_full = s->out_at < s->out_n;
+        if (*is_full)
+            return true;
+    }
+    return true;
+}
