@@ -82,7 +82,9 @@ def test_the_extent_is_the_whole_object_hidden_parts_too() -> None:
 
 def with_bare_rim() -> tuple[pf.Recognition, NDArray[np.bool_], NDArray[np.bool_]]:
     """A model whose middle is textured and whose broad rim is bare; a scene, in colours, where it stands before another
-    colour, its place known by the middle only, its lower left corner hidden. Returns what is found, where it is seen, where hidden."""
+    colour, its place known by the middle only, its lower left corner hidden.
+
+    Returns what is found, where it is seen, where it is hidden."""
     image, inside = model_picture("rose")
     middle = np.zeros_like(inside)
     middle[45:-45, 50:-50] = True
