@@ -49,10 +49,15 @@ def run_match(args: argparse.Namespace) -> Result:
         )
     files = write_matches(args.output, one, two, m)
     document = statistics(m) | {"files": files}
+    doubts = {
+        "no seeds": "no region of one picture is found in the other: they may have nothing in common",
+        "no growth": "no seed grew to 200 matches: the pictures may have nothing in common, these may all be wrong",
+    }
     rows: list[tuple[str, object]] = [
         ("matches", f"{len(m)}, {100 * document['share_of_image1']:.1f} % of {args.first}"),
         *([("filtered", f"{grown - len(m)} of {grown} taken away")] if len(m) < grown else []),
         ("status", m.status),
+        *([("doubt", doubts[m.status])] if m.status in doubts else []),
         ("seeds", f"{len(m.seeds)}, {document['seeds_that_grew']} of them grew"),
     ]
     if len(m):
