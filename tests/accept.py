@@ -89,6 +89,11 @@ def check_recon() -> list[Row]:
     return rows_of("accept_recon.py")
 
 
+def check_dense() -> list[Row]:
+    """The wall of a DN400, densely, after the device's program and the reconstruction."""
+    return rows_of("accept_dense.py")
+
+
 def check_link() -> list[Row]:
     """10,000 sessions over bad lines, and a million frames through the daemon."""
     return rows_of("accept_link.py")
@@ -177,6 +182,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "selfcal": check_selfcal,
     "segment": check_segment,
     "recon": check_recon,
+    "dense": check_dense,
     "link_seeds": check_link_seeds,
     "link": check_link,
     "profile_store": check_profile_store,

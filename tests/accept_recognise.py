@@ -15,7 +15,7 @@ import argparse
 import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -33,7 +33,8 @@ REAL = ("004_sugar_box", "006_mustard_bottle")
 
 @dataclass
 class Set:
-    """models: name -> (image, mask) of each view. truth[scene][name]: mask (H,W), or box, of what is there."""
+    """models: name -> (image, mask) of each view. scenes: (H,W) or (H,W,3). truth[scene][name]: mask (H,W), or box, of
+    what is there."""
 
     name: str
     models: dict[str, list[tuple[np.ndarray, np.ndarray]]]
@@ -65,11 +66,16 @@ def real() -> Set:
         views = sorted((DATA / name / "models").glob("*_color.png"))
         models[name] = [(grey(v), grey(v.with_name(v.name.replace("_color", "_mask"))) > 0) for v in views]
         for path in sorted((DATA / name / "test_images").iterdir()):
-            scenes.append(grey(path))
+            scenes.append(np.asarray(Image.open(path).convert("RGB")))
             label = DATA / name / "labels" / path.name.replace("-color.jpg", "-box.txt")
             rows = [line.split() for line in label.read_text().splitlines() if line.strip()]
             truth.append({row[0]: tuple(map(int, row[1:5])) for row in rows if row[0] in REAL})
     return Set("real", models, scenes, truth)
+
+
+def grey_of(scene: np.ndarray) -> np.ndarray:
+    """A scene without its colours, (H,W) of its own type."""
+    return scene if scene.ndim == 2 else np.asarray(Image.fromarray(scene).convert("L"))
 
 
 def sparse(data: Set) -> dict[str, np.ndarray]:
@@ -82,7 +88,7 @@ def sparse(data: Set) -> dict[str, np.ndarray]:
     }
     counts = []
     for scene in data.scenes:
-        there, descriptors = sift.detectAndCompute(scene, None)
+        there, descriptors = sift.detectAndCompute(grey_of(scene), None)
         for views in described.values():
             best = np.zeros(3)
             for own, one in views:
@@ -107,7 +113,7 @@ def sparse(data: Set) -> dict[str, np.ndarray]:
 
 
 def overlap(found: pf.Recognition, truth: np.ndarray | tuple[int, int, int, int]) -> float:
-    """Intersection over union: of masks, or of the boxes around the contours where the truth is a box."""
+    """Intersection over union: of masks, or of the boxes around them where the truth is a box."""
     if isinstance(truth, np.ndarray):
         mask = found.mask(truth.shape)
         return float((mask & truth).sum() / (mask | truth).sum())
@@ -118,6 +124,11 @@ def whole_overlap(found: pf.Recognition, truth: tuple[int, int, int, int], shape
     """The same for the box around the model's outline carried into the scene, as far as it is in the picture."""
     points = np.clip(np.concatenate(found.extent), 0, np.array(shape[::-1]) - 1)
     return boxes_overlap((*points.min(axis=0), *points.max(axis=0)), truth)
+
+
+def matched_overlap(found: pf.Recognition, truth: np.ndarray | tuple[int, int, int, int]) -> float:
+    """The same for what was matched, without its bare surroundings."""
+    return overlap(replace(found, outline=[]), truth)
 
 
 def boxes_overlap(box: tuple[float, ...], truth: tuple[float, ...]) -> float:
@@ -160,8 +171,10 @@ def measure(data: Set, pictures: Path | None) -> list[dict]:
         own = [s for s, (r, _) in zip(shares, right, strict=True) if r.object == name]
         if own:
             print(f"  {name:24} overlap mean {np.mean(own):.2f}, least {np.min(own):.2f}", file=sys.stderr)
+            alone = [matched_overlap(r, truth) for r, truth in right if r.object == name]
+            print(f"  {'':24} of what was matched, mean {np.mean(alone):.2f}", file=sys.stderr)
         if own and data.name == "real":
-            shape = data.scenes[0].shape
+            shape = data.scenes[0].shape[:2]
             whole = [whole_overlap(r, truth, shape) for r, truth in right if r.object == name]
             print(f"  {'':24} of the whole, mean {np.mean(whole):.2f}, least {np.min(whole):.2f}", file=sys.stderr)
     if pictures:
@@ -170,7 +183,7 @@ def measure(data: Set, pictures: Path | None) -> list[dict]:
         Image.fromarray(draw_roc({k: curves[k] for k in shown})).save(pictures / f"{data.name}-roc.png")
         for k, scene in enumerate(data.scenes):
             own = [r for r in found if r.scene == k]
-            value = scene.astype(np.float32) / np.iinfo(scene.dtype).max
+            value = grey_of(scene).astype(np.float32) / np.iinfo(scene.dtype).max
             Image.fromarray(draw_scene(value, own, names)).save(pictures / f"{data.name}-{k + 1:02}.png")
     rival = max(c.auc for name, c in curves.items() if name in theirs)
     auc = curves["grouped quasi-dense matches"].auc

@@ -8,7 +8,7 @@ from typing import Any
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError
 
-FILTERS = ("consistent", "both-ways", "plane", "motion")
+FILTERS = ("consistent", "both-ways", "plane", "motion", "none")
 MODES = ("adaptive", "constant", "translation")  # matching.MODES, whose import costs time here
 
 
@@ -25,8 +25,11 @@ def run_match(args: argparse.Namespace) -> Result:
     cameras = tuple(Camera.load(path) for path in args.profile) if args.profile else None
     if cameras and len(cameras) > 2:
         raise ArgumentError(f"--profile: {len(cameras)} profiles for two pictures")
-    if {"plane", "motion"} <= set(args.filter):
+    filters = set(args.filter or ["consistent"])
+    if {"plane", "motion"} <= filters:
         raise ArgumentError("--filter: plane or motion, not both")
+    if "none" in filters and len(filters) > 1:
+        raise ArgumentError("--filter: none, or others, not both")
     options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}
     m = match_quasi_dense(
         one,
@@ -37,19 +40,24 @@ def run_match(args: argparse.Namespace) -> Result:
         **options,
     )
     grown = len(m)
-    if args.filter:
+    if filters != {"none"}:
         m = filter_matches(
             m,
-            least=30 if "consistent" in args.filter else 0,
-            back=match_back(one, two, m, **options) if "both-ways" in args.filter else None,
-            geometry=next((name for name in args.filter if name in ("plane", "motion")), None),
+            least=None if "consistent" in filters else 0,
+            back=match_back(one, two, m, **options) if "both-ways" in filters else None,
+            geometry=next(iter(filters & {"plane", "motion"}), None),
         )
     files = write_matches(args.output, one, two, m)
     document = statistics(m) | {"files": files}
+    doubts = {
+        "no seeds": "no region of one picture is found in the other: they may have nothing in common",
+        "no growth": "no seed grew to 200 matches: the pictures may have nothing in common, these may all be wrong",
+    }
     rows: list[tuple[str, object]] = [
         ("matches", f"{len(m)}, {100 * document['share_of_image1']:.1f} % of {args.first}"),
-        *([("filtered", f"{grown - len(m)} of {grown} taken away")] if args.filter else []),
+        *([("filtered", f"{grown - len(m)} of {grown} taken away")] if len(m) < grown else []),
         ("status", m.status),
+        *([("doubt", doubts[m.status])] if m.status in doubts else []),
         ("seeds", f"{len(m.seeds)}, {document['seeds_that_grew']} of them grew"),
     ]
     if len(m):
@@ -95,9 +103,8 @@ def add_match(commands: Any) -> None:
         "--filter",
         action="append",
         choices=FILTERS,
-        default=[],
-        help="keep only matches that fit their neighbours (consistent), that the reverse direction confirms "
-        "(both-ways), or that fit the one plane or rigid motion that most agree with (pinhole pictures); may be "
-        "repeated",
+        help="keep only matches that fit their neighbours and are no small islands (consistent), that the reverse "
+        "direction confirms (both-ways), or that fit the one plane or rigid motion that most agree with (pinhole "
+        "pictures); may be repeated; none: all that grew [consistent]",
     )
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

@@ -18,8 +18,8 @@ def run_recognise(args: argparse.Namespace) -> Result:
     from pipefish.recognition import recognise
     from pipefish.recognition_files import (
         pictures_in,
-        read_grey,
         read_models,
+        read_scene,
         read_truth,
         roc_document,
         write_recognitions,
@@ -30,7 +30,7 @@ def run_recognise(args: argparse.Namespace) -> Result:
     scenes = [p.name for p in files]
     if len({p.stem for p in files}) < len(files):
         raise FormatError(args.scenes[0], None, "two scenes have the same name")
-    pictures = [read_grey(p) for p in files]
+    pictures = [read_scene(p) for p in files]
     models = read_models(args.models, args.max_pixels)
     objects = [model.name for model in models]
     present = read_truth(args.truth, scenes, objects) if args.truth else None

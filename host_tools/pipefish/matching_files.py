@@ -19,19 +19,28 @@ COLUMNS = ("x1", "y1", "x2", "y2", "a11", "a12", "a21", "a22", "zncc")
 
 
 def read_pixels(path: str | os.PathLike[str]) -> NDArray[np.generic]:
-    """A picture as (H,W,3) uint8, or (H,W) uint16 where it is that. Raises FormatError, OSError."""
+    """A picture as (H,W,3) uint8; (H,W) uint16 or float32 where it is that. Raises FormatError, OSError."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as opened:
-            deep = opened.mode.startswith("I;16")
-            return np.asarray(opened) if deep else np.asarray(opened.convert("RGB"))
+            if opened.mode.startswith("I;16") or opened.mode == "F":
+                return np.asarray(opened)
+            if opened.mode == "I":  # what some files of 16 bits are read as
+                return _of_16_bits(np.asarray(opened), path)
+            return np.asarray(opened.convert("RGB"))
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
         raise FormatError(path, None, f"not a picture: {error}") from None
     except OSError as error:
         if error.errno is None:  # Pillow's own, for a damaged file
             raise FormatError(path, None, f"not a whole picture: {error}") from None
         raise
+
+
+def _of_16_bits(pixels: NDArray[np.int32], path: str | os.PathLike[str]) -> NDArray[np.uint16]:
+    if pixels.min() < 0 or pixels.max() > 65535:
+        raise FormatError(path, None, f"values of {pixels.min()} to {pixels.max()}: more than 16 bits are not read")
+    return pixels.astype(np.uint16)
 
 
 def read_grey(path: str | os.PathLike[str]) -> NDArray[np.float32]:

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 CELL, CELL_LEAST, CELL_PX, CELL_SHARE = 8, 10, 0.7, 0.6
 NEIGHBOURS = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (1, -1))  # rows, columns; half of them, the others follow
 TRIALS, JUDGED = 300, 800
+ISLAND = 2000
 PX = {"plane": 2.0, "motion": 1.0}
 
 
@@ -246,19 +247,23 @@ def dominant_geometry(m: Matches, kind: str, px: float) -> Geometry | None:
 def filter_matches(
     m: Matches,
     *,
-    least: int = 30,
+    least: int | None = None,
     back: Matches | None = None,
     geometry: str | None = None,
     px: float | None = None,
 ) -> Matches:
     """The matches that stand up to what is asked.
 
-    least      matches that contradict their neighbours, and islands of fewer than so many, are left out; 0: not asked
+    least      matches that contradict their neighbours, and islands of fewer than so many, are left out; 0: not asked.
+               None: as many as a 2000th of the smaller picture's pixels, 30 at least. Wrong seeds grow islands of
+               a few hundred where repeated patterns resemble each other from far aside
     back       matches of the same images the other way round: what they do not confirm is left out
     geometry   "plane" or "motion": what is off the dominant one by more than `px` [2, 1] pixels is left out (all of it
                where there is none); parts of the scene that move or lie otherwise are lost too
 
     Raises ArgumentError."""
+    if least is None:
+        least = max(30, min(np.prod(m.shape1), np.prod(m.shape2)) // ISLAND)
     if least < 0:
         raise ArgumentError(f"least: {least} is negative")
     if least:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from . import _engine
 from .errors import ArgumentError
 from .grouping import group_options
 from .matching import grey
+from .segmentation import planes
 
 THRESHOLD = 0.05
 MAX_PIXELS = 400_000
@@ -104,6 +105,8 @@ class Recognition:
     segments       of the best view, and of others whose score is at least the threshold; best first
     extent         outline of the whole model, (N,2) each, carried into the scene by the affine map that fits the
                    matches of the view that has most of them: where all of the object would be, hidden parts too
+    outline        (N,2) each: what is seen of a present object, its bare parts too: the extent, settled by the
+                   scene's colours and edges. Empty where the object is not present
     seeds, matches of the best view by each: what a decision without growth or without groups would go by
     """
 
@@ -115,31 +118,66 @@ class Recognition:
     view: str
     segments: list[Segment]
     extent: list[Floats]
+    outline: list[Floats]
     seeds: int
     matches: int
 
     def mask(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """(H,W) of the scene: where the object was found."""
-        from PIL import Image, ImageDraw
+        """(H,W) of the scene: where the object is, by its outline; without one, where it was matched."""
+        return _filled(self.outline, shape) if self.outline else self.matched(shape)
 
-        picture = Image.new("1", (shape[1], shape[0]))
-        draw = ImageDraw.Draw(picture)
-        for segment in self.segments:
-            for line in segment.scene_contours:
-                draw.polygon([tuple(p) for p in line], fill=1)
-        return np.asarray(picture)
+    def matched(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """(H,W) of the scene: where the object's surface was matched."""
+        return _filled([line for segment in self.segments for line in segment.scene_contours], shape)
 
     def contours(self, shape: tuple[int, int]) -> list[Floats]:
-        """Outer boundaries of mask(shape), (N,2) each, largest first: what the segments' contours come to together."""
+        """Outer boundaries of mask(shape), (N,2) each, largest first."""
         return _engine.mask_outlines(self.mask(shape).astype(np.uint8))
 
     def box(self) -> tuple[float, float, float, float] | None:
-        """Around the segments' contours: least x and y, largest x and y. None where nothing was found."""
-        points = [line for segment in self.segments for line in segment.scene_contours]
+        """Around the outline, or what was matched: least x and y, largest x and y. None where nothing was found."""
+        points = self.outline or [line for segment in self.segments for line in segment.scene_contours]
         if not points:
             return None
         xy = np.concatenate(points)
         return (*map(float, xy.min(axis=0)), *map(float, xy.max(axis=0)))  # type: ignore[return-value]
+
+
+def _filled(lines: Sequence[Floats], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H,W): inside one of the lines."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.new("1", (shape[1], shape[0]))
+    draw = ImageDraw.Draw(picture)
+    for line in lines:
+        draw.polygon([tuple(p) for p in line], fill=1)
+    return np.asarray(picture)
+
+
+def _outlined(found: list[Recognition], scene: ArrayLike, pool: ThreadPoolExecutor) -> list[Recognition]:
+    """The recognitions of one scene, those that are present with their outlines."""
+    here = [k for k, r in enumerate(found) if r.present]
+    if not here:
+        return found
+    colours = planes(scene, "scene")
+    if all(np.array_equal(colours[0], plane) for plane in colours[1:]):
+        colours = colours[:1]
+    shape = colours.shape[1:]
+    matched = {k: found[k].matched(shape) for k in here}
+
+    def outline(k: int) -> list[Floats]:
+        others = np.zeros(shape, bool)
+        for j in here:
+            if j != k:
+                others |= matched[j]
+        expected = _filled(found[k].extent, shape)
+        marks = (255 * m.astype(np.uint8) for m in (expected, matched[k], others))
+        return _engine.mask_outlines(_engine.silhouette(colours, *marks))
+
+    out = list(found)
+    for k, lines in zip(here, pool.map(outline, here), strict=True):
+        out[k] = replace(found[k], outline=lines)
+    return out
 
 
 def recognise(
@@ -181,10 +219,11 @@ def recognise(
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            start = 0
+            start, combined = 0, []
             for model in models:
-                out.append(_combine(model, index, found[start : start + len(model)], threshold))
+                combined.append(_combine(model, index, found[start : start + len(model)], threshold))
                 start += len(model)
+            out += _outlined(combined, scenes[index], pool)
     return out
 
 
@@ -221,6 +260,7 @@ def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], thresh
         view=model.labels[best],
         segments=segments,
         extent=found[most]["extent"],
+        outline=[],
         seeds=max(f["seeds"] for f in found),
         matches=max(f["matches"] for f in found),
     )

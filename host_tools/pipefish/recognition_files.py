@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from .errors import FormatError
 from .files import write_atomically
-from .matching_files import png, read_grey
+from .matching import grey
+from .matching_files import png, read_grey, read_pixels
 from .recognition import ObjectModel, Recognition
 from .roc_curve import Roc
 
@@ -107,6 +108,16 @@ def read_models(path: str | os.PathLike[str], max_pixels: int) -> list[ObjectMod
     return out
 
 
+def read_scene(path: str | os.PathLike[str]) -> NDArray[np.generic]:
+    """A scene's picture, with its colours, as recognise() takes it. Raises FormatError, OSError."""
+    pixels = read_pixels(path)
+    try:
+        grey(pixels, "picture")
+    except ValueError as error:
+        raise FormatError(path, None, str(error)) from None
+    return pixels
+
+
 def read_truth(path: str | os.PathLike[str], scenes: Sequence[str], objects: Sequence[str]) -> set[tuple[str, str]]:
     """What is present: rows scene,object with that heading. A scene is named as its file, with or without the ending.
 
@@ -157,6 +168,7 @@ def as_document(found: Sequence[Recognition], scenes: Sequence[str]) -> list[dic
             name: getattr(r, name) for name in ("object", "score", "sum_score", "present", "view", "matches", "seeds")
         }
         row["scene"], row["box"], row["extent"] = scenes[r.scene], r.box(), lines(r.extent)
+        row["outline"] = lines(r.outline)
         row["segments"] = [
             {name: getattr(s, name) for name in ("score", "area", "coverage", "correlation", "matches", "view")}
             | {"model_contours": lines(s.model_contours), "scene_contours": lines(s.scene_contours)}

@@ -444,6 +444,30 @@ def test_the_command_writes_matches_pictures_and_statistics(tmp_path: Path, caps
     assert json.loads((out / "statistics.json").read_text())["status"] == "ok"
 
 
+def test_the_command_leaves_out_islands_unless_told_not_to(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The second picture shows the first with a patch of 14 x 14 pixels moved elsewhere."""
+    one, _ = pair(affine(np.eye(2))[1])
+    two = one.copy()
+    two[63:77, 123:137] = one[23:37, 33:47]
+    seeds = tmp_path / "seeds.csv"
+    seeds.write_text("x1,y1,x2,y2\n40,30,130,70\n100,100,100,100\n")
+    for name, image in (("a.png", one), ("b.png", two)):
+        Image.fromarray((255 * image).astype(np.uint8)).save(tmp_path / name)
+    counts = {}
+    for more in ((), ("--filter", "none")):
+        arguments = ["match", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "-o", str(tmp_path / "out")]
+        assert main([*arguments, "--seeds", str(seeds), "--json", *more]) == 0
+        capsys.readouterr()
+        found = np.load(tmp_path / "out/matches.npz")
+        moved = np.abs(found["xy1"] - found["xy2"]).max(axis=1) > 5
+        counts[more] = moved.sum(), (~moved).sum()
+    (island, kept), (with_island, all_of_it) = counts.values()
+    assert island == 0 and with_island > 0
+    assert kept >= 0.95 * all_of_it
+    assert main([*arguments, "--filter", "none", "--filter", "plane"]) == 1
+    assert "--filter: none" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "content", "option", "what"),
     [

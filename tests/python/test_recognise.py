@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -77,6 +78,53 @@ def test_the_extent_is_the_whole_object_hidden_parts_too() -> None:
     there = (corners - np.array(OBJECT) / 2 - 20) @ TURN.T + PLACES["rose"]
     (line,) = r.extent
     assert np.linalg.norm(line[:, None] - there[None], axis=2).min(axis=0).max() < 2.5
+
+
+def with_bare_rim() -> tuple[pf.Recognition, NDArray[np.bool_], NDArray[np.bool_]]:
+    """A model whose middle is textured and whose broad rim is bare; a scene, in colours, where it stands before another
+    colour, its place known by the middle only, its lower left corner hidden.
+
+    Returns what is found, where it is seen, where it is hidden."""
+    image, inside = model_picture("rose")
+    middle = np.zeros_like(inside)
+    middle[45:-45, 50:-50] = True
+    model = np.where(inside & ~middle, 0.6, image).astype(np.float32)
+    xy = grid(W, H)
+    own = (xy - PLACES["rose"]) @ np.linalg.inv(TURN).T + np.array(OBJECT) / 2 + 20
+    at = np.rint(own).astype(int)
+    held = np.clip(at, 0, np.array(inside.shape[::-1]) - 1)
+    whole = inside[held[..., 1], held[..., 0]] & (held == at).all(axis=-1)
+    seen = whole & (xy[..., 1] - xy[..., 0] < 30)
+    textured = seen & ((own >= [50, 45]) & (own < [90, 79])).all(axis=-1)
+    values = np.where(textured, waves(own, SEEDS["rose"]), 0.6)
+    behind = waves(xy, 50)
+    yellow = np.stack([values, 0.9 * values, np.full_like(values, 0.2)], axis=-1)
+    blue = np.stack([0.4 * behind, 0.4 * behind, np.full_like(behind, 0.6)], axis=-1)
+    picture = np.where(seen[..., None], yellow, blue)
+    return pf.recognise([pf.ObjectModel("rose", [(model, inside)])], [picture])[0], seen, whole & ~seen
+
+
+def test_the_outline_is_that_of_what_is_seen_bare_parts_too() -> None:
+    r, seen, hidden = with_bare_rim()
+    assert r.present and iou(r.matched((H, W)), seen) < 0.5
+    assert iou(r.mask((H, W)), seen) >= 0.9
+    assert hidden.sum() > 400 and (r.mask((H, W)) & hidden).sum() < 0.5 * hidden.sum()
+    y, x = np.nonzero(seen)
+    assert np.abs(np.array(r.box()) - [x.min(), y.min(), x.max(), y.max()]).max() < 5
+
+
+def test_what_another_object_covers_is_not_the_ones() -> None:
+    """Both objects present, the thorn's corner over the rose: what was matched of one is in no other's outline."""
+    both, _ = scene("rose")
+    thorn, covers = scene("thorn")
+    rose, over = pf.recognise(models(), [np.where(covers, thorn, both)])
+    assert rose.present and over.present
+    shared = _whole(rose) & over.matched((H, W))
+    assert shared.sum() > 300 and (rose.mask((H, W)) & shared).sum() < 0.1 * shared.sum()
+
+
+def _whole(r: pf.Recognition) -> NDArray[np.bool_]:
+    return replace(r, outline=r.extent).mask((H, W))
 
 
 def test_what_is_outside_the_mask_is_not_learned() -> None:

@@ -1,5 +1,6 @@
 // Motion segmentation for Python: _engine.segment, _engine.segment_expand. pipefish/segmentation.py is what people use.
 #include "segment/segment.hpp"
+#include "segment/silhouette.hpp"
 
 #include "bind/arrays.hpp"
 #include "bind/matches.hpp"
@@ -130,6 +131,26 @@ nb::dict segment_pictures(const Planes &one, const Planes &two, const Rows2 &xy1
     return out;
 }
 
+using Marks = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+Array<uint8_t> silhouette_of(const Planes &planes, const Marks &expected, const Marks &seen, const Marks &others)
+{
+    const size_t rows = planes.shape(1), columns = planes.shape(2);
+    const auto mask = [&](const Marks &given) {
+        if (given.shape(0) != rows || given.shape(1) != columns)
+            throw std::invalid_argument("a mask is not of the picture's size");
+        return pipefish::group::Mask(static_cast<int>(rows), static_cast<int>(columns),
+                                     const_cast<uint8_t *>(given.data())); // not written to
+    };
+    const pipefish::group::Mask one = mask(expected), two = mask(seen), three = mask(others);
+    pipefish::group::Mask found;
+    {
+        const nb::gil_scoped_release release;
+        found = silhouette(planes_of(planes), one, two, three, {});
+    }
+    return to_numpy<uint8_t>(found.data, {rows, columns});
+}
+
 } // namespace
 
 void bind_segment(nb::module_ &m)
@@ -154,4 +175,7 @@ void bind_segment(nb::module_ &m)
           nb::arg("lonely"), nb::arg("alpha"), nb::arg("labels"),
           "Costs (labels,N), edges (E,2) with weights (E,), partners (labels,N), cost of being alone, label to expand "
           "(-1: all, until none gains), labels (N,) -> labels (N,), their energy. For tests.");
+    m.def("silhouette", &silhouette_of, nb::arg("planes"), nb::arg("expected"), nb::arg("seen"), nb::arg("others"),
+          "Planes (C,H,W) of a scene, masks (H,W) of 0 and 255: where an object is expected, was matched, and where "
+          "others were -> mask (H,W) of what is seen of it.");
 }

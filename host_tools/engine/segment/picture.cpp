@@ -13,54 +13,6 @@ namespace
 
 constexpr int kBins = 32; // of a colour channel
 
-// Linear weights of the two bins around a value.
-struct Bins {
-    int low;
-    double share; // of the upper
-
-    explicit Bins(float v)
-    {
-        const double at = std::clamp(static_cast<double>(v) * kBins - 0.5, 0.0, kBins - 1.0);
-        low = std::min(static_cast<int>(at), kBins - 2);
-        share = at - low;
-    }
-};
-
-// Visits the 2 or 8 cells around a pixel's colour with their weights.
-template <typename Visit> void cells(const std::deque<match::ScaleStack> &planes, int x, int y, const Visit &visit)
-{
-    const size_t n = planes.size();
-    std::array<Bins, 3> bins = {Bins(0), Bins(0), Bins(0)};
-    for (size_t c = 0; c < n; c++)
-        bins[c] = Bins(planes[c].image()(y, x));
-    for (size_t k = 0; k < size_t{1} << n; k++) {
-        size_t cell = 0;
-        double weight = 1;
-        for (size_t c = 0; c < n; c++) {
-            const bool up = k >> c & 1;
-            cell = cell * kBins + static_cast<size_t>(bins[c].low + up);
-            weight *= up ? bins[c].share : 1 - bins[c].share;
-        }
-        visit(cell, weight);
-    }
-}
-
-// Smooths a histogram along one channel by a kernel of 1 4 6 4 1, a deviation of one bin.
-void smooth(std::vector<double> &histogram, size_t stride)
-{
-    constexpr double kernel[5] = {1.0 / 16, 4.0 / 16, 6.0 / 16, 4.0 / 16, 1.0 / 16};
-    const std::vector<double> from = histogram;
-    for (size_t cell = 0; cell < from.size(); cell++) {
-        const auto at = static_cast<int>(cell / stride % kBins);
-        double sum = 0;
-        for (int k = 0; k < 5; k++) {
-            const int to = std::clamp(at + k - 2, 0, kBins - 1);
-            sum += kernel[k] * from[cell + static_cast<size_t>(to - at) * stride];
-        }
-        histogram[cell] = sum;
-    }
-}
-
 // How dense a pixel's colour is among those of its surroundings, 16 pixels 3 and 5 away: a flat region explains itself.
 double local_density(const std::deque<match::ScaleStack> &planes, int x, int y)
 {
@@ -92,23 +44,16 @@ Picture::Picture(const std::vector<Image> &planes) : rarity_(planes.at(0).size()
 {
     for (const Image &plane : planes)
         planes_.emplace_back(plane);
-    size_t count = 1;
-    for (size_t c = 0; c < planes.size(); c++)
-        count *= kBins;
-    std::vector<double> histogram(count, 0);
+    Colours colours(planes, kBins);
     for (int y = 0; y < rarity_.rows; y++)
         for (int x = 0; x < rarity_.cols; x++)
-            cells(planes_, x, y, [&](size_t cell, double weight) { histogram[cell] += weight; });
-    for (size_t c = 0, stride = 1; c < planes.size(); c++, stride *= kBins)
-        smooth(histogram, stride);
+            colours.add(x, y, 1);
+    colours.settle();
     // One of a hundred colours may be any, half of the others are as nearby, half as anywhere in the picture.
-    const auto pixels = static_cast<double>(rarity_.total()), cell_count = static_cast<double>(count);
     for (int y = 0; y < rarity_.rows; y++)
         for (int x = 0; x < rarity_.cols; x++) {
-            double density = 0;
-            cells(planes_, x, y, [&](size_t cell, double weight) { density += weight * histogram[cell]; });
-            rarity_(y, x) = static_cast<float>(
-                -std::log(0.01 + 0.495 * (density * cell_count / pixels + local_density(planes_, x, y))));
+            const double density = colours.density(x, y);
+            rarity_(y, x) = static_cast<float>(-std::log(0.01 + 0.495 * (density + local_density(planes_, x, y))));
         }
 }
 
@@ -120,7 +65,15 @@ double Picture::grey(size_t channel) const
 
 void Picture::edges(int first, double cost, std::vector<Problem::Edge> &out) const
 {
-    const int width = rarity_.cols, height = rarity_.rows;
+    std::vector<Image> planes;
+    for (const match::ScaleStack &p : planes_)
+        planes.push_back(p.image());
+    neighbour_edges(planes, first, cost, out);
+}
+
+void neighbour_edges(const std::vector<Image> &planes, int first, double cost, std::vector<Problem::Edge> &out)
+{
+    const int width = planes.at(0).cols, height = planes[0].rows;
     const auto visit = [&](const auto &body) {
         for (int y = 0; y < height; y++)
             for (int x = 0; x < width; x++)
@@ -128,8 +81,8 @@ void Picture::edges(int first, double cost, std::vector<Problem::Edge> &out) con
                     if (x + dx < 0 || x + dx >= width || y + dy >= height)
                         continue;
                     double difference = 0;
-                    for (const match::ScaleStack &p : planes_) {
-                        const double d = p.image()(y, x) - p.image()(y + dy, x + dx);
+                    for (const Image &p : planes) {
+                        const double d = p(y, x) - p(y + dy, x + dx);
                         difference += d * d;
                     }
                     body(first + y * width + x, dy * width + dx, difference, dx != 0 && dy != 0);

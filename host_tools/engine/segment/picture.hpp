@@ -1,7 +1,7 @@
 // A picture made ready for segmentation: its colour planes, how common its colours are, where its edges are.
 #pragma once
 
-#include "match/image.hpp"
+#include "segment/colours.hpp"
 #include "segment/expand.hpp"
 
 #include <deque>
@@ -9,11 +9,13 @@
 namespace pipefish::segment
 {
 
-using match::Image;
-
 // Least deviation of a layer's colours from one picture to the other, of 1: what a smooth field cannot follow is more
 // than a camera's noise.
 inline constexpr double kLeastNoise = 0.02;
+
+// Appends the edges between neighbouring pixels, eight of them; nodes are numbered from `first`. An edge costs `cost`
+// where colours are alike and down to a tenth where they differ.
+void neighbour_edges(const std::vector<Image> &planes, int first, double cost, std::vector<Problem::Edge> &out);
 
 class Picture
 {
@@ -29,8 +31,7 @@ public:
     // explains it by.
     const Image &rarity() const { return rarity_; }
 
-    // Appends the edges between neighbouring pixels, eight of them; nodes are numbered from `first`. An edge costs
-    // `cost` where colours are alike and down to a tenth where they differ.
+    // As neighbour_edges.
     void edges(int first, double cost, std::vector<Problem::Edge> &out) const;
 
 private:

@@ -1,0 +1,122 @@
+"""A simulated DN400 through pipefishd, the emulated cable, `reconstruct` and `dense`, cell by cell beside the truth.
+
+The drive is 0.9 m past a deposit of 3 mm. Poses are the reconstruction's; the map is laid onto the truth by one rigid
+motion, which the camera centres and directions tell, so that the error of scale stays in.
+
+    python tests/accept_dense.py
+
+prints a table, then one JSON list of {name, value, bound, holds}. Pictures stay in build/accept/recon/dn400.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accept_recon import FOLDER
+from accept_recon_video import recorded
+from accept_rows import at_least, at_most, kept, print_rows
+
+from pipefish.cli import main as pipefish
+from pipefish.demo import find_programs, survey_over_the_line
+from pipefish.simulate import Scene
+from pipefish.wall import Wall, read_wall
+
+NAME = "dense-dn400"
+DEPOSIT = {"s": 0.95, "clock": 3.14, "length": 0.06, "extent": 0.3, "height": 0.003}
+SCENE: dict[str, Any] = {
+    "diameter": 0.4,
+    "pieces": [{"length": 2.4}],
+    "deposits": [DEPOSIT],
+    "texture": {"seed": 45},
+    "sensor": {"seed": 45},
+    "motion": {"seed": 45, "frames": 80, "speed": 0.25, "ramp": 0.4},
+    "telemetry": {"seed": 45},
+}
+
+
+def to_scene(wall: Wall, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The rigid motion (3,3), (3,) from the reconstruction's world to the scene's, by the poses of all keyframes."""
+    frames = {k.index: k.message.frame_sequence for k in wall.survey.keyframes}
+    true = np.array([scene.pose(int(frames[int(k)])) for k in wall.keyframe])
+    turns = np.einsum("nji,njk->ik", true[:, :, :3], wall.poses[:, :, :3])
+    u, _, vt = np.linalg.svd(turns)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    there, here = (-np.einsum("nji,nj->ni", p[:, :, :3], p[:, :, 3]) for p in (true, wall.poses))
+    return turn, there.mean(axis=0) - turn @ here.mean(axis=0)
+
+
+def radial_errors(points: np.ndarray, scene: Scene) -> np.ndarray:
+    """(N,) metres from the true wall of a straight pipe, outwards positive."""
+    rings = np.array([[scene.wall(s, phi) for phi in (0.0, np.pi)] for s in (0.2, 2.2)]).mean(axis=1)
+    along = (rings[1] - rings[0]) / np.linalg.norm(rings[1] - rings[0])
+    up = scene.wall(0.2, 0.0) - rings[0]
+    up /= np.linalg.norm(up)
+    off = points - rings[0]
+    s = off @ along
+    across = off - s[:, None] * along
+    phi = np.arctan2(across @ np.cross(along, up), across @ up)
+    side = scene.wall(0.2, np.pi / 2) - rings[0]
+    phi *= np.sign(side @ np.cross(along, up))
+    true = np.array(
+        [np.linalg.norm(scene.wall(a + 0.2, f) - rings[0] - a * along) for a, f in zip(s, phi, strict=True)]
+    )
+    return np.linalg.norm(across, axis=1) - true
+
+
+def figures() -> dict[str, float]:
+    """What came out, lengths in millimetres."""
+    recording = recorded(NAME, SCENE)
+    scene = Scene.from_truth(recording.truth)
+    folder = FOLDER / NAME
+    survey = survey_over_the_line(find_programs(None), recording, folder / "run", True)
+    for command in (
+        ("reconstruct", survey["file"], "-o", folder / "out"),
+        ("dense", folder / "out", "-o", folder / "map", "--scale", "1.5", "--threads", "2"),
+    ):
+        with redirect_stdout(sys.stderr):
+            if pipefish([str(word) for word in command]) != 0:
+                raise SystemExit(f"pipefish {command[0]} failed")
+    turn, shift = to_scene(read_wall(folder / "out"), scene)
+    found = np.load(folder / "map/dense.npz")
+    measured = np.isfinite(found["deviation"])
+    error = radial_errors(found["points"][measured] @ turn.T + shift, scene)
+    sigma = found["sigma"][measured]
+    same_scale = error - np.median(error)
+    return {
+        "cells": float(measured.sum()),
+        "median_mm": 1000 * float(np.median(np.abs(error))),
+        "p95_mm": 1000 * float(np.percentile(np.abs(error), 95)),
+        "without_mean_p95_sigmas": float(np.percentile(np.abs(same_scale) / sigma, 95)),
+        **deposit(folder / "map/dense.json"),
+    }
+
+
+def deposit(path: Path) -> dict[str, float]:
+    """Height in millimetres and in sigmas of the largest region that stands into the pipe."""
+    inwards = [r for r in json.loads(path.read_text())["regions"] if r["kind"] == "inwards"]
+    first = inwards[0] if inwards else {"height": 0.0, "sigma": 1.0}
+    return {"deposit_mm": 1000 * abs(first["height"]), "deposit_sigmas": abs(first["height"]) / first["sigma"]}
+
+
+def main() -> int:
+    """The rows."""
+    f = kept(FOLDER, NAME, figures)
+    print_rows(
+        [
+            at_most("dense.dn400_median_mm", f["median_mm"], 0.8),
+            at_most("dense.dn400_p95_mm", f["p95_mm"], 3.0),
+            at_least("dense.dn400_deposit_sigmas", f["deposit_sigmas"], 3.0),
+            at_least("dense.dn400_cells", f["cells"], 10000),
+        ]
+    )
+    print({k: round(v, 3) for k, v in f.items()}, file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
