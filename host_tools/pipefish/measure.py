@@ -23,6 +23,7 @@ from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
+from pipefish.tube_water import mirrored
 
 T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
@@ -48,7 +49,8 @@ DEFAULT_ATTITUDE_SIGMA = 0.01
 @dataclass
 class Stretch:
     """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
-    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known)."""
+    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known).
+    water: see `tube_water.mirrored`, whose points are not in the tube."""
 
     segment: int
     tube: Tube
@@ -57,6 +59,7 @@ class Stretch:
     sign: int
     d_mean_sigma: float = math.nan
     camera: Any = 0.0
+    water: list[dict[str, Any]] = field(default_factory=list)
 
     def chainage(self, s: Any) -> Any:
         """Along the survey, from s along the tube."""
@@ -397,19 +400,28 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             why = "nothing tells the scale of this stretch, as of others"
             m.stretches.append(Stretch(segment, Tube("no_scale", why, {}), structure.frames[here], 0.0, 1))
             continue
-        tube = fit_tube(
-            structure.points[inside],
-            structure.own_covariance[inside],
-            m.path(segment),
-            nominal=m.nominal if m.scale.unit == "metre" else None,
-            up=m.up,
-            shared=shared_of(structure, segment, m.factors[segment]),
-            threads=threads or 2,
-            progress=lambda f, word, k=segment: tell(0.5 + 0.45 * (k + f) / count, word),
-        )
+        points, water = structure.points[inside], []
+
+        def fit(points: np.ndarray, k: int = segment, inside: np.ndarray = inside) -> Tube:
+            return fit_tube(
+                points,
+                structure.own_covariance[inside],
+                m.path(k),
+                nominal=m.nominal if m.scale.unit == "metre" else None,
+                up=m.up,
+                shared=shared_of(structure, k, m.factors[k]),
+                threads=threads or 2,
+                progress=lambda f, word: tell(0.5 + 0.45 * (k + f) / count, word),
+            )
+
+        tube = fit(points)
+        if tube.status == "ok":
+            wet, water = mirrored(tube, structure.down is not None)
+            if water:
+                tube = fit(np.where(wet[:, None], np.nan, points))
         tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
         origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
-        m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign))
+        m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign, water=water))
 
 
 def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool) -> tuple[float, int]:

@@ -221,6 +221,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                     "chainage_at_start": x.origin,
                     "chainage_sign": x.sign,
                     "summary": x.tube.summary,
+                    "water": x.water,
                 }
                 for x in m.stretches
             ],
@@ -247,7 +248,7 @@ def _colours(deviation: np.ndarray, diameter: float) -> dict[str, np.ndarray]:
 
 def points_ply(m: Measurement) -> bytes:
     """All points with sigma (that of the longest axis of its covariance), track, place on the tube and distance from it
-    (NaN for those of no tube)."""
+    (NaN for those of no tube, and for what water mirrors)."""
     structure, size = m.structure, mean_diameter(m)[0]
     values = {name: np.full(len(structure.points), np.nan) for name in ("chainage", "clock", "distance")}
     for stretch in m.measured:
@@ -255,6 +256,8 @@ def points_ply(m: Measurement) -> bytes:
         place = stretch.tube.project(structure.points[inside])
         values["chainage"][inside] = stretch.chainage(place["s"])
         values["clock"][inside], values["distance"][inside] = place["clock"], place["distance"]
+        for column in values.values():
+            column[np.flatnonzero(inside)[~stretch.tube.points["known"]]] = np.nan
     sigma = np.sqrt(np.maximum(0, np.linalg.eigvalsh(structure.covariance)[:, -1]))
     columns = dict(zip("xyz", structure.points.T, strict=True))
     columns |= {"sigma": sigma, **values}

@@ -11,7 +11,7 @@ import numpy as np
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
 from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
-from pipefish.measured_texts import clock_text
+from pipefish.measured_texts import clock_text, length_text
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
@@ -81,7 +81,7 @@ def remark(m: Measurement) -> None:
         )
     if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
         remarks.append(m.health.text)
-    remarks += _invert_remark(m)
+    remarks += _water_remark(m) + _invert_remark(m)
     if m.camera.covariance is None:
         remarks.append(
             "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
@@ -115,6 +115,19 @@ def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> 
     if m.structure.down is not None and abs(middle - math.pi) < INVERT:
         words += " (the invert: water or sediment?)"
     return words, float(width[k])
+
+
+def _water_remark(m: Measurement) -> list[str]:
+    """Of points that were seen in water or through it."""
+    out = []
+    for stretch in m.measured:
+        for w in stretch.water:
+            start, end = np.sort(stretch.chainage([w["start"], w["end"]]))
+            out.append(
+                f"From {start:.2f} to {end:.2f} water mirrors the wall: {w['points']} points under its surface are no "
+                f"wall and were left out. It stands {length_text(w['depth'], m.scale.unit)} over the invert."
+            )
+    return out
 
 
 def _invert_remark(m: Measurement) -> list[str]:

@@ -266,6 +266,39 @@ def test_an_invert_under_water_is_told_with_its_clock(tmp_path):
         assert hour in (5, 6)
 
 
+def mirrored(drive: Drive, level: float, every: int) -> Drive:
+    """The drive with water so far below the axis, which shows each so-manieth point of the dry wall once more."""
+    image = drive.points[::every] * [1, -1, 1] + [0, 2 * level, 0]
+    image = image[image[:, 1] > level]
+    frame, track, pixels = [drive.tracks.frame], [drive.tracks.track], [drive.tracks.pixels]
+    for number, pose in enumerate(drive.poses):
+        seen = image @ pose[:, :3].T + pose[:, 3]
+        uv, ok = drive.camera.project(seen)
+        theta = np.degrees(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]))
+        here = np.flatnonzero(ok & (theta > 35) & (theta < 89))
+        frame.append(np.full(len(here), number))
+        track.append(len(drive.points) + here)
+        pixels.append(uv[here] + np.random.default_rng(number).normal(0, 0.3, (len(here), 2)))
+    tracks = pf.Tracks(*(np.concatenate(part) for part in (frame, track, pixels)))
+    return dataclasses.replace(drive, tracks=tracks, points=np.concatenate([drive.points, image]))
+
+
+def test_what_water_mirrors_is_no_wall_and_no_lateral(tmp_path):
+    """The images are as rigid as the wall: without knowing them the invert has a lateral, 0.2 m wide."""
+    level = 0.15 * np.cos(np.radians(50))
+    drive = mirrored(tube_drive(21, 1.6, density=900.0, ovality=0.01), level, 4)
+    dry = (drive.points[:, 1] < level)[drive.tracks.track] | (drive.tracks.track >= 900 * 2.4)
+    survey = survey_of(drive, tmp_path / "a.mcap", keep=dry, attitude=True)
+    assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = document_of(tmp_path / "out")
+    assert not document["events"] and document["summary"]["d_mean"] == pytest.approx(0.3, rel=0.01)
+    (water,) = document["tubes"][0]["water"]
+    assert water["depth"] == pytest.approx(0.15 - level, abs=0.003) and water["points"] > 100
+    assert any("water mirrors the wall" in r for r in document["remarks"])
+    distance = read_columns(tmp_path / "out" / "points.ply")["distance"]
+    assert np.isnan(distance).sum() >= water["points"] and (distance > 0.01).sum() < 0.05 * water["points"]
+
+
 def test_a_survey_driven_backwards_is_measured_and_says_so(drive, tmp_path):
     backwards = np.arange(len(drive.poses))[::-1]
     survey = survey_of(drive, tmp_path / "a.mcap", frames=backwards)
