@@ -43,6 +43,7 @@ TRACK_FLOOR_PX = 0.5
 # Even so tracks agree on small things that are not so: with the right profile the drift that they showed in two drawn
 # drives round bends had a chi-square of 9 and 38 for 5 degrees of freedom, with a central profile of the second 55.
 TRACK_COMMON = 3.0
+STOOD = 10  # frames in which less than a centimetre was driven
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
 
@@ -248,9 +249,7 @@ def measure(
     if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
     if len(survey.keyframes) < 3:
-        raise PipefishError(
-            f"{survey.path}: {len(survey.keyframes)} keyframes; three are the least that can be measured"
-        )
+        raise PipefishError(f"{survey.path}: {_too_short(survey)}; three are the least that can be measured")
     camera = camera_of(survey, camera)
     remarks: list[str] = []
     chainage, quality = _encoder(survey, remarks)
@@ -329,11 +328,28 @@ def measure(
     return m
 
 
-def _why(survey: Survey, structure: Reconstruction) -> str:
-    """Why there is no structure, with what the device said about the scene."""
+def _states(survey: Survey) -> str:
+    """What the device said about the scene."""
     states = survey.info["states"]
     seen = ", ".join(f"{state} at {count} of {len(survey.keyframes)} keyframes" for state, count in states.items())
-    seen = f"; the device said: {seen}" if seen else ""
+    return f"; the device said: {seen}" if seen else ""
+
+
+def _too_short(survey: Survey) -> str:
+    """What a survey of too few keyframes has."""
+    info, count = survey.info, len(survey.keyframes)
+    words = f"{count} keyframe{'' if count == 1 else 's'}"
+    if info["frames"]:
+        words += f" of {info['frames']} frames"
+    if info["length_m"] is not None:
+        stood = " (the camera stood still?)" if (info["frames"] or 0) >= STOOD and info["length_m"] < 0.01 else ""
+        words += f", {info['length_m']:.2f} m driven{stood}"
+    return words + _states(survey)
+
+
+def _why(survey: Survey, structure: Reconstruction) -> str:
+    """Why there is no structure, with what the device said about the scene."""
+    seen = _states(survey)
     if not survey.info["tracks"]["observations"]:
         return f"no keyframe has tracks: a black or covered picture?{seen}"
     return structure.reason + seen

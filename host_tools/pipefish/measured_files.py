@@ -21,6 +21,7 @@ from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
+from pipefish.tube_findings import COLUMNS
 
 RING = 72  # vertices of tube.ply around the pipe
 COLMAP_THETA = math.radians(89)  # its functions divide by z
@@ -78,7 +79,7 @@ def events(m: Measurement) -> list[dict[str, Any]]:
 
 
 def _events_csv(rows: list[dict[str, Any]]) -> bytes:
-    names = list(dict.fromkeys(["kind", "chainage", *(name for row in rows for name in row)]))
+    names = ["kind", "chainage", "stretch", *COLUMNS[1:], "reason", "detail"]
     return csv_bytes({name: [row.get(name) for row in rows] for name in names})
 
 

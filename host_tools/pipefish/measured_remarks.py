@@ -22,6 +22,9 @@ BIN_LEAST = 100  # observations, for a bin to be judged
 INVERT = math.radians(45)  # from six o'clock
 GAP_TOLD = math.radians(60)  # without points, at GAP_SHARE of a stretch's stations: worth a remark
 GAP_SHARE = 0.2
+LINE_SIGMAS, LINE_OFF = 5.0, 0.25  # beyond both a stated line time is doubted: swaying between keyframes biases it
+NOMINAL_OFF = 0.1  # pipes are up to 7 % off the diameter that they are named by
+TURNED = 0.25  # diameters that the camera must go back
 SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 
 
@@ -63,6 +66,7 @@ def remark(m: Measurement) -> None:
             f"The scale is the given diameter of {1000 * mean_diameter(m)[0]:.1f} mm. So the mean diameter was not "
             "measured; its changes along the pipe, ovality and angles were."
         )
+    remarks += _nominal_remark(m)
     worst = m.residuals.spread
     if worst > SIGMA_MOST:
         remarks.append(
@@ -88,6 +92,8 @@ def remark(m: Measurement) -> None:
         )
     if m.structure.down is None:
         remarks.append("No inclinometer: the clock is relative to the first keyframe.")
+    remarks += _shutter_remark(m)
+    remarks += _turned_remark(m)
     if m.backwards:
         remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
     for b in m.survey.breaks:
@@ -115,6 +121,57 @@ def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> 
     if m.structure.down is not None and abs(middle - math.pi) < INVERT:
         words += " (the invert: water or sediment?)"
     return words, float(width[k])
+
+
+def _nominal_remark(m: Measurement) -> list[str]:
+    """Of a diameter that no pipe of that name has: not a check of a few per cent, which nominal diameters are off."""
+    if not m.nominal or m.scale.unit != "metre" or m.scale.diameter_from_prior:
+        return []
+    value, off = mean_diameter(m)[0], mean_diameter(m)[0] / m.nominal - 1
+    if abs(off) < NOMINAL_OFF:
+        return []
+    return [
+        f"The mean diameter of {1000 * value:.0f} mm is {100 * abs(off):.0f} % {'over' if off > 0 else 'under'} the "
+        f"nominal {1000 * m.nominal:.0f} mm: a wrong camera profile, a wrong scale of {m.scale.source}, or another "
+        "pipe than was said?"
+    ]
+
+
+def _shutter_remark(m: Measurement) -> list[str]:
+    """Of rows that say another time than was stated."""
+    shutter, told = m.structure.shutter, m.structure.line_time
+    if shutter is None or told is None:
+        return []
+    stated, (value, sigma) = 1e6 * shutter.line_time, (1e6 * told[0], 1e6 * told[1])
+    if abs(value - stated) < max(LINE_SIGMAS * sigma, LINE_OFF * abs(stated)):
+        return []
+    why = ": is its sign wrong?" if abs(value + stated) < max(LINE_SIGMAS * sigma, LINE_OFF * abs(stated)) else ""
+    return [
+        f"The rolling shutter is stated as {stated:.1f} us a row (camera.line_time_us, --line-time), but the survey's "
+        f"own rows say {value:.1f} +- {1.96 * sigma:.1f} (95 %){why}"
+        + ("" if why else ": bends, clocks and ovality may be off.")
+    ]
+
+
+def _turned_remark(m: Measurement) -> list[str]:
+    """Of a drive that passes wall a second time. By the path: not all encoders count backwards."""
+    back, size = 0.0, mean_diameter(m)[0]
+    for segment in range(len(m.structure.sigma)):
+        steps = np.diff(m.structure.centres[m.structure.segment == segment], axis=0)
+        steps = steps[np.linalg.norm(steps, axis=1) > 1e-3 * size]
+        if not len(steps):
+            continue
+        turns = np.einsum("ni,ni->n", steps[1:], steps[:-1]) < 0
+        way = np.cumprod(np.append(1.0, np.where(turns, -1.0, 1.0)))
+        driven = np.append(0.0, np.cumsum(way * np.linalg.norm(steps, axis=1)))
+        driven *= 1.0 if driven[-1] >= 0 else -1.0
+        back = max(back, float((np.maximum.accumulate(driven) - driven).max()))
+    if back < TURNED * size:
+        return []
+    return [
+        f"The camera turned round and drove back by up to {length_text(back, m.scale.unit, metres=True)}: what it "
+        "passed twice was measured as new wall each time, and both count."
+    ]
 
 
 def _water_remark(m: Measurement) -> list[str]:
