@@ -206,6 +206,21 @@ def _invert_remark(m: Measurement) -> list[str]:
     return out
 
 
+def _bare_between(m: Measurement, start: float, end: float) -> tuple[float, float]:
+    """The wall that stretches leave between two keyframes: a camera sees it ahead of where it is."""
+    low, high = min(start, end), max(start, end)
+    before, after, reach = [], [], mean_diameter(m)[0]  # further off lies what other gaps are told of
+    for stretch in m.measured:
+        table = stretch.tube.stations
+        seen = stretch.chainage(table["s"][table["status"] == "ok"])
+        if len(seen) and seen.min() <= low < seen.max() + reach:
+            before.append(float(seen.max()))
+        elif len(seen) and seen.min() - reach < high <= seen.max():
+            after.append(float(seen.min()))
+    low, high = max(before, default=low), min(after, default=high)
+    return min(low, high), high
+
+
 def not_measured(m: Measurement) -> list[dict[str, Any]]:
     """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
     rows = []
@@ -218,14 +233,11 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
         return float(value) if math.isfinite(value) else None
 
     for gap in m.structure.gaps:
-        rows.append(
-            {
-                "start": at(along[gap.first]),
-                "end": at(along[gap.last]),
-                "reason": gap.reason,
-                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
-            }
-        )
+        start, end = _bare_between(m, along[gap.first], along[gap.last])
+        detail = f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}"
+        if start == end:
+            detail += "; the wall there was seen all the same"
+        rows.append({"start": at(start), "end": at(end), "reason": gap.reason, "detail": detail})
     for stretch in m.stretches:
         if stretch.tube.status != "ok":
             ends = along[stretch.frames[[0, -1]]]

@@ -249,6 +249,9 @@ def test_a_stretch_without_texture_is_left_blank_and_the_rest_is_measured(tmp_pa
     chainage = np.array(document["stations"]["chainage"])
     assert chainage[second].max() == pytest.approx(4.4, abs=0.3)
     assert chainage[second].min() > chainage[first].max() - 0.6
+    # What is said to be missing is what the stations leave, not where the camera had no pose.
+    assert gap["start"] == pytest.approx(min(chainage[first].max(), chainage[second].min()), abs=1e-6)
+    assert gap["end"] == pytest.approx(chainage[second].min(), abs=1e-6)
 
 
 def test_an_invert_under_water_is_told_with_its_clock(tmp_path):
