@@ -4,6 +4,7 @@ table       covariances of points and cameras against section medians that an in
 drives      20 simulated drives of 30 m through a DN300: keyframes every 5 cm, tracks with 0.3 px noise, a camera of 180
             degrees, with an encoder (0.5 mm a step) and without: errors beside their posterior, per section of 0.75 D
 tubes       the same drives through `fit_tube`: diameters and ovality of its stations
+draws       200 draws of noise on one drive of 1 m: scatter of points, rings, lengths, poses beside their posterior
 two_view    400 pairs of views in a tube, errors beside the bound of Cramer and Rao
 long        time and memory of 300 m against 30 m
 video       three pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
@@ -254,6 +255,66 @@ def check_tubes() -> list[dict[str, Any]]:
     ]
 
 
+def draw_figures(draw: int, drive: Drive) -> dict[str, Any]:
+    """One draw of noise, in the gauge of the reconstruction (first pose, distance to the last), where the truth is
+    known: squared errors and variances of points, radii of three rings and lengths between them, and of a pose in the
+    middle e^T C^-1 e."""
+    t, random = drive.tracks, np.random.default_rng(draw)
+    noisy = pf.Tracks(t.frame, t.track, t.pixels + random.normal(0, 0.3, t.pixels.shape))
+    rec = pf.reconstruct(noisy, drive.camera)
+    r = drive.poses[0, :, :3]
+    length = np.linalg.norm(drive.centres[-1] - drive.centres[0])
+    wall = (drive.points[rec.track] - drive.centres[0]) @ r.T / length
+    error, here = rec.points - wall, drive.points[rec.track]
+    out: dict[str, Any] = {
+        "points": [float((error**2).sum()), float(np.einsum("nii->", rec.covariance))],
+        "rings": [],
+        "lengths": [],
+    }
+    places, rows, begin = [], [], []
+    for start in (0.2, 0.5, 0.8):
+        ring = np.flatnonzero((here[:, 2] > start) & (here[:, 2] < start + 0.2))
+        phi = np.arctan2(here[ring, 1], here[ring, 0])
+        outwards = np.column_stack([np.cos(phi), np.sin(phi), np.zeros(len(ring))]) @ r.T
+        along = np.tile(r[:, 2], (len(ring), 1))
+        begin.append(sum(map(len, places)))
+        places.append(ring)
+        rows += [outwards / len(ring), along / len(ring)]
+    jacobian = np.zeros((6, sum(map(len, places)), 3))
+    for k, row in enumerate(rows):
+        jacobian[k, begin[k // 2] : begin[k // 2] + len(row)] = row
+    joined = np.concatenate(places)
+    covariance = rec.functions_covariance(joined, jacobian)
+    values = np.einsum("mni,ni->m", jacobian, error[joined])
+    for k in range(3):
+        out["rings"].append([float(values[2 * k] ** 2), float(covariance[2 * k, 2 * k])])
+    for k in (3, 5):
+        difference = np.zeros(6)
+        difference[[k, k - 2]] = 1.0, -1.0
+        out["lengths"].append([float((values @ difference) ** 2), float(difference @ covariance @ difference)])
+    # The pose: rotation on the left, then centre.
+    middle = len(rec.frames) // 2
+    true_turn = drive.poses[middle, :, :3] @ r.T
+    w = rec.poses[middle, :, :3] @ true_turn.T
+    centre = (drive.centres[middle] - drive.centres[0]) @ r.T / length
+    e = np.concatenate([[w[2, 1] - w[1, 2], w[0, 2] - w[2, 0], w[1, 0] - w[0, 1]], 2 * (rec.centres[middle] - centre)])
+    out["nees"] = float(e / 2 @ np.linalg.solve(rec.pose_covariance[middle], e / 2))
+    return out
+
+
+def check_draws() -> list[dict[str, Any]]:
+    """Scatter over posterior within 15 %; the pose's six squared errors within their 95 % interval."""
+    count, drive = 200, tube_drive(7, 1.0, sigma=0.0)
+    every = kept(FOLDER, "draws", lambda: [draw_figures(k, drive) for k in range(count)])
+    rows = []
+    for name in ("points", "rings", "lengths"):
+        squared, variance = np.array([d[name] for d in every]).reshape(count, -1, 2).mean(0).T
+        rows.append(row(f"draws.{name}_over_sigma", math.sqrt((squared / variance).mean()), 0.85, 1.15))
+    spread = NORMAL_95 * math.sqrt(2 * 6 / count)  # chi-squared of 1200 degrees of freedom, over 200
+    nees = float(np.mean([d["nees"] for d in every]))
+    return [*rows, row("draws.pose_nees", nees, round(6 - spread, 3), round(6 + spread, 3))]
+
+
 def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, float]) -> list[float]:
     """rms of the whitened errors of rotation and direction, failures."""
     turns, directions, failed, runs = [], [], 0, 400
@@ -330,6 +391,7 @@ CHECKS = {
     "table": check_table,
     "drives": check_drives,
     "tubes": check_tubes,
+    "draws": check_draws,
     "two_view": check_two_view,
     "long": check_long,
     "video": check_video,

@@ -44,7 +44,7 @@ def run_dense(args: argparse.Namespace) -> Result:
             mapped.append(strip)
         if not maps:
             raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
-        document, files = write_dense(Path(args.output), maps, mapped, measured.unit)
+        document, files = write_dense(Path(args.output), maps, mapped, measured.unit, measured.document["summary"])
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
     rows: list[tuple[str, object]] = [
@@ -60,6 +60,8 @@ def run_dense(args: argparse.Namespace) -> Result:
             f"median {length_text(middle, unit)}, 90 % within {length_text(low, unit)} to {length_text(high, unit)}",
         ),
     ]
+    if document["scale_sigma"]:
+        rows.append(("scale", f"+- {196 * document['scale_sigma']:.2g} % (95 %) of every radius, in common"))
     for r in document["regions"][:20]:
         rows.append(
             (

@@ -216,8 +216,9 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
             )
         )
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
-    if document["quality"]["profile"]:
-        rows.append(("profile", document["quality"]["profile"]["text"]))
+    verdict = document["quality"]["profile"]
+    if verdict and verdict["text"] not in document["remarks"]:
+        rows.append(("profile", verdict["text"]))
     rows += [("note", remark) for remark in document["remarks"]]
     rows += [("written", file) for file in files]
     return table(rows)

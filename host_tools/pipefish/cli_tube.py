@@ -107,15 +107,17 @@ def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
 
     from pipefish.cloudfile import ply_bytes
     from pipefish.files import write_atomically
+    from pipefish.tube_findings import COLUMNS
 
     folder.mkdir(parents=True, exist_ok=True)
     vertices, faces = tube.mesh()
     columns = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
     contents = {
         "profile.csv": _csv(
-            [dict(zip(tube.stations, row, strict=True)) for row in zip(*tube.stations.values(), strict=True)]
+            list(tube.stations),
+            [dict(zip(tube.stations, row, strict=True)) for row in zip(*tube.stations.values(), strict=True)],
         ),
-        "events.csv": _csv(tube.events or [{"kind": None, "s": None}], bool(tube.events)),
+        "events.csv": _csv(COLUMNS, tube.events),
         "tube.ply": ply_bytes(columns, faces, ("units: metres",)),
         "tube.json": json.dumps(document).encode(),
     }
@@ -124,12 +126,11 @@ def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
     return [str(folder / name) for name in contents]
 
 
-def _csv(rows: list[dict[str, Any]], with_rows: bool = True) -> bytes:
-    names = list(dict.fromkeys(name for row in rows for name in row))
+def _csv(names: list[str], rows: list[dict[str, Any]]) -> bytes:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(names)
-    for row in rows if with_rows else []:
+    for row in rows:
         values = (_plain(row.get(name)) for name in names)
         writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in values])
     return stream.getvalue().encode()

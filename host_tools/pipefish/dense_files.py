@@ -126,8 +126,21 @@ def cloud(found: DenseWall, unit: str) -> bytes:
     return ply_bytes(columns, None, (f"unit: {unit}", f"full colour at {span:.6g} off the fitted tube"))
 
 
-def document_of(maps: list[DenseWall], strips: list[Strip], unit: str) -> dict[str, Any]:
-    """The document of dense.json."""
+def radius_sigmas(summary: dict[str, Any]) -> dict[str, Any]:
+    """What the radii of all cells have in common and their sigmas do not hold, from the summary of reconstruction.json:
+    radius_sigma    repeatability of the fitted tube, of one place
+    scale_sigma     relative: the scale and the camera; None where neither is known
+    """
+    station, shared = summary.get("station_sigma"), summary.get("systematic")
+    prior = summary.get("diameter_from_prior")
+    return {
+        "radius_sigma": 0.5 * station if station is not None else None,
+        "scale_sigma": shared["relative"] if shared and not prior else None,
+    }
+
+
+def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: dict[str, Any]) -> dict[str, Any]:
+    """The document of dense.json; summary: that of reconstruction.json."""
     regions = []
     for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
         for r in found.regions:
@@ -151,13 +164,14 @@ def document_of(maps: list[DenseWall], strips: list[Strip], unit: str) -> dict[s
             "pairs": sum(f.pairs_used for f in maps),
             "deviation_p05_p50_p95": np.percentile(values, [5, 50, 95]) if len(values) else None,
             "sigma_median": float(np.median(sigmas)) if len(sigmas) else None,
+            **radius_sigmas(summary),
             "regions": regions,
         }
     )
 
 
 def write_dense(
-    folder: Path, maps: list[DenseWall], strips: list[Strip], unit: str
+    folder: Path, maps: list[DenseWall], strips: list[Strip], unit: str, summary: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
     """Writes dense.json, and of each piece dense.npz, deviation.csv, sigma.csv, dense.png, dense.ply (from the second
     piece on with its number). Returns the document and the paths. Raises OSError."""
@@ -186,7 +200,7 @@ def write_dense(
         contents[f"sigma{end}.csv"] = _table(corner, chainage, found.clock, factor * found.sigma)
         contents[f"dense{end}.png"] = picture.getvalue()
         contents[f"dense{end}.ply"] = cloud(found, unit)
-    document = document_of(maps, strips, unit)
+    document = document_of(maps, strips, unit, summary)
     document["files"] = [*contents, "dense.json"]
     contents["dense.json"] = json.dumps(document).encode()  # last: what is there is whole
     folder.mkdir(parents=True, exist_ok=True)

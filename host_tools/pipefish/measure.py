@@ -23,6 +23,7 @@ from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
+from pipefish.tube_water import mirrored
 
 T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
@@ -42,13 +43,15 @@ TRACK_FLOOR_PX = 0.5
 # Even so tracks agree on small things that are not so: with the right profile the drift that they showed in two drawn
 # drives round bends had a chi-square of 9 and 38 for 5 degrees of freedom, with a central profile of the second 55.
 TRACK_COMMON = 3.0
+STOOD = 10  # frames in which less than a centimetre was driven
 DEFAULT_ATTITUDE_SIGMA = 0.01
 
 
 @dataclass
 class Stretch:
     """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
-    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known)."""
+    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known).
+    water: see `tube_water.mirrored`, whose points are not in the tube."""
 
     segment: int
     tube: Tube
@@ -57,6 +60,7 @@ class Stretch:
     sign: int
     d_mean_sigma: float = math.nan
     camera: Any = 0.0
+    water: list[dict[str, Any]] = field(default_factory=list)
 
     def chainage(self, s: Any) -> Any:
         """Along the survey, from s along the tube."""
@@ -245,9 +249,7 @@ def measure(
     if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
     if len(survey.keyframes) < 3:
-        raise PipefishError(
-            f"{survey.path}: {len(survey.keyframes)} keyframes; three are the least that can be measured"
-        )
+        raise PipefishError(f"{survey.path}: {_too_short(survey)}; three are the least that can be measured")
     camera = camera_of(survey, camera)
     remarks: list[str] = []
     chainage, quality = _encoder(survey, remarks)
@@ -326,11 +328,28 @@ def measure(
     return m
 
 
-def _why(survey: Survey, structure: Reconstruction) -> str:
-    """Why there is no structure, with what the device said about the scene."""
+def _states(survey: Survey) -> str:
+    """What the device said about the scene."""
     states = survey.info["states"]
     seen = ", ".join(f"{state} at {count} of {len(survey.keyframes)} keyframes" for state, count in states.items())
-    seen = f"; the device said: {seen}" if seen else ""
+    return f"; the device said: {seen}" if seen else ""
+
+
+def _too_short(survey: Survey) -> str:
+    """What a survey of too few keyframes has."""
+    info, count = survey.info, len(survey.keyframes)
+    words = f"{count} keyframe{'' if count == 1 else 's'}"
+    if info["frames"]:
+        words += f" of {info['frames']} frames"
+    if info["length_m"] is not None:
+        stood = " (the camera stood still?)" if (info["frames"] or 0) >= STOOD and info["length_m"] < 0.01 else ""
+        words += f", {info['length_m']:.2f} m driven{stood}"
+    return words + _states(survey)
+
+
+def _why(survey: Survey, structure: Reconstruction) -> str:
+    """Why there is no structure, with what the device said about the scene."""
+    seen = _states(survey)
     if not survey.info["tracks"]["observations"]:
         return f"no keyframe has tracks: a black or covered picture?{seen}"
     return structure.reason + seen
@@ -397,19 +416,28 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             why = "nothing tells the scale of this stretch, as of others"
             m.stretches.append(Stretch(segment, Tube("no_scale", why, {}), structure.frames[here], 0.0, 1))
             continue
-        tube = fit_tube(
-            structure.points[inside],
-            structure.own_covariance[inside],
-            m.path(segment),
-            nominal=m.nominal if m.scale.unit == "metre" else None,
-            up=m.up,
-            shared=shared_of(structure, segment, m.factors[segment]),
-            threads=threads or 2,
-            progress=lambda f, word, k=segment: tell(0.5 + 0.45 * (k + f) / count, word),
-        )
+        points, water = structure.points[inside], []
+
+        def fit(points: np.ndarray, k: int = segment, inside: np.ndarray = inside) -> Tube:
+            return fit_tube(
+                points,
+                structure.own_covariance[inside],
+                m.path(k),
+                nominal=m.nominal if m.scale.unit == "metre" else None,
+                up=m.up,
+                shared=shared_of(structure, k, m.factors[k]),
+                threads=threads or 2,
+                progress=lambda f, word: tell(0.5 + 0.45 * (k + f) / count, word),
+            )
+
+        tube = fit(points)
+        if tube.status == "ok":
+            wet, water = mirrored(tube, structure.down is not None)
+            if water:
+                tube = fit(np.where(wet[:, None], np.nan, points))
         tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
         origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
-        m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign))
+        m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign, water=water))
 
 
 def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool) -> tuple[float, int]:

@@ -21,6 +21,7 @@ from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
+from pipefish.tube_findings import COLUMNS
 
 RING = 72  # vertices of tube.ply around the pipe
 COLMAP_THETA = math.radians(89)  # its functions divide by z
@@ -78,7 +79,7 @@ def events(m: Measurement) -> list[dict[str, Any]]:
 
 
 def _events_csv(rows: list[dict[str, Any]]) -> bytes:
-    names = list(dict.fromkeys(["kind", "chainage", *(name for row in rows for name in row)]))
+    names = ["kind", "chainage", "stretch", *COLUMNS[1:], "reason", "detail"]
     return csv_bytes({name: [row.get(name) for row in rows] for name in names})
 
 
@@ -221,6 +222,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                     "chainage_at_start": x.origin,
                     "chainage_sign": x.sign,
                     "summary": x.tube.summary,
+                    "water": x.water,
                 }
                 for x in m.stretches
             ],
@@ -247,7 +249,7 @@ def _colours(deviation: np.ndarray, diameter: float) -> dict[str, np.ndarray]:
 
 def points_ply(m: Measurement) -> bytes:
     """All points with sigma (that of the longest axis of its covariance), track, place on the tube and distance from it
-    (NaN for those of no tube)."""
+    (NaN for those of no tube, and for what water mirrors)."""
     structure, size = m.structure, mean_diameter(m)[0]
     values = {name: np.full(len(structure.points), np.nan) for name in ("chainage", "clock", "distance")}
     for stretch in m.measured:
@@ -255,6 +257,8 @@ def points_ply(m: Measurement) -> bytes:
         place = stretch.tube.project(structure.points[inside])
         values["chainage"][inside] = stretch.chainage(place["s"])
         values["clock"][inside], values["distance"][inside] = place["clock"], place["distance"]
+        for column in values.values():
+            column[np.flatnonzero(inside)[~stretch.tube.points["known"]]] = np.nan
     sigma = np.sqrt(np.maximum(0, np.linalg.eigvalsh(structure.covariance)[:, -1]))
     columns = dict(zip("xyz", structure.points.T, strict=True))
     columns |= {"sigma": sigma, **values}

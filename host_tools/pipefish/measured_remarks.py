@@ -11,7 +11,7 @@ import numpy as np
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
 from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
-from pipefish.measured_texts import clock_text
+from pipefish.measured_texts import clock_text, length_text
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
@@ -22,6 +22,9 @@ BIN_LEAST = 100  # observations, for a bin to be judged
 INVERT = math.radians(45)  # from six o'clock
 GAP_TOLD = math.radians(60)  # without points, at GAP_SHARE of a stretch's stations: worth a remark
 GAP_SHARE = 0.2
+LINE_SIGMAS, LINE_OFF = 5.0, 0.25  # beyond both a stated line time is doubted: swaying between keyframes biases it
+NOMINAL_OFF = 0.1  # pipes are up to 7 % off the diameter that they are named by
+TURNED = 0.25  # diameters that the camera must go back
 SIGMA_MOST = 2.0  # robust spread of the residuals over the tracks' own noise
 
 
@@ -63,6 +66,7 @@ def remark(m: Measurement) -> None:
             f"The scale is the given diameter of {1000 * mean_diameter(m)[0]:.1f} mm. So the mean diameter was not "
             "measured; its changes along the pipe, ovality and angles were."
         )
+    remarks += _nominal_remark(m)
     worst = m.residuals.spread
     if worst > SIGMA_MOST:
         remarks.append(
@@ -81,13 +85,15 @@ def remark(m: Measurement) -> None:
         )
     if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
         remarks.append(m.health.text)
-    remarks += _invert_remark(m)
+    remarks += _water_remark(m) + _invert_remark(m)
     if m.camera.covariance is None:
         remarks.append(
             "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
         )
     if m.structure.down is None:
         remarks.append("No inclinometer: the clock is relative to the first keyframe.")
+    remarks += _shutter_remark(m)
+    remarks += _turned_remark(m)
     if m.backwards:
         remarks.append("The camera drove backwards, against its line of sight; clock as the camera looks.")
     for b in m.survey.breaks:
@@ -117,6 +123,70 @@ def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> 
     return words, float(width[k])
 
 
+def _nominal_remark(m: Measurement) -> list[str]:
+    """Of a diameter that no pipe of that name has: not a check of a few per cent, which nominal diameters are off."""
+    if not m.nominal or m.scale.unit != "metre" or m.scale.diameter_from_prior:
+        return []
+    value, off = mean_diameter(m)[0], mean_diameter(m)[0] / m.nominal - 1
+    if abs(off) < NOMINAL_OFF:
+        return []
+    return [
+        f"The mean diameter of {1000 * value:.0f} mm is {100 * abs(off):.0f} % {'over' if off > 0 else 'under'} the "
+        f"nominal {1000 * m.nominal:.0f} mm: a wrong camera profile, a wrong scale of {m.scale.source}, or another "
+        "pipe than was said?"
+    ]
+
+
+def _shutter_remark(m: Measurement) -> list[str]:
+    """Of rows that say another time than was stated."""
+    shutter, told = m.structure.shutter, m.structure.line_time
+    if shutter is None or told is None:
+        return []
+    stated, (value, sigma) = 1e6 * shutter.line_time, (1e6 * told[0], 1e6 * told[1])
+    if abs(value - stated) < max(LINE_SIGMAS * sigma, LINE_OFF * abs(stated)):
+        return []
+    why = ": is its sign wrong?" if abs(value + stated) < max(LINE_SIGMAS * sigma, LINE_OFF * abs(stated)) else ""
+    return [
+        f"The rolling shutter is stated as {stated:.1f} us a row (camera.line_time_us, --line-time), but the survey's "
+        f"own rows say {value:.1f} +- {1.96 * sigma:.1f} (95 %){why}"
+        + ("" if why else ": bends, clocks and ovality may be off.")
+    ]
+
+
+def _turned_remark(m: Measurement) -> list[str]:
+    """Of a drive that passes wall a second time. By the path: not all encoders count backwards."""
+    back, size = 0.0, mean_diameter(m)[0]
+    for segment in range(len(m.structure.sigma)):
+        steps = np.diff(m.structure.centres[m.structure.segment == segment], axis=0)
+        steps = steps[np.linalg.norm(steps, axis=1) > 1e-3 * size]
+        if not len(steps):
+            continue
+        turns = np.einsum("ni,ni->n", steps[1:], steps[:-1]) < 0
+        way = np.cumprod(np.append(1.0, np.where(turns, -1.0, 1.0)))
+        driven = np.append(0.0, np.cumsum(way * np.linalg.norm(steps, axis=1)))
+        driven *= 1.0 if driven[-1] >= 0 else -1.0
+        back = max(back, float((np.maximum.accumulate(driven) - driven).max()))
+    if back < TURNED * size:
+        return []
+    return [
+        f"The camera turned round and drove back by up to {length_text(back, m.scale.unit, metres=True)}: what it "
+        "passed twice was measured as new wall each time, and both count."
+    ]
+
+
+def _water_remark(m: Measurement) -> list[str]:
+    """Of points that were seen in water or through it."""
+    out = []
+    for stretch in m.measured:
+        for w in stretch.water:
+            start, end = np.sort(stretch.chainage([w["start"], w["end"]]))
+            out.append(
+                f"From {start:.2f} to {end:.2f} water mirrors the wall: {w['points']} points under its surface are no "
+                f"wall and were left out. It stands {length_text(w['depth'], m.scale.unit)} over the invert."
+            )
+    return out
+
+
 def _invert_remark(m: Measurement) -> list[str]:
     """Of stretches whose ellipse stands on the rest of the wall, because part of it shows no points."""
     out = []
@@ -136,6 +206,21 @@ def _invert_remark(m: Measurement) -> list[str]:
     return out
 
 
+def _bare_between(m: Measurement, start: float, end: float) -> tuple[float, float]:
+    """The wall that stretches leave between two keyframes: a camera sees it ahead of where it is."""
+    low, high = min(start, end), max(start, end)
+    before, after, reach = [], [], mean_diameter(m)[0]  # further off lies what other gaps are told of
+    for stretch in m.measured:
+        table = stretch.tube.stations
+        seen = stretch.chainage(table["s"][table["status"] == "ok"])
+        if len(seen) and seen.min() <= low < seen.max() + reach:
+            before.append(float(seen.max()))
+        elif len(seen) and seen.min() - reach < high <= seen.max():
+            after.append(float(seen.min()))
+    low, high = max(before, default=low), min(after, default=high)
+    return min(low, high), high
+
+
 def not_measured(m: Measurement) -> list[dict[str, Any]]:
     """Stretches without values: start, end (chainage, None where it is unknown), reason, detail."""
     rows = []
@@ -148,14 +233,11 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
         return float(value) if math.isfinite(value) else None
 
     for gap in m.structure.gaps:
-        rows.append(
-            {
-                "start": at(along[gap.first]),
-                "end": at(along[gap.last]),
-                "reason": gap.reason,
-                "detail": f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}",
-            }
-        )
+        start, end = _bare_between(m, along[gap.first], along[gap.last])
+        detail = f"keyframes {m.index[gap.first]} to {m.index[gap.last]}: {REASONS[gap.reason]}"
+        if start == end:
+            detail += "; the wall there was seen all the same"
+        rows.append({"start": at(start), "end": at(end), "reason": gap.reason, "detail": detail})
     for stretch in m.stretches:
         if stretch.tube.status != "ok":
             ends = along[stretch.frames[[0, -1]]]

@@ -223,8 +223,8 @@ class Report(Charts):
         lead += f"measured from {s['keyframes_with_pose']} keyframes and {s['points']} points of its wall."
         if self.document["status"] != "ok":
             missing = s["stations"] - s["stations_with_ovality"]
-            lead += f" Parts were not measured ({missing} of {s['stations']} stations have no ovality, and gaps between"
-            lead += " stretches no station): they are left blank and listed."
+            without = f", {missing} of {s['stations']} stations have no ovality" if missing else ""
+            lead += f" Parts were not measured{without}: they are left blank and listed."
         if not self.document["scale"]["consistent"]:
             lead += " What tells the scale disagrees: see what to know before a length is used."
         charts = [diameter, ovality, tube, *line, *quality]

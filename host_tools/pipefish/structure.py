@@ -101,6 +101,7 @@ class Reconstruction:
     gaps             list of Gap
     down             (3,) direction of gravity in the world, None without an inclinometer
     sag              px^2, of each segment: the tracks' common sag
+    line_time        seconds, and its sigma, as the survey's own rows tell it; None without a rolling shutter
     shutter          what was said of a rolling shutter; poses are those of its middle row: see poses_at()
     camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
     cost             sum of half the squared residuals
@@ -141,6 +142,7 @@ class Reconstruction:
     iterations: list[int] = field(default_factory=list)
     drift: list[dict[str, Any]] = field(default_factory=list, repr=False)
     shutter: RollingShutter | None = field(default=None, repr=False)
+    line_time: tuple[float, float] | None = None
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
 
@@ -329,6 +331,8 @@ def reconstruct(
     )
     out = _result(found, names, frames, step, encoder, camera)
     out.shutter = shutter
+    if shutter is not None:
+        out.line_time = _line_time(found["segments"], shutter.line_time)
     out.own_covariance = _own_covariance(out, tracks, camera, sigma)
     return out
 
@@ -372,6 +376,15 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
 def _wheel_sigma(segment: dict[str, Any] | None) -> float | None:
     """Of the first parameter that all poses share, the wheel's scale, where there is one."""
     return float(np.sqrt(segment["random"].border[0, 0])) if segment and segment["metric"] else None
+
+
+def _line_time(segments: list[dict[str, Any]], stated: float) -> tuple[float, float] | None:
+    """Of all segments, weighed."""
+    told = [(s["late"], s["late_sigma"] ** -2.0) for s in segments if s["late_sigma"] > 0]
+    if not told:
+        return None
+    share, weight = np.array(told).T
+    return stated * float(share @ weight / weight.sum()), abs(stated) / float(np.sqrt(weight.sum()))
 
 
 def _stacked(parts: list[npt.NDArray[Any]], shape: tuple[int, ...], dtype: type = np.float64) -> npt.NDArray[Any]:

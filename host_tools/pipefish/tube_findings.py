@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from pipefish.tube import Tube
     from pipefish.tube_shared import Common
 
+# Of a table of events, whatever was found.
+PLACE = ["kind", "s", "s_sigma", "start", "end", "clock", "clock_sigma"]
+SIZE = ["length", "width", "size_sigma", "height", "height_sigma", "area", "points"]
+JOINT = ["step", "step_sigma", "diameter_step", "diameter_step_sigma", "gap", "gap_sigma", "chi2"]
+COLUMNS = [*PLACE, *SIZE, *JOINT, "angle", "angle_sigma", "radius"]
 FALSE_ALARMS = 0.01  # of one fit
 GROSS = 4.0  # standard deviations
 # Of the diameter. Neighbouring tracks see the same relief in the same changing light and go astray together, which no

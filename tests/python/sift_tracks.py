@@ -19,23 +19,31 @@ def features(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     image = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise SystemExit(f"{path}: no image")
+    # At half the size there are nearly as many corners, a little truer, in a quarter of the time.
+    image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT_create(12000).detectAndCompute(image, None)
-    places = np.array([p.pt for p in points])
+    places = 2 * np.array([p.pt for p in points]) + 0.5
     _, first = np.unique(places, axis=0, return_index=True)  # corners with several orientations
     # OpenCV's SIFT doubles the image first, which puts its corners a quarter of a pixel too far right and down.
-    places -= 0.25 if cv2.__version__ < "4.9" else 0.0
-    size = np.array([p.size for p in points])
+    places -= 0.5 if cv2.__version__ < "4.9" else 0.0
+    size = 2 * np.array([p.size for p in points])
     return places[first], descriptors[first], np.hypot(0.1, 0.05 * size[first])
 
 
 def matched(a: np.ndarray, b: np.ndarray, ratio: float = 0.75) -> np.ndarray:
-    """(m,2) indices into both."""
-    pairs = []
-    for first, second in ((a, b), (b, a)):
-        found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
-        pairs.append({m.queryIdx: m.trainIdx for m, n in found if m.distance < ratio * n.distance})
-    both = [(i, j) for i, j in pairs[0].items() if pairs[1].get(j) == i]
-    return np.array(both, int).reshape(-1, 2)
+    """(m,2) indices into both; all distances at once, as a product of matrices."""
+    a, b = a.astype(np.float32), b.astype(np.float32)
+    squared = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * a @ b.T
+    nearest = []
+    for d in (squared, squared.T):
+        two = np.argpartition(d, 1, axis=1)[:, :2]
+        two = np.take_along_axis(two, np.take_along_axis(d, two, 1).argsort(1), 1)
+        first, second = np.take_along_axis(d, two, 1).T
+        nearest.append(np.where(first < ratio**2 * second, two[:, 0], -1))
+    i = np.flatnonzero(nearest[0] >= 0)
+    j = nearest[0][i]
+    both = nearest[1][j] == i
+    return np.column_stack([i[both], j[both]])
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pipefish as pf
-from tube_tracks import Drive, fisheye, tube_drive, tube_pair
+from tube_tracks import Drive, fisheye, similarity, tube_drive, tube_pair
 
 
 def residuals(drive: Drive, rec: pf.Reconstruction) -> np.ndarray:
@@ -66,6 +66,36 @@ def test_covariances_are_the_inverse_of_the_whole_normal_matrix() -> None:
     flat = weights.reshape(2, -1)
     expected = flat @ inverse[start:, start:] @ flat.T
     assert rec.functions_covariance(np.arange(count), weights) == pytest.approx(expected, rel=1e-4)
+
+
+def inner(points: np.ndarray) -> np.ndarray:
+    """(3n,3n) projection of errors of points (n,3) onto those that no motion and no scale makes."""
+    turns = -np.cross(points[:, None, :], np.eye(3)).transpose(0, 2, 1)
+    free = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turns, points[:, :, None]], axis=2).reshape(-1, 7)
+    return np.eye(len(free)) - free @ np.linalg.solve(free.T @ free, free.T)
+
+
+def test_two_gauges_say_the_same_of_what_no_gauge_changes() -> None:
+    """The drive from its other end: another pose is held, and every point's covariance is another. Without motion and
+    scale of the points they agree to 1e-6. Exact tracks: both are linear at the same place."""
+    drive = tube_drive(43, 0.7, sigma=0.0)
+    t, last = drive.tracks, len(drive.poses) - 1
+    there = pf.reconstruct(t, drive.camera)
+    back = pf.reconstruct(pf.Tracks(last - t.frame, t.track, t.pixels), drive.camera)
+    assert there.status == back.status == "ok"
+    common, a, b = np.intersect1d(there.track, back.track, return_indices=True)
+    assert len(common) > 0.99 * len(there.track)
+    some = np.linspace(0, len(common) - 1, 16).round().astype(int)
+    scale, turn, _ = similarity(back.points[b], there.points[a])
+    rows = np.eye(48).reshape(48, 16, 3)
+    free = inner(there.points[a[some]])
+    found = []
+    for rec, places, by in ((there, a[some], np.eye(3)), (back, b[some], scale * turn)):
+        covariance = rec.functions_covariance(places, rows @ by) / rec.variance_factor[0]
+        found.append(free @ covariance @ free.T)
+        raw = np.trace(covariance)
+    assert raw > 2 * np.trace(found[0]), "the gauges must matter"
+    assert np.abs(found[0] - found[1]).max() < 1e-6 * np.abs(found[0]).max()
 
 
 def test_wrong_observations_are_told_from_right_ones() -> None:

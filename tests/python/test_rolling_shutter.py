@@ -136,11 +136,22 @@ def test_rows_bend_a_straight_pipe_and_their_time_takes_it_back(tmp_path: Path) 
     told = pf.reconstruct(tracks, camera, driven, encoder=encoder, shutter=told_of(scene, frames))
     assert blind.status == told.status == "ok"
     assert blind.variance_factor[0] - told.variance_factor[0] > 0.02
+    assert blind.line_time is None and abs(told.line_time[0] - LINE_TIME) < 4 * told.line_time[1] + 0.03 * LINE_TIME
     (blind_radius, blind_bend), (radius, bend) = measured(blind, wall), measured(told, wall)
     assert blind_bend > 0.5 and bend < 0.2
     assert blind_radius > 2e-4 and abs(radius) < 2e-4
     # Judged at the frames' poses most observations would lie beyond 3.5 sigma and not count.
     assert np.median(np.einsum("nii->n", told.own_covariance)) < np.median(np.einsum("nii->n", blind.own_covariance))
+
+
+@pytest.mark.parametrize("factor", [-1.0, 3.0])
+def test_rows_tell_a_line_time_of_the_wrong_sign_or_unit(tmp_path: Path, factor: float) -> None:
+    tracks, camera, scene, _, frames = drive(tmp_path, 3, 0.3, {"wobble_m": 0.003, "wobble_rad": 0.012, "frames": 101})
+    shutter = pf.RollingShutter([scene.time(int(f)) for f in frames], factor * LINE_TIME)
+    rec = pf.reconstruct(tracks, camera, np.array([scene.driven(int(f)) for f in frames]), shutter=shutter)
+    value, sigma = rec.line_time
+    assert rec.status == "ok" and sigma < 0.2 * LINE_TIME
+    assert abs(value - LINE_TIME) < 4 * sigma + 0.1 * LINE_TIME
 
 
 def test_a_time_that_is_not_known_leaves_a_frame_as_it_is(tmp_path: Path) -> None:

@@ -162,6 +162,20 @@ def test_a_stretch_without_points_is_a_gap_not_a_guess() -> None:
     assert np.isfinite(t["d_mean"][(t["s"] < 1.3) | (t["s"] > 2.5)]).all()
 
 
+@pytest.mark.parametrize("driven", [0.075, 0.16, 0.32])
+def test_a_drive_shorter_than_the_pipe_is_wide_is_measured_where_it_saw_the_wall(driven: float) -> None:
+    """What is left of a survey between two interruptions: most of the wall that it saw lies beyond the path's end."""
+    pipe = Pipe(length=4, seed=15)
+    points, path = pipe.points(2400), pipe.cameras()
+    points = points[(points[:, 2] > 1.09) & (points[:, 2] < 1.25 + driven)]
+    path = np.column_stack([path[0, :2] * np.ones((5, 2)), np.linspace(1.0, 1.0 + driven, 5)])
+    for centres in (path, path[::-1]):  # forwards, and backwards out of it
+        tube = pf.fit_tube(points, pipe.noise, centres)
+        assert tube.status == "ok" and tube.length > 0.12 + driven
+        t = tube.stations
+        assert (np.abs(t["d_mean"] - 0.3) < 4.5 * t["d_mean_sigma"]).all()
+
+
 def test_wrong_arguments_are_named() -> None:
     points = Pipe().points(200)
     for wrong, name in (

@@ -27,6 +27,7 @@ struct State {
     double wheel = 0.0;
     Vector3d down = Vector3d::UnitY();
     double sag = 0.0;
+    double late = 1.0; // of the stated line time
     Eigen::VectorXd camera;
 };
 
@@ -102,7 +103,7 @@ public:
         }
         const size_t point = static_cast<size_t>(e);
         RowsX j_border = RowsX::Zero(2, border_);
-        const bool shared = camera_columns_ > 0 || sag_at_ >= 0 || measures_pupil();
+        const bool shared = camera_columns_ > 0 || sag_at_ >= 0 || late_at_ >= 0 || measures_pupil();
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
             const Observation &o = table_[place_[k]];
             const geometry::TurnBetween turn = turn_at(k);
@@ -124,7 +125,7 @@ public:
             Rows<2, 6> j_pose[2] = {Rows<2, 6>::Zero(), Rows<2, 6>::Zero()};
             const int frames[2] = {frame_[k], rolls() ? moment_[k].other : -1};
             const int blocks[2] = {block_of(frames[0]), block_of(frames[1])};
-            const double share = rolls() ? moment_[k].share : 0.0;
+            const double share = share_at(k);
             if (!is_held(frames[0])) {
                 j_pose[0] << j_turn * turn.by_first, (share - 1.0) * j_point;
             }
@@ -136,6 +137,11 @@ public:
             }
             if (sag_at_ >= 0) {
                 j_border.col(sag_at_) = o.whiten * o.sag;
+            }
+            if (late_at_ >= 0) { // further on the way: turned more, and moved
+                const size_t f = static_cast<size_t>(frames[0]), other = static_cast<size_t>(frames[1]);
+                j_border.col(late_at_) = moment_[k].share * (j_turn * turn_towards(f, frames[1]) -
+                                                             j_point * (state_.centre[other] - state_.centre[f]));
             }
             for (int c = 0; c < camera_columns_; c++) {
                 j_border.col(camera_at_ + c) =
@@ -186,6 +192,9 @@ public:
         if (sag_at_ >= 0) {
             state_.sag = saved_.sag + step.g[sag_at_];
         }
+        if (late_at_ >= 0) {
+            state_.late = saved_.late + step.g[late_at_];
+        }
         if (camera_columns_ > 0) {
             state_.camera = saved_.camera + step.g.tail(camera_columns_);
             camera_ = changed_camera(original_, *options_.camera_prior, state_.camera);
@@ -209,7 +218,7 @@ public:
     const State &state() const { return state_; }
     const std::vector<int> &used() const { return place_; }
     int observations() const { return static_cast<int>(place_.size()); }
-    int down_at() const { return down_at_; }
+    int late_at() const { return late_at_; }
 
     // Degrees of freedom of the residuals, those of the rest included.
     int redundancy() const
@@ -226,6 +235,7 @@ private:
     double yardstick() const { return measures_pupil() ? 1.0 + state_.wheel : 1.0; }
 
     bool rolls() const { return !moment_.empty(); }
+    double share_at(size_t k) const { return rolls() ? state_.late * moment_[k].share : 0.0; }
 
     // The camera's rotation at observation k, and how it turns with the two frames it lies between; its centre.
     geometry::TurnBetween turn_at(size_t k) const
@@ -234,7 +244,7 @@ private:
         if (!rolls()) {
             return {state_.rotation[f], Matrix3d::Identity(), Matrix3d::Zero()};
         }
-        return geometry::turn_between(state_.rotation[f], turn_towards(f, moment_[k].other), moment_[k].share);
+        return geometry::turn_between(state_.rotation[f], turn_towards(f, moment_[k].other), share_at(k));
     }
     Vector3d centre_at(size_t k) const
     {
@@ -242,7 +252,7 @@ private:
         if (!rolls()) {
             return here;
         }
-        return here + moment_[k].share * (state_.centre[static_cast<size_t>(moment_[k].other)] - here);
+        return here + share_at(k) * (state_.centre[static_cast<size_t>(moment_[k].other)] - here);
     }
     Vector3d turn_towards(size_t f, int other) const
     {
@@ -281,7 +291,7 @@ private:
                 const size_t f = static_cast<size_t>(frame_[k]);
                 Matrix3d part = state_.rotation[f];
                 if (rolls()) {
-                    part = geometry::rotation_exp(moment_[k].share * turn_towards(f, moment_[k].other)) * part;
+                    part = geometry::rotation_exp(share_at(k) * turn_towards(f, moment_[k].other)) * part;
                 }
                 Eigen::Map<Vector3d>(in_camera_.data() + 3 * k) = part * (state_.point[p] - centre_at(k)) / yardstick();
             }
@@ -325,6 +335,10 @@ private:
         }
         if (options_.sag_sigma > 0.0) {
             sag_at_ = border_++;
+            extra_rows_++;
+        }
+        if (options_.late_sigma > 0.0 && rolls()) {
+            late_at_ = border_++;
             extra_rows_++;
         }
         if (options_.camera_prior) {
@@ -400,6 +414,9 @@ private:
         if (sag_at_ >= 0) {
             sum += std::pow(state_.sag / options_.sag_sigma, 2);
         }
+        if (late_at_ >= 0) {
+            sum += std::pow((state_.late - 1.0) / options_.late_sigma, 2);
+        }
         if (camera_columns_ > 0) {
             sum += (camera_root_ * state_.camera).squaredNorm();
         }
@@ -433,11 +450,17 @@ private:
         if (options_.gravity) {
             linearize_gravity(sink);
         }
-        if (sag_at_ >= 0) {
+        const auto add_prior = [&](int at, double r, double sigma) {
             RowsX j = RowsX::Zero(1, border_);
-            j(0, sag_at_) = 1.0 / options_.sag_sigma;
-            const double r = state_.sag / options_.sag_sigma;
+            j(0, at) = 1.0 / sigma;
+            r /= sigma;
             sink.add(1, &r, plain, nullptr, {}, {}, j.data());
+        };
+        if (sag_at_ >= 0) {
+            add_prior(sag_at_, state_.sag, options_.sag_sigma);
+        }
+        if (late_at_ >= 0) {
+            add_prior(late_at_, state_.late - 1.0, options_.late_sigma);
         }
         if (camera_columns_ > 0) {
             RowsX j = RowsX::Zero(camera_columns_, border_);
@@ -516,7 +539,7 @@ private:
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
     std::vector<int> wanted_; // ascending
-    int border_ = 0, down_at_ = 0, sag_at_ = -1, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
+    int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
     Eigen::MatrixXd camera_root_;
     double start_length_ = 1.0;
 };
@@ -572,6 +595,8 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.wheel = problem.state().wheel;
     report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
     report.sag = problem.state().sag;
+    report.late = problem.state().late;
+    report.late_at = problem.late_at();
     report.camera = problem.state().camera;
     report.used = problem.used();
     if (covariance) {

@@ -11,6 +11,8 @@ namespace pipefish::sfm
 namespace
 {
 
+constexpr double LATE_SIGMA = 10.0; // stated line times may have the other sign, or be of other units
+
 double median_of(std::vector<double> &values)
 {
     if (values.empty()) {
@@ -398,6 +400,17 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     segment.report = adjust(map, table, central, settings, &segment.random);
     const std::vector<int> used = segment.report.used; // or the covariances would be of different points
     settings.only = &used;
+    if (table.rolls()) { // what the rows themselves say of their time: a wrong sign or unit bends the pipe in silence
+        Submap again = map;
+        settings.late_sigma = LATE_SIGMA;
+        BundleCovariance known;
+        const BundleReport report = adjust(again, table, central, settings, &known);
+        if (report.late_at >= 0) {
+            segment.late = report.late;
+            segment.late_sigma = std::sqrt(report.variance_factor * known.border()(report.late_at, report.late_at));
+        }
+        settings.late_sigma = 0.0;
+    }
     if (options.drift_prior) {
         segment.drift.map = map;
         settings.camera_prior = options.drift_prior;

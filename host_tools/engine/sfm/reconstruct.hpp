@@ -42,7 +42,8 @@ struct Segment {
     Drift drift;                    // empty without drift_prior
     double sigma = 1.0;             // robust, of the whitened residuals before the last selection
     bool metric = false;            // scale from odometry
-    double scale_sigma = 0.0;       // relative, of the scale from odometry before the adjustment
+    double late = 1.0, late_sigma = 0.0; // line time over the stated one, by the survey itself; sigma 0: not looked at
+    double scale_sigma = 0.0;            // relative, of the scale from odometry before the adjustment
 };
 
 struct Reconstruction {

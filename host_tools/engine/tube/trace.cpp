@@ -317,6 +317,42 @@ std::vector<Cylinder> trace(const Cloud &cloud, const Cylinder &seed)
     return extended(cloud, nearest, {seed}, seed.rho);
 }
 
+namespace
+{
+
+// Where along a path sections are tried, with its tangents. Who drives a diameter or two sees most of the wall beyond
+// the path's ends: there it goes on straight.
+std::vector<Cylinder> nodes_on(const Eigen::Matrix3Xd &path, double stride, double length, double radius)
+{
+    constexpr int BEYOND = 3;
+    std::vector<Cylinder> out;
+    const Eigen::Index count = path.cols();
+    const auto add = [&](Eigen::Index i, double ahead) {
+        const Eigen::Index a = std::max<Eigen::Index>(0, i - 3), b = std::min(count - 1, i + 3);
+        Cylinder c;
+        c.axis = (path.col(b) - path.col(a)).normalized();
+        c.centre = path.col(i) + ahead * c.axis;
+        c.rho = radius;
+        out.push_back(c);
+    };
+    const int beyond = length < 4.0 * radius ? BEYOND : 0;
+    for (int k = beyond; k > 0; k--) {
+        add(0, -0.5 * k * radius);
+    }
+    for (Eigen::Index i = 0, last = 0; i + 1 < count; i++) {
+        if (i == 0 || (path.col(i) - path.col(last)).norm() >= stride) {
+            add(i, 0.0);
+            last = i;
+        }
+    }
+    for (int k = 1; k <= beyond; k++) {
+        add(count - 1, 0.5 * k * radius);
+    }
+    return out;
+}
+
+} // namespace
+
 std::vector<Cylinder> along(const Cloud &cloud, const Eigen::Matrix3Xd &path, int threads)
 {
     const Nearest<3> nearest(cloud.points), on_path(path);
@@ -329,24 +365,16 @@ std::vector<Cylinder> along(const Cloud &cloud, const Eigen::Matrix3Xd &path, in
         std::nth_element(v.begin(), v.begin() + static_cast<std::ptrdiff_t>(v.size() / 2), v.end());
         return v[v.size() / 2];
     };
-    double radius = median_of(away);
+    double radius = median_of(away), length = 0.0;
+    for (Eigen::Index i = 0; i + 1 < path.cols(); i++) {
+        length += (path.col(i + 1) - path.col(i)).norm();
+    }
     // Twice: the second time with the radius that the first found.
     std::vector<Cylinder> found;
     for (int round = 0; round < 2; round++) {
         // Nodes half a radius apart; a coarser look suffices for the radius.
-        const double stride = (round == 0 ? 2.0 : 0.75) * radius;
-        std::vector<Cylinder> start;
-        Vector3d last = path.col(0);
-        for (Eigen::Index i = 0; i + 1 < path.cols(); i++) {
-            if (i == 0 || (path.col(i) - last).norm() >= stride) {
-                const Eigen::Index a = std::max<Eigen::Index>(0, i - 3), b = std::min(path.cols() - 1, i + 3);
-                Cylinder c;
-                c.centre = last = path.col(i);
-                c.axis = (path.col(b) - path.col(a)).normalized();
-                c.rho = radius;
-                start.push_back(c);
-            }
-        }
+        const double stride = round == 0 ? std::min(2.0 * radius, 0.25 * length) : 0.75 * radius;
+        const std::vector<Cylinder> start = nodes_on(path, stride, length, radius);
         std::vector<Cylinder> fitted(start.size());
         parallel_for(static_cast<int>(start.size()), threads, [&](int k) {
             const Cylinder &c = start[static_cast<size_t>(k)];
