@@ -333,6 +333,8 @@ void pf_tracking_shot(void *tracking, void *item)
     if (shot->cause != PF_KEYFRAME_NO) {
         memcpy(shot->tracks, tracks, n * sizeof *tracks);
         shot->n_tracks = n;
+        if (predicts)
+            pf_wall_settle(&p->wall, shot->tracks, n, pf_track_project, p->camera);
         memset(&p->since, 0, sizeof p->since);
     }
     shot->track_ns = pf_now() - start;

@@ -5,24 +5,26 @@
 
 /* A template is renewed when its warp has moved this far from identity: the affine model then leaves, at the edge of a
  * 21-pixel window, second-order terms of a few tenths of a pixel on a pipe's wall. */
-#define RENEW        (65536 / 5)
-#define PULL_MAX     (3 << 16) /* the template may move a track by 3 px from where half resolution put it */
-#define DRIFT_SLACK  3277      /* the template may look 0.1 less similar than the previous patch */
-#define WALL_SLACK   6554      /* 0.2 */
-#define CERTAIN      (2 << 16) /* a track found this near its start is next sought from half resolution on */
-#define GUESS_MOST   (4096 << 16)
-#define SAME_START   (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
-#define WARPED_APART 49152     /* 3/4 px: the two starts of a warped template differ by 1.7 px */
-#define STARTS       3
-#define COARSE       2u /* level at which starts are compared: a pixel of it is 4 px */
-#define COARSE_HALF  5
-#define MARGIN       1638      /* 0.05 of similarity */
-#define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
-#define NEAR_LEAST   5u        /* of those within 45 degrees */
-#define NEAR_PART    16        /* a sector at less than this part of its ring's pace does not count */
-#define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
-#define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
-#define NEIGHBOURS   3
+#define RENEW       (65536 / 5)
+#define PULL_MAX    (3 << 16) /* the template may move a track by 3 px from where half resolution put it */
+#define FADED       29491     /* 0.9 */
+#define DRIFT_SLACK 3277      /* the template may look 0.1 less similar than the previous patch */
+#define WALL_SLACK  6554      /* 0.2 */
+#define CERTAIN     (2 << 16) /* a track found this near its start is next sought from half resolution on */
+#define GUESS_MOST  (4096 << 16)
+#define SAME_START  (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
+#define WARPED_APART                                                                                                   \
+    24576 /* 3/8 px: the two starts of a warped template differ by 0.8 px; a small mark pulls no farther */
+#define STARTS      3
+#define COARSE      2u /* level at which starts are compared: a pixel of it is 4 px */
+#define COARSE_HALF 5
+#define MARGIN      1638      /* 0.05 of similarity */
+#define FLOW_LEAST  8u        /* tracks in a ring before its median is believed */
+#define NEAR_LEAST  5u        /* of those within 45 degrees */
+#define NEAR_PART   16        /* a sector at less than this part of its ring's pace does not count */
+#define FLOW_STIRS  (4 << 16) /* a ring that has moved 4 px */
+#define STILL_PART  4         /* a track that has made less than a quarter (half, across) of that way stands still */
+#define NEIGHBOURS  3
 /* Sums of both variances, px^2 Q20. Beyond 0.4 px a track is no longer known well enough that this is the point first
  * seen. Beyond 0.25 px it is lost where that is 8 times what it was at first sight: its marks have faded, been drawn
  * out, or no longer explain what is seen; with relief in a light that moves errors are then several times what is
@@ -156,11 +158,12 @@ static uint32_t rank_starts(const pf_tracker *t, const pf_track *track, const pf
 }
 
 /* Whether too much of a window is clipped, or much more or less than of its template: what is clipped in one of them
- * only has a shape of its own, and pulls by up to half a pixel. */
+ * only has a shape of its own, and pulls by up to half a pixel. Where the wall is looked after that is no reason: on
+ * PVC a third to a half of what was lost was in its place, beside the glare. */
 static bool is_clipped(const pf_tracker *t, uint32_t now, uint32_t before)
 {
     const uint32_t area = t->config.window * t->config.window, change = now > before ? now - before : before - now;
-    return CLIPPED * now > area || CLIP_CHANGE * change > area;
+    return CLIPPED * now > area || (!t->config.has_wall && CLIP_CHANGE * change > area);
 }
 
 /* What a track must pass wherever it was found: `fit` of its template, `clipped` pixels of it clipped, in the new frame
@@ -196,27 +199,36 @@ static int64_t most_apart(const pf_tracker *t)
     return (int64_t)t->config.fb_q16 * (t->config.has_wall ? 2 : 1);
 }
 
+/* Whether the template has had its time: its shape has changed, or, where the wall is looked after, its likeness fades.
+ * At the rim of a clay pipe, where the lamp's image comes up under a patch, it is still alike from frame to frame when
+ * it is not like its first sight any more. */
+static bool is_worn(const pf_tracker *t, const pf_anchor *anchor, int32_t likeness)
+{
+    for (int32_t k = 0; k < 4; k++) {
+        const int32_t d = anchor->a[k] - (k == 0 || k == 3 ? 65536 : 0);
+        if (d > RENEW || d < -RENEW)
+            return true;
+    }
+    return t->config.has_wall && likeness < FADED;
+}
+
 /* Brings a track and its slot up to date: found at `fine`. */
 static void accept(pf_tracker *t, pf_track *track, uint16_t slot, pf_point_q16 fine, const pf_fit *anchored,
                    int32_t quality)
 {
     pf_slot *s = &t->slots[slot];
+    const pf_image *image = &t->pyramid[t->now].level[0];
+    int64_t carried[3];
     s->move = (pf_point_q16){fine.x - track->pos.x, fine.y - track->pos.y};
     track->pos = fine;
     track->quality = (uint16_t)quality;
     pf_anchor_covariance(&s->anchor, t->config.noise_q8, anchored->gain_q14, track);
-    for (int32_t k = 0; k < 4; k++) {
-        const int32_t d = s->anchor.a[k] - (k == 0 || k == 3 ? 65536 : 0);
-        if (d > RENEW || d < -RENEW) {
-            int64_t carried[3];
-            pf_anchor_carry(&s->anchor, t->config.noise_q8, carried);
-            pf_anchor_take(&t->klt, &t->pyramid[t->now].level[0], fine, &s->anchor,
-                           t->pixels + (size_t)slot * t->patch_bytes);
-            memcpy(s->anchor.carried, carried, sizeof carried);
-            s->clipped = pf_mask_clipped(t, &t->pyramid[t->now].level[0], fine);
-            break;
-        }
-    }
+    if (!is_worn(t, &s->anchor, anchored->zncc_q15))
+        return;
+    pf_anchor_carry(&s->anchor, t->config.noise_q8, carried);
+    pf_anchor_take(&t->klt, image, fine, &s->anchor, t->pixels + (size_t)slot * t->patch_bytes);
+    memcpy(s->anchor.carried, carried, sizeof carried);
+    s->clipped = pf_mask_clipped(t, image, fine);
 }
 
 /* One attempt at one track from one guess; on success `track` and its slot are up to date. *reached gets how far the

@@ -249,8 +249,8 @@ typedef struct pf_wall { /* private */
     uint16_t *pair;
 } pf_wall;
 
-/* How far a track may walk off: 1 px, Q16. */
-#define PF_WALL_MOST_Q16 65536u
+/* How far a track may walk off, Q16: 2 px, for pf_wall_settle takes half of it back. */
+#define PF_WALL_MOST_Q16 131072u
 
 /* Bytes of workspace for a tracker of so many tracks. */
 #define PF_WALL_BYTES(max_tracks) (40u * (size_t)(max_tracks) + 9216u)
@@ -264,6 +264,11 @@ pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size
  * neighbours do alike: then that is where the wall is. Returns how many. For pf_tracker_give_up. */
 uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                        pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray);
+
+/* The places of a keyframe: moves each of tracks[n], a copy of the table last checked, back by half of what it has
+ * walked off and its seven nearest neighbours have not. What they walk off alike is the wall's own shape and stays. The
+ * tracker goes on from where it found them. Cost: 20 n^2 instructions. */
+void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_project project, const void *camera);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
  * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */
