@@ -229,17 +229,21 @@ def test_a_profile_without_the_pupil_shift_is_not_accused(monkeypatch):
 
 
 def test_the_check_asks_for_no_second_reconstruction(monkeypatch):
-    """With one that was made for it the answer is the same; `common` noise widens it."""
+    """With one that was made for it the answer is the same; with the noise of its tracks taken for more, wider."""
     drive, readings = bent_drive()
     known = {"encoder": ENCODER, "sigma": 0.2, "threads": 1}
     alone = health.check_profile(drive.tracks, drive.camera, readings, **known)
-    prior = health.drift_prior(drive.tracks, drive.camera)
-    structure = reconstruct(drive.tracks, drive.camera, readings, drift=prior, **known)
-    monkeypatch.setattr(health, "reconstruct", None)
-    again = health.check_profile(drive.tracks, drive.camera, readings, structure=structure, **known)
-    assert (again.verdict, again.alpha_sigma) == (alone.verdict, pytest.approx(alone.alpha_sigma, rel=1e-6))
-    wider = health.check_profile(drive.tracks, drive.camera, readings, structure=structure, common=3.0, **known)
-    assert wider.alpha_sigma > 2 * again.alpha_sigma and wider.verdict == "cannot tell"
+
+    def again(noise: float) -> health.ProfileCheck:
+        prior = health.drift_prior(drive.tracks, drive.camera, noise)
+        structure = reconstruct(drive.tracks, drive.camera, readings, drift=prior, **known)
+        with monkeypatch.context() as patch:
+            patch.setattr(health, "reconstruct", None)
+            return health.check_profile(drive.tracks, drive.camera, readings, structure=structure, **known)
+
+    same, wider = again(1.0), again(3.0)
+    assert (same.verdict, same.alpha_sigma) == (alone.verdict, pytest.approx(alone.alpha_sigma, rel=1e-6))
+    assert wider.alpha_sigma > 2 * alone.alpha_sigma and wider.verdict == "cannot tell"
 
 
 def test_chi2_tail_against_tables():
