@@ -83,16 +83,16 @@ def calibrated(scene: Scene, views: int = 80, noise: float = 0.05) -> pf.Camera:
     return pf.calibrate(seen, image_size=(spec["width"], spec["height"]), model="auto", board="flat").camera
 
 
-def recorded(name: str) -> Recording:
-    """The scene's recording, drawn if need be."""
-    scene = Scene(SCENES[name])
+def recorded(name: str, spec: dict[str, Any]) -> Recording:
+    """The recording of the scene of that name, drawn if need be."""
+    scene = Scene(spec)
     ends = [hashlib.sha256(scene.render(frame).tobytes()).hexdigest() for frame in (0, scene.frames - 1)]
     stem, stamp = FOLDER / name / "drive", FOLDER / name / "stamp.json"
     wanted = {"scene": scene.spec, "ends": ends}
     if not stamp.exists() or json.loads(stamp.read_text()) != json.loads(json.dumps(wanted)):
         stem.parent.mkdir(parents=True, exist_ok=True)
         stamp.unlink(missing_ok=True)
-        simulate(SCENES[name], stem, quiet=True)
+        simulate(spec, stem, quiet=True)
         stamp.write_text(json.dumps(wanted))
     return Recording.at(stem)
 
@@ -124,7 +124,7 @@ def findings(measured: Measurement, scene: Scene) -> list[Limits]:
 
 def video_figures(name: str) -> list[Limits]:
     """Name, value and limits of what came out of one scene."""
-    recording = recorded(name)
+    recording = recorded(name, SCENES[name])
     scene = Scene.from_truth(recording.truth)
     profile = recording.profile.with_name("calibrated.json")
     calibrated(scene).save(profile)
