@@ -84,7 +84,7 @@ def calibrated(scene: Scene, views: int = 80, noise: float = 0.05) -> pf.Camera:
 
 
 def recorded(name: str, spec: dict[str, Any]) -> Recording:
-    """A scene's recording under this name, drawn if need be."""
+    """The recording of the scene of that name, drawn if need be."""
     scene = Scene(spec)
     ends = [hashlib.sha256(scene.render(frame).tobytes()).hexdigest() for frame in (0, scene.frames - 1)]
     stem, stamp = FOLDER / name / "drive", FOLDER / name / "stamp.json"

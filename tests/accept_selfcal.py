@@ -1,10 +1,10 @@
 """Self-calibration and the profile's health check over random set-ups, and on real data where they are; resumable.
 
-    python tests/accept_selfcal.py [--only general,half,degenerate,real,health] [--setups 500]
+    python tests/accept_selfcal.py [--only general,half,degenerate,real,health,rendered] [--setups 500]
 
 prints a table, then one JSON list of {name, value, bound, holds}. Results of set-ups are kept in build/accept_selfcal/,
 one line each, and taken from there while product and script are the same. Real data: in PIPEFISH_DATA or
-../shared/data.
+../shared/data. `rendered` draws a video (340 MB, kept in build/accept/recon/knee) and plays it through pipefishd.
 """
 
 import argparse
@@ -21,14 +21,19 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "python"))
 
-from accept_rows import Row, at_least, at_most, figure, kept_series, print_rows  # noqa: E402
+from accept_recon_video import calibrated, recorded  # noqa: E402
+from accept_rows import Row, at_least, at_most, exactly, figure, kept_series, print_rows  # noqa: E402
 
 from calib_data_sets import jy_stereo, ov_plane  # noqa: E402
 from pipefish.camera import Camera  # noqa: E402
+from pipefish.demo import find_programs, survey_over_the_line  # noqa: E402
 from pipefish.matching_files import read_grey  # noqa: E402
+from pipefish.measure import measure  # noqa: E402
 from pipefish.selfcal import self_calibrate  # noqa: E402
 from pipefish.selfcal_input import COMMON_SIGMA, match_pictures  # noqa: E402
-from selfcal_drives import health_of  # noqa: E402
+from pipefish.simulate import Scene  # noqa: E402
+from pipefish.survey import Survey  # noqa: E402
+from selfcal_drives import drifted, health_of  # noqa: E402
 from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup  # noqa: E402
 
 KEEP = ROOT / "build" / "accept_selfcal"
@@ -224,13 +229,45 @@ def check_health(count: int) -> Iterator[Row]:
     yield figure("health.straight_not_cannot_tell", certain, "= 0", certain == 0)
 
 
+# A DN300 with a bend of 90 degrees, concrete; 0.3 m/s, 15 mm a frame.
+KNEE = {
+    "diameter": 0.3,
+    "pieces": [{"length": 2.0}, {"angle": math.pi / 2, "radius": 0.9, "clock": 0.6}, {"length": 2.4}],
+    "texture": {"seed": 53},
+    "sensor": {"seed": 53, "exposure_s": 0.001},
+    "motion": {"seed": 53, "frames": 330, "speed": 0.3},
+    "telemetry": {"seed": 53},
+}
+CHANGES = ("", "scale", "centre")
+
+
+def rendered(number: int) -> Row:
+    """A drawn survey through pipefishd, by a profile from a board that is right or changed since; diameter unknown."""
+    recording = recorded("knee", KNEE)
+    recording.profile = recording.video.with_name("profile.json")
+    drifted(calibrated(Scene.from_truth(recording.truth)), CHANGES[number]).save(recording.profile)
+    run = recording.video.with_name("run")
+    survey = survey_over_the_line(find_programs(None), recording, run, True)
+    health = measure(Survey.open(Path(survey["file"]))).health
+    assert health is not None
+    return {"change": CHANGES[number], **health.as_dict()}
+
+
+def check_rendered() -> Iterator[Row]:
+    right, *changed = kept_series(KEEP, "rendered", len(CHANGES), rendered)
+    for row in (right, *changed):
+        print(f"  rendered, {row['change'] or 'right'}: {row['text']}", file=sys.stderr)
+    yield exactly("health.rendered_right_called_valid", float(right["verdict"].endswith("valid")), 1.0)
+    yield exactly("health.rendered_drifts_found", sum(r["verdict"].startswith("drifted") for r in changed), 2)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--setups", type=int, default=500)
     parser.add_argument("--half", type=int, default=200)
     parser.add_argument("--degenerate", type=int, default=200)
     parser.add_argument("--health", type=int, default=100)
-    parser.add_argument("--only", default="general,half,degenerate,real,health")
+    parser.add_argument("--only", default="general,half,degenerate,real,health,rendered")
     args = parser.parse_args()
     checks: dict[str, Callable[[], Iterator[Row]]] = {
         "general": lambda: check_general(args.setups),
@@ -238,6 +275,7 @@ def main() -> int:
         "degenerate": lambda: check_degenerate(args.degenerate),
         "real": check_real,
         "health": lambda: check_health(args.health),
+        "rendered": check_rendered,
     }
     rows = [row for name in args.only.split(",") for row in checks[name]()]
     print_rows(rows)

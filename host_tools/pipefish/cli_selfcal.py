@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 from pipefish.cli import Result, add_command, positive, table
@@ -25,6 +26,8 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     from pipefish.selfcal import self_calibrate
     from pipefish.selfcal_input import read
 
+    if not Path(args.output).absolute().parent.is_dir():
+        raise ArgumentError(f"--output: {Path(args.output).parent} is no folder")
     with Progress("selfcal", 100, args.json) as bar:
         given = read(args.inputs, args.threads, lambda done, of: bar.update(80 * done // of, "matching"))
         if args.size and given.size and tuple(args.size) != given.size:

@@ -1,7 +1,8 @@
 """Whether a survey still agrees with its camera profile. docs/selfcal.md.
 
 The survey's last adjustment is made once more with the profile free to drift, and what it says of the drift is
-compared with what noise and the profile's own covariance allow. A drift that it cannot see is never called none.
+compared with what noise, the profile's own covariance and what no profile knows of its lens allow. A drift that it
+cannot see is never called none.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .camera import Camera
+from .camera import PARAMETERS, Camera
 from .errors import ArgumentError
 from .structure import Encoder, Reconstruction, RollingShutter, reconstruct
 from .survey import Tracks
@@ -24,10 +25,15 @@ Floats = npt.NDArray[np.float64]
 
 BUDGET = 0.005  # of the diameter: what profilers are required to hold, and calibration's verdict allows
 FALSE_ALARM = 0.005  # of the test: the noise is never quite the one stated, and the bar is 2 %
-FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1")
+CPOLY_POWERS = (1,) * 2 + (2,) * 6 + (3,) * 6  # of theta, by coefficient
+FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1", *(f"cpoly[{n}]" for n in range(14)))
 #: Metres, of a profile that says nothing of the pupil's shift: two millimetres at 57 degrees, five at 90. A wall 75 mm
 #: away looks through it as if the angles had drifted.
 PUPIL_SIGMA = 0.002
+# What a good profile does not know of its lens, pixels: ripples of the radius over LENS_LENGTH radians, and terms that
+# are not round, each at the rim. Three directions of drift are radial curves that are nearly alike, so that 0.07 px of
+# ripple look like 1.7 % of the angle scale with 1 % along alpha and a bend, to a sigma of 0.4 %.
+LENS_RADIAL_PX, LENS_LENGTH, LENS_ASYMMETRIC_PX = 0.06, 0.4, 0.2
 #: How a profile may drift: directions, and their sigmas. A knock or another temperature moves these, no others.
 DRIFT = {
     "angle scale": 0.03,  # all angles by a factor
@@ -78,27 +84,53 @@ class ProfileCheck:
         return out
 
 
+def _radial_slope(camera: Camera, theta: Floats) -> Floats:
+    """(N,5): how the radius at angles (N,) from the axis, in units of f, answers to ln f and k2 to k5."""
+    powers = theta[:, None] ** np.array([3, 5, 7, 9])
+    return np.column_stack([theta + powers @ [camera.k2, camera.k3, camera.k4, camera.k5], powers])
+
+
+def _radial_fit(camera: Camera, theta: Floats) -> Floats:
+    """(5,N): change of ln f and k2 to k5 by a change of the radius, in units of f, at angles (N,)."""
+    design = _radial_slope(camera, theta)
+    scale = np.abs(design).max(axis=0)
+    return np.linalg.pinv(design / scale) / scale[:, None]
+
+
+def _into_free(camera: Camera) -> Floats:
+    """(23,5): what ln f and k2 to k5 do to FREE."""
+    out = np.zeros((len(FREE), 5))
+    out[0, 0], out[1, 0] = camera.f_u, camera.f_v
+    out[4:8, 1:] = np.eye(4)
+    return out
+
+
 def _directions(camera: Camera, theta_end: float) -> Floats:
-    """(9,5): what each way to drift, by its unit, does to FREE."""
+    """(23,5): what each way to drift, by its unit, does to FREE."""
     theta = np.linspace(0.02, 1.0, 60) * theta_end
     k = np.array([camera.k2, camera.k3, camera.k4, camera.k5])
-    powers = theta[:, None] ** np.array([3, 5, 7, 9])
     rise = 1 + (theta[:, None] ** np.array([2, 4, 6, 8]) * np.array([3, 5, 7, 9])) @ k
-    design = np.column_stack([theta + powers @ k, powers])
-    scale = np.abs(design).max(axis=0)
-    along = np.linalg.lstsq(design / scale, rise * np.sin(theta) * np.cos(theta), rcond=None)[0] / scale
     out = np.zeros((len(FREE), len(DRIFT)))
     out[0, 0], out[1, 0] = camera.f_u, camera.f_v
-    out[0, 1], out[1, 1], out[4:8, 1] = along[0] * camera.f_u, along[0] * camera.f_v, along[1:]
+    out[:, 1] = _into_free(camera) @ _radial_fit(camera, theta) @ (rise * np.sin(theta) * np.cos(theta))
     out[4, 2] = out[2, 3] = out[3, 4] = 1.0
     return out
 
 
-def _own_covariance(camera: Camera) -> Floats:
-    """The profile's covariance of FREE, (9,9); with a little of each so that it has an inverse."""
+def _own_covariance(camera: Camera, theta_end: float) -> Floats:
+    """The covariance of FREE without a drift, (23,23): the profile's, and what it does not know of its lens."""
     pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_SIGMA
-    bends = [1e-8, 1e-9, 1e-10, 1e-11]
-    out = np.diag([(2e-4 * camera.f_u) ** 2, (2e-4 * camera.f_v) ** 2, 0.01, 0.01, *bends, pupil**2])
+    theta = np.linspace(0.2, 1.0, 60) * theta_end
+    ripple = (LENS_RADIAL_PX / camera.f_u) ** 2 * np.exp(-0.5 * ((theta[:, None] - theta) / LENS_LENGTH) ** 2)
+    fit = _into_free(camera) @ _radial_fit(camera, theta)
+    out = fit @ ripple @ fit.T
+    own = np.zeros(len(FREE))
+    own[:2] = 2e-4 * np.array([camera.f_u, camera.f_v])
+    own[2:4] = LENS_ASYMMETRIC_PX
+    own[4:8] = [1e-4, 3e-5, 1e-5, 3e-6]  # little, so that there is an inverse
+    own[8] = pupil
+    own[9:] = LENS_ASYMMETRIC_PX / camera.f_u / theta_end ** np.array(CPOLY_POWERS)
+    out += np.diag(own**2)
     if camera.covariance is not None:
         places = [(i, FREE.index(n)) for i, n in enumerate(camera.covariance_parameters) if n in FREE]
         for i, a in places:
@@ -107,37 +139,30 @@ def _own_covariance(camera: Camera) -> Floats:
     return out
 
 
-def _diameter_slope(camera: Camera, tracks: Tracks, directions: Floats) -> Floats:
-    """(5,): how ln of the diameter answers to each way to drift, for the angles at which the wall was seen. A wall
-    point seen at two angles a and b, a distance s apart, is s / (cot a - cot b) off the axis."""
+def _diameter_slope(camera: Camera, tracks: Tracks) -> Floats:
+    """(23,): how ln of the diameter answers to FREE, for the angles at which the wall was seen. A wall point seen at
+    two angles a and b, a distance s apart, is s / (cot a - cot b) off the axis."""
     first = np.flatnonzero(np.diff(tracks.track, prepend=-1))
     last = np.append(first[1:], len(tracks.track)) - 1
-    ends = tracks.pixels[np.concatenate([first, last])]
-
-    def angles(changed: Camera) -> Floats:
-        rays, _ = changed.unproject(ends)
-        return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-
-    theta = angles(camera)
-    near, far = np.split(theta, 2)
+    rays, ok = camera.unproject(tracks.pixels[np.concatenate([first, last])])
+    across = np.hypot(rays[:, 0], rays[:, 1])
+    theta = np.arctan2(across, rays[:, 2])
+    _, _, by_point, by_free = camera.project_jacobian(rays)
     with np.errstate(divide="ignore", invalid="ignore"):
+        outward = np.column_stack([rays[:, :2] / across[:, None] * np.cos(theta)[:, None], -np.sin(theta)])
+        rise = np.einsum("nij,nj->ni", by_point, outward)
+        by_free = by_free[:, :, [PARAMETERS.index(name) for name in FREE]]
+        slope = -np.einsum("ni,nip->np", rise, by_free) / (rise**2).sum(axis=1)[:, None]
+        near, far = np.split(theta, 2)
+        slope_near, slope_far = np.split(slope, 2)
         base = 1 / np.tan(near) - 1 / np.tan(far)
         weight = base**2 / (1 / np.sin(near) ** 4 + 1 / np.sin(far) ** 4)
-    out = np.zeros(directions.shape[1])
-    for column in range(directions.shape[1]):
-        h = 1e-4 * (DRIFT[list(DRIFT)[column]] / 0.05)
-        changed = dataclasses.replace(
-            camera,
-            covariance=None,
-            covariance_parameters=(),
-            **{n: getattr(camera, n) + h * d for n, d in zip(FREE, directions[:, column], strict=True)},
-        )
-        slope_near, slope_far = np.split((angles(changed) - theta) / h, 2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            each = (slope_near / np.sin(near) ** 2 - slope_far / np.sin(far) ** 2) / base
-        known = np.isfinite(each) & np.isfinite(weight) & (np.abs(base) > 0.2)
-        out[column] = np.average(each[known], weights=weight[known]) if known.any() else 0.0
-    return out
+        each = slope_near / np.sin(near)[:, None] ** 2 - slope_far / np.sin(far)[:, None] ** 2
+        each /= base[:, None]
+    known = (
+        np.logical_and(*np.split(ok, 2)) & np.isfinite(each).all(axis=1) & np.isfinite(weight) & (np.abs(base) > 0.2)
+    )
+    return np.average(each[known], axis=0, weights=weight[known]) if known.any() else np.zeros(len(FREE))
 
 
 def _chi2_tail(value: float, degrees: int) -> float:
@@ -161,16 +186,16 @@ def _theta_end(camera: Camera, tracks: Tracks) -> float:
     return float(np.quantile(theta, 0.98)) if len(theta) else 0.0
 
 
-def _prior(camera: Camera, directions: Floats) -> Floats:
-    scaled = directions * np.array(list(DRIFT.values()))
-    return _own_covariance(camera) + scaled @ scaled.T
+def _prior(camera: Camera, theta_end: float) -> Floats:
+    scaled = _directions(camera, theta_end) * np.array(list(DRIFT.values()))
+    return _own_covariance(camera, theta_end) + scaled @ scaled.T
 
 
-def drift_prior(tracks: Tracks, camera: Camera) -> tuple[tuple[str, ...], Floats] | None:
-    """What reconstruct(drift=...) takes for a check of the profile. None for a camera that is not generic, or not a
-    track inside its field."""
+def drift_prior(tracks: Tracks, camera: Camera, noise: float = 1.0) -> tuple[tuple[str, ...], Floats, float] | None:
+    """What reconstruct(drift=...) takes for a check of the profile; `noise`: factor on the tracks' sigmas. None for a
+    camera that is not generic, or not a track inside its field."""
     end = _theta_end(camera, tracks) if camera.radial == "generic" else 0.0
-    return (FREE, _prior(camera, _directions(camera, end))) if end > 0 else None
+    return (FREE, _prior(camera, end), noise) if end > 0 else None
 
 
 def check_profile(
@@ -186,23 +211,23 @@ def check_profile(
     diameter: float | None = None,
     diameter_sigma: float = 0.001,
     budget: float = BUDGET,
-    common: float = 1.0,
+    noise: float = 1.0,
     threads: int | None = None,
     shutter: RollingShutter | None = None,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
     tracks .. sigma, shutter  as of reconstruct()
-    structure        reconstruct() of the same with drift=drift_prior(tracks, camera); None: it is made here
+    structure        reconstruct() of the same with drift=drift_prior(tracks, camera, noise); None: it is made here
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
-    common           factor on the noise of the tracks, for errors that many of them have in common
+    noise            factor on the sigmas of the tracks, where they are wider than noise to keep something else at bay
 
     Raises ArgumentError.
     """
-    if not common >= 1:
-        raise ArgumentError(f"common: {common} is below 1")
+    if not noise > 0:
+        raise ArgumentError(f"noise: {noise} is not above 0")
     if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
         raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
     if camera.radial != "generic":
@@ -210,9 +235,7 @@ def check_profile(
     end = _theta_end(camera, tracks)
     if not end > 0:
         return _nothing(budget, "no track inside the profile's field")
-    directions = _directions(camera, end)
-    drift = np.array(list(DRIFT.values()))
-    own, prior = _own_covariance(camera), _prior(camera, directions)
+    prior = _prior(camera, end)
     found = structure or reconstruct(
         tracks,
         dataclasses.replace(camera, covariance=None, covariance_parameters=()),
@@ -222,7 +245,7 @@ def check_profile(
         attitude_sigma=attitude_sigma,
         sigma=sigma,
         threads=threads,
-        drift=(FREE, prior),
+        drift=(FREE, prior, noise),
         shutter=shutter,
     )
     if not found.drift:
@@ -233,30 +256,38 @@ def check_profile(
             "the camera never panned, tilted or went round a bend; a known diameter beside the encoder "
             "would show a drift",
         )
-    # In units of the drift's sigmas; what of a change is no drift belongs to the profile's own covariance.
-    scaled = directions * drift
-    weight = np.linalg.inv(own)
-    into = np.linalg.solve(scaled.T @ weight @ scaled + np.eye(5), scaled.T @ weight)
-    before, own_part = into @ prior @ into.T, into @ own @ into.T
-    value, spread = _together(found, into, before, common)
-    slope = _diameter_slope(camera, tracks, directions) * drift
-    evidence = "bends and turns of the drive"
+    seen = _together(found, prior)
+    slope, evidence = _diameter_slope(camera, tracks), "bends and turns of the drive"
     if diameter is not None and found.unit == "metre":
-        value, spread, evidence = _with_diameter(found, diameter, diameter_sigma, common, value, spread, slope)
-    return _judge(value, spread, before, own_part, slope, drift, budget, evidence)
+        seen, evidence = _with_diameter(found, diameter, diameter_sigma, seen, slope)
+    return _judge(seen, camera, end, slope, budget, evidence)
 
 
-def _together(found: Reconstruction, into: Floats, before: Floats, common: float) -> tuple[Floats, Floats]:
-    """Drift (5,) in its prior's sigmas and its covariance, from all segments. Noise above the one stated counts."""
-    prior = np.linalg.inv(before)
-    known, weighed = prior.copy(), np.zeros(len(before))
+@dataclass(frozen=True)
+class _Seen:
+    """What the survey alone says of FREE: information (23,23), and information times value (23,)."""
+
+    information: Floats
+    weighed: Floats
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """Of a covariance or an information whose parameters differ by many orders of magnitude."""
+    scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    out = np.linalg.inv(matrix / np.outer(scale, scale)) / np.outer(scale, scale)
+    return (out + out.T) / 2
+
+
+def _together(found: Reconstruction, prior: Floats) -> _Seen:
+    """From all segments. Noise above the one stated counts."""
+    before = _inverse(prior)
+    information, weighed = np.zeros_like(prior), np.zeros(len(prior))
     for part, factor in zip(found.drift, found.variance_factor, strict=True):
-        posterior = np.linalg.inv(into @ part["covariance"] @ into.T)
-        noise = common**2 * max(1.0, factor)
-        known += (posterior - prior) / noise
-        weighed += posterior @ into @ part["camera"] / noise
-    spread = np.linalg.inv((known + known.T) / 2)
-    return spread @ weighed, spread
+        posterior = _inverse(part["covariance"])
+        noise = max(1.0, factor / part["noise"] ** 2)
+        information += (posterior - before) / noise
+        weighed += posterior @ part["camera"] / noise
+    return _Seen(information, weighed)
 
 
 def _largest_turn(found: Reconstruction) -> float:
@@ -276,15 +307,9 @@ def _nothing(budget: float, why: str) -> ProfileCheck:
 
 
 def _with_diameter(
-    found: Reconstruction,
-    diameter: float,
-    diameter_sigma: float,
-    common: float,
-    value: Floats,
-    spread: Floats,
-    slope: Floats,
-) -> tuple[Floats, Floats, str]:
-    """The known diameter beside the measured one, as one more measurement of the drift."""
+    found: Reconstruction, diameter: float, diameter_sigma: float, seen: _Seen, slope: Floats
+) -> tuple[_Seen, str]:
+    """The known diameter beside the measured one, as one more measurement of the profile."""
     part = found.drift[0]
     inside = np.flatnonzero(found.point_segment == 0)
     inside = inside[np.isin(found.track[inside], part["tracks"])]
@@ -292,38 +317,32 @@ def _with_diameter(
     centres = -np.einsum("nij,ni->nj", part["poses"][:, :, :3], part["poses"][:, :, 3])
     tube = fit_tube(part["points"][kept], found.covariance[inside], centres)
     if tube.status != "ok":
-        return value, spread, f"bends and turns of the drive; no diameter ({tube.reason})"
+        return seen, f"bends and turns of the drive; no diameter ({tube.reason})"
     measured = float(tube.summary["d_mean"])
-    random = common * float(tube.summary["d_mean_sigma"]) / measured
+    random = float(tube.summary["d_mean_sigma"]) / measured
     noise = random**2 + found.scale_sigma**2 + diameter_sigma**2
-    gain = spread @ slope / (slope @ spread @ slope + noise)
-    value = value + gain * math.log(diameter / measured)
-    spread = spread - np.outer(gain, slope @ spread)
-    return value, (spread + spread.T) / 2, "the encoder and the known diameter, bends and turns of the drive"
+    # It was measured with the profile as it was found in that adjustment.
+    value = math.log(diameter / measured) + slope @ part["camera"]
+    together = _Seen(seen.information + np.outer(slope, slope) / noise, seen.weighed + slope * value / noise)
+    return together, "the encoder and the known diameter, bends and turns of the drive"
 
 
-def _judge(
-    value: Floats,
-    spread: Floats,
-    before: Floats,
-    own: Floats,
-    slope: Floats,
-    drift: Floats,
-    budget: float,
-    evidence: str,
-) -> ProfileCheck:
-    open_sigma = math.sqrt(max(0.0, slope @ spread @ slope))
-    # What the data alone say: information beyond the prior's, along the combinations that have enough of it.
-    known = np.linalg.inv(spread) - np.linalg.inv(before)
+def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget: float, evidence: str) -> ProfileCheck:
+    drift = np.array(list(DRIFT.values()))
+    scaled = _directions(camera, theta_end) * drift  # in units of the drift's sigmas
+    own = _inverse(_own_covariance(camera, theta_end))
+    left = _inverse(seen.information + _inverse(_prior(camera, theta_end)))
+    open_sigma = math.sqrt(max(0.0, slope @ left @ slope))
+    # Of the drift, with the profile's own uncertainty as noise.
+    apart = seen.information @ _inverse(seen.information + own)
+    known = scaled.T @ (seen.information - apart @ seen.information) @ scaled
+    weighed = scaled.T @ (seen.weighed - apart @ seen.weighed)
     size, axes = np.linalg.eigh((known + known.T) / 2)
-    seen = size > SEEN
-    axes, size = axes[:, seen], size[seen]
-    statistic = 0.0
-    if seen.any():
-        alone = axes.T @ np.linalg.solve(spread, value) / size
-        noise = np.diag(1 / size) + axes.T @ own @ axes
-        statistic = float(alone @ np.linalg.solve(noise, alone))
-    probability = _chi2_tail(statistic, int(seen.sum()))
+    clear = size > SEEN
+    statistic = float(np.sum((axes[:, clear].T @ weighed) ** 2 / size[clear]))
+    probability = _chi2_tail(statistic, int(clear.sum()))
+    spread = np.linalg.inv((known + known.T) / 2 + np.eye(len(DRIFT)))
+    value = spread @ weighed
     sigmas = np.sqrt(np.maximum(0, spread.diagonal()))
     changes = {
         name: (float(v * d * (100 if UNITS[name] == "%" else 1)), float(s * d * (100 if UNITS[name] == "%" else 1)))
@@ -347,4 +366,4 @@ def _judge(
         text = f"The profile has drifted: {what}; {open_text}. Recalibrate the camera."
     else:
         verdict, text = VERDICTS["valid"], f"The profile is still valid: {open_text}, by {evidence}."
-    return ProfileCheck(verdict, text, open_sigma, budget, changes, probability, int(seen.sum()), evidence)
+    return ProfileCheck(verdict, text, open_sigma, budget, changes, probability, int(clear.sum()), evidence)

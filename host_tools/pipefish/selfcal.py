@@ -39,9 +39,12 @@ PARAMETERS = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
 
 #: Why there is no camera.
 REASONS = {
-    "no_matches": "too few matches agree with one motion of a camera",
-    "standing": "hardly anything moved between the views: a camera that stands",
-    "turning": "the camera only turned: without a change of place nothing is seen in depth",
+    "no_matches": "too few matches agree with one motion of a camera. Take sharp pictures of a scene that stands still "
+    "and has texture, which overlap by more than half",
+    "standing": "hardly anything moved between the views: a camera that stands, or one picture twice. Move it, and pan "
+    "or tilt it, between views",
+    "turning": "the camera only turned: without a change of place nothing is seen in depth. Move it as well, by a tenth "
+    "of the distance to the scene or more",
     "low_coverage": "the matches span too little of the picture",
     "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
     "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",
@@ -226,9 +229,9 @@ def _reason(status: str, found: dict[str, Any]) -> str:
         )
         text += " of a scene in depth" if found["needed"] else ", with more or better matches"
     if status == "low_coverage":
-        text += f" ({100 * found['area']:.0f} %; {100 * AREA_LEAST:.0f} % are needed)"
+        text += f" ({100 * found['area']:.0f} %; {100 * AREA_LEAST:.0f} % are needed). Take a scene that fills it"
     if status == "planar":
-        text += ": take a scene in depth"
+        text += ". Take a scene in depth: near and far things, not a wall or a board alone"
     return text
 
 

@@ -114,7 +114,7 @@ def from_matches(path: str | os.PathLike[str]) -> Input:
             if len(row) < 4:
                 raise FormatError(path, f"line {number}", f"{len(row)} numbers; each row needs x1 y1 x2 y2")
         if not rows:
-            raise FormatError(path, None, "no matches")
+            raise FormatError(path, None, "no matches: not a row of numbers x1 y1 x2 y2")
         values = np.array([row[:4] for _, row in rows])
         one, two = values[:, :2], values[:, 2:]
     return Input([_thinned(one, two)], None, [Path(path).name])
@@ -162,5 +162,7 @@ def read(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -
     if any(files):
         raise ArgumentError(f"{paths[files.index(True)]}: pictures or files of matches, not both")
     if len(paths) < 2:
-        raise ArgumentError(f"{paths[0]}: one picture; two views are the least")
+        raise ArgumentError(
+            f"{paths[0]}: alone; give two pictures or more, or a file of matches (.npz, .csv, .txt), or a survey (.mcap)"
+        )
     return from_pictures(paths, threads, tell)

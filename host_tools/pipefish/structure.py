@@ -106,7 +106,7 @@ class Reconstruction:
     camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
     cost             sum of half the squared residuals
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
-                     covariance (m,m); poses, points and tracks as they are then
+                     covariance (m,m); poses, points and tracks as they are then; noise, the factor
     """
 
     status: str
@@ -265,7 +265,7 @@ def reconstruct(
     seed: int = 0,
     still: float = 0.5,
     sag_sigma: float = 0.0,
-    drift: tuple[Sequence[str], Floats] | None = None,
+    drift: tuple[Sequence[str], Floats, float] | None = None,
     shutter: RollingShutter | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
@@ -280,8 +280,9 @@ def reconstruct(
     still      px: frames in which tracks moved less (median) are not used
     sag_sigma  px^2, above 0: tracks have a common sag that is not known, as those of a tracker with a window have in a
                tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
-    drift      names of the camera's parameters and their covariance, as wide as they may have changed since it was
-               calibrated: the adjustment is then made once more with them free, for Reconstruction.drift alone
+    drift      names of the camera's parameters, their covariance, as wide as they may have changed since it was
+               calibrated, and a factor on the noise of the tracks: the adjustment is then made once more with them
+               free, for Reconstruction.drift alone
     shutter    of a camera whose rows are exposed one after the other; None: all at once
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
@@ -324,6 +325,7 @@ def reconstruct(
         None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
         [PARAMETERS.index(name) for name in drift[0]] if drift else [],
         np.ascontiguousarray(drift[1]) if drift else None,
+        float(drift[2]) if drift else 1.0,
         float(sag_sigma),
         None if shutter is None else shutter.time,
         0.0 if shutter is None else shutter.line_time,
@@ -333,6 +335,8 @@ def reconstruct(
     out.shutter = shutter
     if shutter is not None:
         out.line_time = _line_time(found["segments"], shutter.line_time)
+    for part in out.drift:
+        part["noise"] = drift[2]
     out.own_covariance = _own_covariance(out, tracks, camera, sigma)
     return out
 

@@ -12,10 +12,8 @@ import pipefish as pf
 def fisheye(theta_max: float = 100.0, size: int = 1024, **more: float) -> pf.Camera:
     """A lens of 300 px/rad, its image circle in a square image."""
     half = (size - 1) / 2
-    values = {"k2": -0.02, "k3": 0.002} | more
-    return pf.Camera(
-        width=size, height=size, f_u=300.0, f_v=300.0, c_u=half, c_v=half, theta_max=np.radians(theta_max), **values
-    )
+    values = {"f_u": 300.0, "f_v": 300.0, "k2": -0.02, "k3": 0.002} | more
+    return pf.Camera(width=size, height=size, c_u=half, c_v=half, theta_max=np.radians(theta_max), **values)
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:

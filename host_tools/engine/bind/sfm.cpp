@@ -285,8 +285,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
                      const std::optional<Square> &uncertainty, const std::vector<uint32_t> &drifting,
-                     const std::optional<Square> &drift, double sag_sigma, const std::optional<Values> &frame_time,
-                     double line_time, double middle_row)
+                     const std::optional<Square> &drift, double drift_noise, double sag_sigma,
+                     const std::optional<Values> &frame_time, double line_time, double middle_row)
 {
     Extras extras;
     sfm::ReconstructOptions options;
@@ -310,6 +310,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     }
     options.camera_prior = prior_of(uncertain, uncertainty, extras.camera);
     options.drift_prior = prior_of(drifting, drift, extras.drift);
+    options.drift_noise = drift_noise;
     if (frame_time) {
         extras.shutter.time.assign(frame_time->data(), frame_time->data() + frame_time->shape(0));
         extras.shutter.line_time = line_time;
@@ -365,8 +366,9 @@ void bind_sfm(nb::module_ &m)
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("drifting"),
-          nb::arg("drift").noconvert().none(), nb::arg("sag_sigma"), nb::arg("frame_time").noconvert().none(),
-          nb::arg("line_time"), nb::arg("middle_row"), "Poses and points from tracks; see pipefish.structure.");
+          nb::arg("drift").noconvert().none(), nb::arg("drift_noise"), nb::arg("sag_sigma"),
+          nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"),
+          "Poses and points from tracks; see pipefish.structure.");
     m.def("adjust", &adjust, nb::arg("camera"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(),
           nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(), nb::arg("sigma"),
           nb::arg("max_iterations"), "Least squares from a start, as a segment of reconstruct().");

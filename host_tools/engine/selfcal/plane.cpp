@@ -8,6 +8,7 @@
 #include <cmath>
 #include <limits>
 #include <numbers>
+#include <optional>
 
 namespace pipefish::selfcal
 {
@@ -97,6 +98,8 @@ public:
         }
         set_weights();
     }
+
+    Matrix3 homography() const { return Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h_.data()); }
 
     // ---- the problem as the optimiser sees it
     int eliminated() const { return 0; }
@@ -219,7 +222,7 @@ private:
                 rays.push_back({f, g});
             }
             h_ = Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 9, 9>>(normal).eigenvectors().col(0);
-            const Matrix3 m = Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h_.data());
+            const Matrix3 m = homography();
             for (const auto &[f, g] : rays) {
                 sign += g.dot(m * f) > 0.0 ? 1.0 : -1.0;
             }
@@ -232,7 +235,7 @@ private:
     void set_weights()
     {
         const Pair &pair = (*at_.pairs)[pair_];
-        const Matrix3 m = Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h_.data());
+        const Matrix3 m = homography();
         for (const int i : matches()) {
             const size_t k = static_cast<size_t>(i);
             Beam<double> one, two;
@@ -275,12 +278,12 @@ constexpr double MOST_NOISE = 1.3; // of the noise stated
 // GRIC in the four coordinates of a pair: an epipolar geometry has manifolds of dimension 3, a plane of 2. The noise is
 // that of the plane's fit where it is up to MOST_NOISE of that of the epipolar one: of a plane's matches an epipolar
 // geometry with a strange lens keeps those that suit it.
-bool plane_is_cheaper(const Adjustment &lens, size_t pair, const std::vector<double> &epipolar)
+std::optional<Matrix3> cheaper_plane(const Adjustment &lens, size_t pair, const std::vector<double> &epipolar)
 {
     Problem problem(lens, pair);
     problem.fit(std::max(1.0, problem.typical()), false);
     if (problem.typical() * lens.sigma > NEAR_PX) {
-        return false;
+        return std::nullopt;
     }
     for (const double scale : {8.0, 2.0, 2.0}) {
         problem.fit(scale, true);
@@ -292,16 +295,39 @@ bool plane_is_cheaper(const Adjustment &lens, size_t pair, const std::vector<dou
     for (const double squared : epipolar) {
         sum += std::min(squared / noise, 2.0);
     }
-    return problem.truncated(4.0 * noise) / noise + 2.0 * n * std::log(4.0) + 8.0 * std::log(4.0 * n) < sum;
+    if (problem.truncated(4.0 * noise) / noise + 2.0 * n * std::log(4.0) + 8.0 * std::log(4.0 * n) < sum) {
+        return problem.homography();
+    }
+    return std::nullopt;
+}
+
+// Whether some lens makes a rotation of it. A homography leaves the lens open along cot theta -> alpha cot theta, which
+// makes diag(1, 1, alpha) H diag(1, 1, 1 / alpha) of it: of a rotation one alpha makes all singular values alike.
+// Those of a plane differ by the baseline over its distance, of an axial drive for every alpha.
+bool is_turn(const Matrix3 &h)
+{
+    constexpr double ALIKE = 0.02, LEAST_ANGLE = 0.05; // radians
+    double least = std::numeric_limits<double>::infinity(), angle = 0.0;
+    for (double log_alpha = -1.5; log_alpha < 1.5; log_alpha += 0.005) {
+        const Eigen::Vector3d scale(1.0, 1.0, std::exp(log_alpha));
+        const Matrix3 m = scale.asDiagonal() * h * scale.cwiseInverse().asDiagonal();
+        const Eigen::SelfAdjointEigenSolver<Matrix3> squares(m.transpose() * m, Eigen::EigenvaluesOnly);
+        const double spread = std::sqrt(squares.eigenvalues()[2] / std::max(squares.eigenvalues()[0], 1e-12)) - 1.0;
+        if (spread < least) {
+            least = spread;
+            angle = std::acos(std::clamp((m.trace() / std::cbrt(m.determinant()) - 1.0) / 2.0, -1.0, 1.0));
+        }
+    }
+    return least < ALIKE && angle > LEAST_ANGLE;
 }
 
 } // namespace
 
-bool is_plane(const Adjustment &at, size_t pair)
+Flat flatness(const Adjustment &at, size_t pair)
 {
     const std::vector<int> &match = at.match[pair];
     if (match.size() < 12) {
-        return false;
+        return Flat::no;
     }
     std::vector<double> epipolar;
     double reach = 0.0;
@@ -311,21 +337,20 @@ bool is_plane(const Adjustment &at, size_t pair)
         reach = std::max({reach, ((*at.pairs)[pair].one(k) - at.prior.centre).norm(),
                           ((*at.pairs)[pair].two(k) - at.prior.centre).norm()});
     }
-    if (plane_is_cheaper(at, pair, epipolar)) {
-        return true;
-    }
+    std::optional<Matrix3> h = cheaper_plane(at, pair, epipolar);
     // From ordinary lenses too: on a plane the lens found may be one from which no way leads to the plane's.
     for (const auto &[rim, q] : {std::pair(0.6, 1.0), std::pair(1.0, 0.25), std::pair(1.6, 0.0), std::pair(1.8, 0.3)}) {
+        if (h) {
+            break;
+        }
         Adjustment other = at;
         other.family = LensFamily(1.1 * rim, at.prior.bend);
         other.lens = at.prior_mean();
         other.lens[kShape] = q;
         other.lens[kLogF] = std::log(reach / nominal_radius(q, rim));
-        if (plane_is_cheaper(other, pair, epipolar)) {
-            return true;
-        }
+        h = cheaper_plane(other, pair, epipolar);
     }
-    return false;
+    return !h ? Flat::no : is_turn(*h) ? Flat::turned : Flat::plane;
 }
 
 } // namespace pipefish::selfcal

@@ -8,8 +8,14 @@
 namespace pipefish::selfcal
 {
 
+enum class Flat {
+    no,
+    plane,
+    turned, // the homography is a rotation's: without a change of place everything is as far away
+};
+
 // For the matches that count in `at`, of one of its pairs: whether plane and lens explain them for less (GRIC, Torr
 // 1998) than its epipolar geometry.
-bool is_plane(const Adjustment &at, size_t pair);
+Flat flatness(const Adjustment &at, size_t pair);
 
 } // namespace pipefish::selfcal

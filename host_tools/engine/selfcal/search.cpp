@@ -503,8 +503,8 @@ private:
             out.status = PairStatus::ok;
             if (geometry::explaining_rotation(out.pose, a, b, match, options_.seed)) {
                 out.status = PairStatus::turning;
-            } else if (is_plane(at, static_cast<size_t>(p))) {
-                out.status = PairStatus::plane;
+            } else if (const Flat flat = flatness(at, static_cast<size_t>(p)); flat != Flat::no) {
+                out.status = flat == Flat::plane ? PairStatus::plane : PairStatus::turning;
             } else {
                 good.push_back(p);
             }

@@ -414,8 +414,10 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     if (options.drift_prior) {
         segment.drift.map = map;
         settings.camera_prior = options.drift_prior;
+        TrackTable sharper = table;
+        sharper.scale_noise(options.drift_noise);
         BundleCovariance known;
-        segment.drift.camera = adjust(segment.drift.map, table, central, settings, &known).camera;
+        segment.drift.camera = adjust(segment.drift.map, sharper, central, settings, &known).camera;
         const Eigen::Index n = segment.drift.camera.size();
         segment.drift.covariance = known.border().bottomRightCorner(n, n);
     }

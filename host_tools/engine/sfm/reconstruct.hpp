@@ -17,6 +17,7 @@ struct ReconstructOptions {
     const Gravity *gravity = nullptr;   // by frame of the table
     const CameraPrior *camera_prior = nullptr;
     const CameraPrior *drift_prior = nullptr; // as wide as a camera may have changed since it was calibrated
+    double drift_noise = 1.0;                 // factor on the observations' noise in that adjustment
     double sag_sigma = 0.0;                   // as in BundleOptions
     const Shutter *shutter = nullptr;         // that rolls; times by frame of the table
 };
