@@ -13,7 +13,7 @@ namespace pipefish::segment
 namespace
 {
 
-constexpr double kSpacing = 16, kLightSpacing = 32; // of the grids, pixels
+constexpr double kLightSpacing = 16; // of the grid, pixels
 
 Side side_of(const Picture &here, const Picture &there, std::vector<Tie> ties, double scale, const Options &options)
 {
@@ -32,7 +32,7 @@ Side side_of(const Picture &here, const Picture &there, std::vector<Tie> ties, d
     const cv::Mat_<uint8_t> near(distance <= options.reach);
     const cv::Rect box = cv::boundingRect(near);
     side.reach = near(box).clone();
-    side.warp.lattice = Lattice(box, kSpacing);
+    side.warp.lattice = Lattice(box, options.spacing);
     side.warp.d = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(2 * side.warp.lattice.points()));
     side.light = Lattice(box, kLightSpacing);
     const auto points = static_cast<Eigen::Index>(side.light.points());

@@ -69,6 +69,33 @@ Matrix2d Warp::slope(double x, double y) const
     return out;
 }
 
+Warp finer(const Warp &warp)
+{
+    const Lattice &old = warp.lattice;
+    Warp out{Lattice(old.box, old.spacing / 2), {}};
+    const Lattice &grid = out.lattice;
+    out.d.resize(static_cast<Eigen::Index>(2 * grid.points()));
+    // Every other point of the new grid is one of the old, whose neighbours have a share; the others are half way.
+    struct Share {
+        int first;
+        std::array<double, 3> w;
+    };
+    const auto shares = [](int k) {
+        return k % 2 == 0 ? Share{k / 2, {0.5, 0.5, 0}} : Share{(k - 1) / 2, {0.125, 0.75, 0.125}};
+    };
+    for (int j = 0; j < grid.ny; j++)
+        for (int i = 0; i < grid.nx; i++) {
+            const Share across = shares(i), down = shares(j);
+            Vector2d v = Vector2d::Zero();
+            for (int b = 0; b < 3; b++)
+                for (int a = 0; a < 3; a++)
+                    if (const double w = across.w[static_cast<size_t>(a)] * down.w[static_cast<size_t>(b)]; w > 0)
+                        v += w * warp.d.segment<2>(2 * ((down.first + b) * old.nx + across.first + a));
+            out.d.segment<2>(2 * (j * grid.nx + i)) = v;
+        }
+    return out;
+}
+
 Normal::Normal(const Lattice &lattice)
     : lattice_(lattice), block_(lattice.points()),
       right_(Eigen::VectorXd::Zero(static_cast<Eigen::Index>(2 * lattice.points())))

@@ -43,6 +43,9 @@ struct Warp {
     Matrix2d slope(double x, double y) const;
 };
 
+// The same field on a grid of half the spacing.
+Warp finer(const Warp &warp);
+
 // Normal equations of a change of a Warp: sums of quadratic costs, sparse because a spline is local.
 class Normal
 {

@@ -220,4 +220,20 @@ double round_trip_energy(const Side &one, const Side &other)
     return sum;
 }
 
+double tie_energy(const Layer &layer, const Tie &tie, double ties)
+{
+    double sum = 0;
+    for (size_t s = 0; s < 2; s++) {
+        const Side &one = layer.side[s], &other = layer.side[1 - s];
+        const Vector2d &from = s == 0 ? tie.at : tie.to, &target = s == 0 ? tie.to : tie.at;
+        const cv::Point at(static_cast<int>(std::lround(from.x())), static_cast<int>(std::lround(from.y())));
+        if (!one.box().contains(at) || !one.reach(at - one.box().tl()))
+            return std::numeric_limits<double>::infinity();
+        const Vector2d to = one.warp.to(from.x(), from.y());
+        sum += ties * tie.weight * huber((to - target).norm() / unit_there(one)) +
+               kRoundTrip * tie.weight * huber((other.warp.to(to.x(), to.y()) - from).norm() / unit_here(one));
+    }
+    return sum;
+}
+
 } // namespace pipefish::segment

@@ -13,6 +13,7 @@ struct Options {
     double edge = 3;     // cost of a boundary, nats a pixel along the grid
     double lonely = 1;   // cost of a pixel whose place in the other picture is not the same layer's, nats
     double layer = 1000; // cost of a layer, nats
+    double spacing = 16; // of displacement's grid, pixels; halved once layers are merged
     double bend = 1;     // stiffness of displacement: nats for a second difference of a pixel between grid points
     double light = 200;  // stiffness of gain and offset: nats for a difference of 1 between grid points, halved
     double reach = 40;   // pixels beyond its matches in which a layer may be
@@ -26,6 +27,7 @@ inline constexpr double kUnit = 1000; // costs are in thousandths of a nat, whol
 struct Tie {
     Vector2d at, to;
     double weight;
+    bool free = false; // of no group: a layer may take it, and let it go
 };
 
 // One picture of a layer: from here to the other picture.
@@ -81,6 +83,9 @@ double shape_energy(const Side &side, const Options &options, double ties);
 double light_energy(const Side &side, const Options &options);
 // How far places are from themselves after the way there and back, at the ties of both sides.
 double round_trip_energy(const Side &one, const Side &other);
+
+// What a match (picture 1, picture 2) would add to these if it were among the layer's; infinite out of reach.
+double tie_energy(const Layer &layer, const Tie &tie, double ties);
 
 // Units in which a distance in a side's own picture and in the other is measured: pixels of the coarser of the two.
 inline double unit_here(const Side &side)

@@ -40,6 +40,12 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
     note("fields");
     state.merge();
     note("merge");
+    state.finer();
+    for (int k = 0; k < 3; k++) {
+        state.claim();
+        state.refine(2);
+    }
+    note("claim");
     for (int round = 0; round < options.rounds && state.layers() > 0; round++) {
         const double before = trace.back().energy;
         if (round == 1)
@@ -48,9 +54,10 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
         note("labels");
         state.remove();
         note("remove");
+        state.claim();
         state.refine(3);
         note("fields");
-        if (round < 2) {
+        if (round == 0) {
             state.merge();
             note("merge");
         }

@@ -17,16 +17,18 @@ int32_t units(double nats)
     return static_cast<int32_t>(std::lround(kUnit * nats));
 }
 
-// Matches of a group, one of four: they overlap that much.
-std::vector<Tie> ties_of(const std::vector<match::Match> &matches, const group::Groups &groups, int group)
+constexpr double kUnclaimed = 5.5; // what a match costs in a picture where no layer is near it: as one 6 pixels off
+
+// Matches of groups from `first` to before `last`, one of four: they overlap that much.
+std::vector<Tie> ties_of(const std::vector<match::Match> &matches, const group::Groups &groups, int first, int last)
 {
     constexpr int step = 4;
     std::vector<Tie> out;
     int count = 0;
     for (size_t k = 0; k < matches.size(); k++)
-        if (groups.label[k] == group && count++ % step == 0)
+        if (groups.label[k] >= first && groups.label[k] < last && count++ % step == 0)
             out.push_back({Vector2d(matches[k].x, matches[k].y), matches[k].centre.cast<double>(),
-                           step * static_cast<double>(matches[k].zncc)});
+                           step * static_cast<double>(matches[k].zncc), first < 0 || last > first + 1});
     return out;
 }
 
@@ -48,9 +50,12 @@ State::State(const std::vector<Image> (&planes)[2], const std::vector<match::Mat
     layers_.resize(static_cast<size_t>(count));
     pipefish::parallel_for(count, options.threads, [&](int k) {
         Layer &layer = layers_[static_cast<size_t>(k)];
-        layer = layer_of(pictures_, ties_of(matches, groups, k), options_);
+        layer = layer_of(pictures_, ties_of(matches, groups, k, k + 1), options_);
         layer.groups = {k};
     });
+    free_ = ties_of(matches, groups, -1, 0);
+    const std::vector<Tie> more = ties_of(matches, groups, count, groups.count);
+    free_.insert(free_.end(), more.begin(), more.end());
     for (size_t s = 0; s < 2; s++) {
         labels_[s] = LabelImage(pictures_[s].size(), uint8_t{0});
         for (int k = count; k-- > 0;) { // the largest last, over the others
@@ -74,9 +79,18 @@ double State::cut(const LabelImage (&labels)[2]) const
     return static_cast<double>(sum) / kUnit;
 }
 
+double State::unclaimed(const std::vector<Tie> &ties) const
+{
+    double sum = 0;
+    for (const Tie &t : ties)
+        sum += t.free ? 2 * ties_ * t.weight * kUnclaimed : 0;
+    return sum;
+}
+
 double State::energy() const
 {
     double sum = cut(labels_);
+    sum += unclaimed(free_);
     for (size_t k = 0; k < layers_.size(); k++)
         sum += layer_energy(layers_[k], given(static_cast<int>(k) + 1), options_) + options_.layer;
     return sum;
@@ -94,6 +108,30 @@ void State::refine(int steps)
 {
     parallel_for(static_cast<int>(layers_.size()), options_.threads,
                  [&](int k) { refine_one(layers_[static_cast<size_t>(k)], given(k + 1), steps); });
+}
+
+void State::finer()
+{
+    options_.spacing /= 2;
+    for (Layer &layer : layers_)
+        for (Side &side : layer.side)
+            side.warp = segment::finer(side.warp);
+}
+
+void State::claim()
+{
+    std::erase_if(free_, [&](const Tie &t) {
+        double least = 2 * ties_ * t.weight * kUnclaimed;
+        Layer *best = nullptr;
+        for (Layer &layer : layers_)
+            if (const double cost = tie_energy(layer, t, ties_); cost < least)
+                least = cost, best = &layer;
+        if (best != nullptr) {
+            best->side[0].ties.push_back(t);
+            best->side[1].ties.push_back({t.to, t.at, t.weight, true});
+        }
+        return best != nullptr;
+    });
 }
 
 Problem State::problem() const
@@ -213,7 +251,8 @@ bool State::try_remove(int label, int heir)
         }
         replace(labels[s], label, 0);
     }
-    double gain = layer_energy(layers_[own], given(label), options_) + options_.layer + cut(labels_) - cut(labels);
+    double gain = layer_energy(layers_[own], given(label), options_) + options_.layer + cut(labels_) - cut(labels) -
+                  unclaimed(layers_[own].side[0].ties);
     if (heir > 0)
         gain += layer_energy(layers_[other], given(heir), options_) -
                 layer_energy(layers_[other], {labels, heir, ties_}, options_);
@@ -221,6 +260,8 @@ bool State::try_remove(int label, int heir)
         return false;
     for (size_t s = 0; s < 2; s++)
         labels_[s] = labels[s];
+    std::copy_if(layers_[own].side[0].ties.begin(), layers_[own].side[0].ties.end(), std::back_inserter(free_),
+                 [](const Tie &t) { return t.free; });
     erase(own);
     return true;
 }

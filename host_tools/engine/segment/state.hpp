@@ -16,8 +16,10 @@ public:
     double energy() const;
     void refine(int steps);                // fields and noise of all layers
     void relabel(int cycles);              // alpha-expansion
+    void claim();                          // matches without a layer, by the layers whose fields are near
     void merge();                          // pairs that are cheaper as one
     void remove();                         // layers that are dearer than the background
+    void finer();                          // displacement from now on on a grid of half the spacing
     void trust_pictures() { ties_ = 0.2; } // matches have served: from now on they count for less
     size_t layers() const { return layers_.size(); }
     Result result() const;
@@ -28,7 +30,8 @@ private:
     Problem problem() const;
     int64_t boundary(int a, int b) const; // what edges between labels a and b cost
     bool within_reach(const Layer &a, const Layer &b) const;
-    double cut(const LabelImage (&labels)[2]) const; // what all boundaries cost, nats
+    double cut(const LabelImage (&labels)[2]) const;      // what all boundaries cost, nats
+    double unclaimed(const std::vector<Tie> &ties) const; // what those that are free cost where no layer has them
     bool try_remove(int label, int heir);
     bool try_merge(size_t a, size_t b);
     void erase(size_t layer); // its labels have gone
@@ -37,6 +40,7 @@ private:
     Picture pictures_[2];
     std::vector<Problem::Edge> edges_;
     std::vector<Layer> layers_; // layer k - 1 has label k
+    std::vector<Tie> free_;     // matches of no layer
     LabelImage labels_[2];
     double ties_ = 1;
 };
