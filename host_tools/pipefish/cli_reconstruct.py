@@ -217,7 +217,7 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
         )
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
     verdict = document["quality"]["profile"]
-    if verdict and verdict["text"] not in document["remarks"]:
+    if verdict and not any(remark.startswith(verdict["text"].rstrip(".")) for remark in document["remarks"]):
         rows.append(("profile", verdict["text"]))
     rows += [("note", remark) for remark in document["remarks"]]
     rows += [("written", file) for file in files]

@@ -304,8 +304,7 @@ def measure(
         reasons = sorted({s.tube.reason for s in m.stretches})
         raise PipefishError(
             f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
-            "found, but "
-            f"no pipe around them: {'; '.join(reasons)}"
+            f"found, but no pipe around them: {'; '.join(reasons)} (a wrong camera profile?)"
         )
     _sigmas(m)
     _check_diameter(m, known.diameter)

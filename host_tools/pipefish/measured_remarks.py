@@ -55,7 +55,10 @@ def remark(m: Measurement) -> None:
     told = disagreement(m.scale)
     remarks = [told] if told else []
     if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
-        remarks.append(m.health.text)
+        # By a diameter that contradicts the encoder, one of three is wrong.
+        remarks.append(
+            m.health.text.rstrip(".") + (", unless the encoder or the given diameter is wrong." if told else ".")
+        )
     if m.scale.source == "none":
         remarks.append(
             "There is no scale: no encoder, no known length. Lengths are in mean diameters; only ratios were "

@@ -33,6 +33,7 @@ from crawler import (
 )
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import Client, Handlers
+from pipefish.rolling import KEY as LINE_TIME
 from pipefish.transport import TcpTransport
 
 
@@ -170,7 +171,7 @@ def test_the_frame_index_replays_to_the_same_keyframes(tmp_path: Path, crawler: 
 def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: Crawler):
     hashes = write_recording(tmp_path / "survey.y4m", 40)
     store = Store(crawler.port)
-    crawler.start("--set", "survey.name=Ölstraße 7")
+    crawler.start("--set", "survey.name=Ölstraße 7", "--set", "camera.line_time_us=-12.5")
     assert receive_all(crawler, store) == 0
 
     [start], keyframes, [end] = store.starts, store.keyframes, store.ends
@@ -179,6 +180,7 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
     assert (start.width, start.height, start.profile) == (WIDTH, HEIGHT, b"")
     assert start.encoder.metres_per_count == 0.0001
     assert "keyframe.step_mm = 2" in start.config
+    assert f"{LINE_TIME} = -12.5" in start.config, "what `reconstruct` takes the rows' time from"
     tracker = "".join(f"{line}\n" for line in start.config if line.startswith("tracker."))
     assert start.tracker_config_sha256 == hashlib.sha256(tracker.encode()).digest()
     assert {start.survey_id} == {k.survey_id for k in keyframes} | {end.survey_id}

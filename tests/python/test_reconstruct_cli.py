@@ -231,6 +231,7 @@ def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged
     assert not check["consistent"] and check["deviation"] < -3 and not check["used"]
     assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
     assert "sigma apart" in " ".join(document["remarks"])
+    assert "Recalibrate the camera, unless the encoder or the given diameter is wrong." in " ".join(document["remarks"])
 
 
 def test_a_stretch_without_texture_is_left_blank_and_the_rest_is_measured(tmp_path):
