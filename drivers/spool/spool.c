@@ -225,18 +225,22 @@ static void close_database(spool *s)
 }
 
 /* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
- * some need not know. */
+ * some need not know. A file that cannot be set aside stays in use; without a new one every call tries again (enter).
+ */
 static pf_status heal(spool *s)
 {
     char aside[PF_SALVAGE_PATH_MAX];
-    close_database(s);
     s->is_damaged = false;
     s->stats.errors++;
     pf_status status = pf_spool_set_aside(s->path, aside, &s->failure);
-    if (status == PF_OK)
-        status = open_database(s);
     if (status != PF_OK)
         return status;
+    close_database(s);
+    status = open_database(s);
+    if (status != PF_OK) {
+        close_database(s);
+        return status;
+    }
     s->stats.objects = pf_spool_salvage(s->db, aside);
     (void)pf_fail(&s->failure, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", s->path,
                   s->stats.objects, aside);
@@ -245,6 +249,18 @@ static pf_status heal(spool *s)
     s->stats.bytes = (uint64_t)bytes;
     s->stats.healed++;
     return status;
+}
+
+/* Takes the mutex. False, without it: the file could not be opened again after it was found damaged, nor can it now. */
+static bool enter(spool *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    if (s->db != NULL || open_database(s) == PF_OK)
+        return true;
+    close_database(s);
+    s->stats.errors++;
+    pthread_mutex_unlock(&s->mutex);
+    return false;
 }
 
 /* ---- calls; each takes the mutex ---- */
@@ -349,7 +365,8 @@ static pf_status try_to_store(spool *s, const object *o, const char *key, const 
 
 static pf_status store(spool *s, const object *o, const char *key, const void *value, size_t value_n)
 {
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     pf_status status = try_to_store(s, o, key, value, value_n);
     if (s->is_damaged && heal(s) == PF_OK)
         status = try_to_store(s, o, key, value, value_n);
@@ -392,7 +409,8 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
     uint64_t freed = 0;
     int code = SQLITE_ROW;
     *count = 0;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_VICTIMS];
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     (void)sqlite3_bind_int64(q, 2, importance);
@@ -416,7 +434,8 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
 static pf_status spool_keep_all(void *self)
 {
     spool *s = self;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     pf_status status = run(s, SQL_KEEP_ALL) ? PF_OK : fail_call(s, "keeping what is there");
     pthread_mutex_unlock(&s->mutex);
     return status;
@@ -438,7 +457,8 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
     pf_status status = PF_OK;
     if (after >= INT64_MAX)
         return PF_ERR_END;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_NEXT];
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     int code = sqlite3_step(q);
@@ -464,7 +484,8 @@ static pf_status spool_read(void *self, uint64_t row, void *bytes, size_t capaci
     spool *s = self;
     uint8_t hash[32];
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_READ];
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
@@ -497,7 +518,8 @@ static pf_status spool_remove(void *self, uint64_t row)
 {
     spool *s = self;
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_SIZE];
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
@@ -519,7 +541,8 @@ static pf_status spool_get(void *self, const char *key, void *bytes, size_t capa
 {
     spool *s = self;
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_GET];
     (void)sqlite3_bind_text(q, 1, key, -1, SQLITE_STATIC);
     int code = sqlite3_step(q);
