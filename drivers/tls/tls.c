@@ -155,7 +155,7 @@ static guest *free_place(tls *t, const uint8_t address[16], uint64_t now)
     for (int i = 0; i < GUESTS_MAX; i++) {
         if (t->guests[i].fd < 0)
             place = &t->guests[i];
-        else if (memcmp(t->guests[i].address, address, 16) == 0)
+        else if (!t->guests[i].is_leaving && memcmp(t->guests[i].address, address, 16) == 0)
             same++;
     }
     if (same >= GUESTS_OF_ADDRESS)
