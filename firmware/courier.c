@@ -35,6 +35,7 @@ struct pf_courier {
     visitor visitors[PF_VISITORS_MAX];
     char failure[256]; /* of the transport, as it was last logged; "" since it is connected */
     uint64_t status_due, publish_due;
+    uint32_t refused;                   /* strangers and hosts, when it was last looked at */
     pf_link_event profile;              /* one that the host has sent; its bytes are the link's until it is answered */
     bool has_profile, is_profile_asked; /* it waits for the keeper; the keeper has it */
     const uint8_t *still;               /* name of the one that the link sends; NULL = none */
@@ -148,12 +149,24 @@ static void send_still(pf_courier *c)
 
 /* ---- events */
 
+/* Who it is, where that is known: whose request it was then stands in the log behind it. */
+static void tell_host(const pf_session *s, const char *what)
+{
+    const pf_transport_stats *network;
+    const char *name;
+    pf_role role = s->transport.ops->peer(s->transport.self, &name, &network);
+    if (network != NULL)
+        pf_log(PF_LOG_INFO, "%s: %s, %s", what, name, pf_role_text(role));
+    else
+        pf_log(PF_LOG_INFO, "%s", what);
+}
+
 static void take_event(void *context, pf_session *s, const pf_link_event *e, uint64_t now)
 {
     pf_courier *c = context;
     switch ((pf_link_event_type)e->type) {
     case PF_LINK_UP:
-        pf_log(PF_LOG_INFO, "host is there%s", e->peer_restarted ? " (started anew)" : "");
+        tell_host(s, e->peer_restarted ? "host is there (started anew)" : "host is there");
         if (e->peer_restarted)
             drop_still(c); /* the host before asked for it */
         c->status_due = now;
@@ -220,6 +233,25 @@ static void tell_failure(pf_courier *c)
     pf_log(PF_LOG_WARNING, "%s: %s", t->ops->name(t->self), failure);
 }
 
+/* Those who were turned away while a host is there; without one it is the transport's failure and told as such. */
+static void tell_refused(pf_courier *c)
+{
+    const pf_transport *t = &c->daemon->transport;
+    const pf_transport_stats *s;
+    const char *name;
+    (void)t->ops->peer(t->self, &name, &s);
+    if (s == NULL)
+        return;
+    const uint32_t refused = s->refused_unknown + s->refused_revoked + s->refused_handshake + s->refused_late +
+                             s->refused_often + s->refused_busy;
+    if (c->host.has_stream && refused != c->refused) {
+        if (!pf_request_may_complain())
+            return;
+        pf_log(PF_LOG_WARNING, "%s: turned away: %s", t->ops->name(t->self), t->ops->error(t->self));
+    }
+    c->refused = refused;
+}
+
 static void lose_stream(pf_courier *c, uint64_t now)
 {
     tell_failure(c);
@@ -239,6 +271,7 @@ static void service(pf_courier *c, uint64_t now)
     c->host.has_stream = status == PF_OK;
     if (!c->host.has_stream)
         tell_failure(c);
+    tell_refused(c);
 }
 
 /* ---- those that look on */
@@ -262,7 +295,7 @@ static void take_visitors(pf_courier *c, uint64_t now)
         pf_session_reset(&v->session, take_visitor_event, c, now);
         v->session.has_stream = true;
         v->since_ns = now;
-        pf_log(PF_LOG_DEBUG, "a visitor looks on");
+        tell_host(&v->session, "a host looks on");
     }
 }
 

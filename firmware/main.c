@@ -15,6 +15,7 @@
 #include "guard.h"
 #include "keeper.h"
 #include "log.h"
+#include "pairing.h"
 #include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
@@ -285,49 +286,11 @@ static void settle_profile(pf_daemon *d)
     }
 }
 
-static bool open_trust(pf_daemon *d, char *error, size_t n)
-{
-    const char *folder = d->config.link.trust;
-    char why[768] = "";
-    if (folder[0] == '\0' || pf_trust_open(&d->trust, folder, why, sizeof why) == PF_OK)
-        return true;
-    (void)snprintf(error, n, "link.trust: %s", why);
-    return false;
-}
-
-/* Lets a host in without its cable: "role key name" as a line of the file of hosts. */
-static int pair(pf_daemon *d, const char *line, char *error, size_t n)
-{
-    char key[65], why[128] = "";
-    pf_peers one;
-    if (pf_peers_parse(&one, line, strlen(line), why, sizeof why) != PF_OK || one.count != 1) {
-        (void)snprintf(error, n, "--pair: %s", one.count == 0 && why[0] == '\0' ? "nobody" : why);
-        return USAGE;
-    }
-    if (d->config.link.trust[0] == '\0') {
-        (void)snprintf(error, n, "link.trust: must be set: the folder of the keys");
-        return FAILED;
-    }
-    if (!open_trust(d, error, n))
-        return FAILED;
-    const pf_peer *peer = &one.peer[0];
-    int code = DONE;
-    if (pf_trust_set(d->trust, peer->key, peer->role, peer->name) == PF_OK) {
-        pf_key_print(pf_trust_key(d->trust), key);
-        (void)printf("%s: %s\nthis device's key: %s\n", peer->name, pf_role_text(peer->role), key);
-    } else {
-        (void)snprintf(error, n, "link.trust: %s", pf_trust_error(d->trust));
-        code = FAILED;
-    }
-    pf_trust_close(d->trust);
-    return code;
-}
-
 static bool open_transport(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
     pf_status status;
-    if (!open_trust(d, error, n))
+    if (!pf_pairing_open(d, error, n))
         return false;
     if (c->link.transport == PF_TRANSPORT_SERIAL)
         status =
@@ -558,7 +521,7 @@ int main(int argc, char **argv)
         return FAILED;
     }
     if (o.pair != NULL) {
-        code = pair(&d, o.pair, error, sizeof error);
+        code = pf_pairing_add(&d, o.pair, error, sizeof error);
         if (code != DONE)
             pf_log(PF_LOG_ERROR, "%s", error);
         return code;

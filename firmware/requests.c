@@ -4,8 +4,21 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "clock.h"
 #include "keeper.h"
 #include "log.h"
+
+#define COMPLAIN_NS UINT64_C(1000000000)
+
+bool pf_request_may_complain(void)
+{
+    static uint64_t due; /* the courier is one thread */
+    const uint64_t now = pf_now();
+    if (now < due)
+        return false;
+    due = now + COMPLAIN_NS;
+    return true;
+}
 
 /* What it was let in as. */
 static pf_role own_role(const pf_session *s)
@@ -60,7 +73,7 @@ static void send_reply(pf_session *s, const pf_msg_reply *reply)
     if (pf_msg_encode_reply(reply, bytes, sizeof bytes, &n) != PF_OK)
         return;
     pf_status sent = pf_link_send_control(s->link, bytes, n);
-    if (sent != PF_OK)
+    if (sent != PF_OK && pf_request_may_complain())
         pf_log(PF_LOG_WARNING, "reply %u: %s", reply->id, pf_status_text(sent));
 }
 
@@ -156,12 +169,14 @@ static bool may_ask(const pf_session *s, pf_request_what what, pf_msg_reply *rep
         return true;
     if (own_role(s) >= needs) {
         reply->error = "another host is connected to the device: until it has gone this one may only look on";
-        pf_log(PF_LOG_WARNING, "request %u is refused: another host is connected", (unsigned)what);
+        if (pf_request_may_complain())
+            pf_log(PF_LOG_WARNING, "request %u is refused: another host is connected", (unsigned)what);
         return false;
     }
     reply->error = needs == PF_ROLE_OPERATOR ? "this host may not: the role operator is needed"
                                              : "this host may not: the role calibrator is needed";
-    pf_log(PF_LOG_WARNING, "request %u is refused: the host is a %s", (unsigned)what, pf_role_text(has));
+    if (pf_request_may_complain())
+        pf_log(PF_LOG_WARNING, "request %u is refused: the host is a %s", (unsigned)what, pf_role_text(has));
     return false;
 }
 
@@ -194,7 +209,8 @@ void pf_request_answer(pf_daemon *d, pf_session *s, const uint8_t *bytes, size_t
     bool is_answered = true;
 
     if (pf_msg_decode_request(bytes, size, &request) != PF_OK) {
-        pf_log(PF_LOG_WARNING, "a request of %zu bytes is damaged", size);
+        if (pf_request_may_complain())
+            pf_log(PF_LOG_WARNING, "a request of %zu bytes is damaged", size);
         return;
     }
     reply.id = request.id;

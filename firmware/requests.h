@@ -7,6 +7,10 @@
 
 #define PF_CONTROL_MAX 1000u /* bytes: a status at its largest has about 500 */
 
+/* Whether what somebody else did wrong may be a line of the log: one a second, or he fills the disk. Of the courier's
+ * thread. */
+bool pf_request_may_complain(void);
+
 /* What the host at the other end may do. A visitor is a viewer, whatever it was let in as. */
 pf_role pf_request_role(const pf_session *session);
 

@@ -43,6 +43,7 @@ struct pf_store {
     pf_store_stats stats;
     /* The thread's own: */
     bool was_blocked, was_failing, was_evicting; /* has said so */
+    bool must_keep;                              /* what other surveys left still has ranks: nothing may go for it */
     char lost_break[PF_BREAK_REASON_MAX];        /* of a keyframe that was lost: the next one that is stored tells it */
 };
 
@@ -77,6 +78,9 @@ typedef struct sacrifice {
 static pf_status store_instead(pf_store *s, const pf_job *job, pf_survey *survey, const char *break_reason,
                                uint64_t cursor, sacrifice *made)
 {
+    if (s->must_keep && s->spool.ops->keep_all(s->spool.self) != PF_OK)
+        return PF_ERR_SPACE;
+    s->must_keep = false;
     uint32_t importance = job->is_event ? UINT32_MAX : pf_survey_importance(job->index);
     pf_status status = s->spool.ops->victims(s->spool.self, cursor, importance, job->n, made->victims, &made->count);
     for (uint32_t i = 0; status == PF_OK && i < made->count; i++)
@@ -267,6 +271,8 @@ static void refresh_spool_stats(pf_store *s)
     pthread_mutex_unlock(&s->mutex);
     s->spool.ops->stats(s->spool.self, &stats);
     pthread_mutex_lock(&s->mutex);
+    if (stats.healed != s->stats.spool.healed)
+        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
     s->stats.spool = stats;
     pthread_cond_broadcast(&s->change);
 }
@@ -387,11 +393,9 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
     s->config = *config;
     s->has_more = true;
     /* What other surveys left is whole, or its end has told what is lost. */
-    if (!survey->is_resumed && spool->ops->keep_all(spool->self) != PF_OK) {
-        (void)snprintf(error, n, "%s", spool->ops->error(spool->self));
-        release(s);
-        return false;
-    }
+    s->must_keep = !survey->is_resumed && spool->ops->keep_all(spool->self) != PF_OK;
+    if (s->must_keep) /* on a disk that is full: what is there can be sent all the same */
+        pf_log(PF_LOG_ERROR, "%s", spool->ops->error(spool->self));
     if (!measure_spool(s, error, n)) {
         release(s);
         return false;

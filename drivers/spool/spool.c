@@ -3,6 +3,7 @@
 #include "pipefish/drivers/spool.h"
 #include "common/failure.h"
 #include "pipefish/drivers/sha256.h"
+#include "spool/salvage.h"
 
 #include <inttypes.h>
 #include <pthread.h>
@@ -74,6 +75,7 @@ typedef struct spool {
     sqlite3_stmt *statements[SQL_STATEMENTS];
     uint64_t quota;
     char *path;
+    bool is_damaged; /* SQLite has found the file to be, and it is to be replaced */
     pf_spool_stats stats;
     pf_failure failure;
 } spool;
@@ -93,8 +95,10 @@ static pf_status fail_sqlite(spool *s, const char *doing)
     pf_status status = PF_ERR_IO;
     switch (sqlite3_errcode(s->db)) {
     case SQLITE_NOTADB:
+        s->is_damaged = pf_spool_was_one(s->path, APPLICATION_ID);
         return pf_fail(&s->failure, PF_ERR_FORMAT, "%s: not a spool: not an SQLite file", s->path);
     case SQLITE_CORRUPT:
+        s->is_damaged = true;
         status = PF_ERR_FORMAT;
         break;
     case SQLITE_BUSY:
@@ -210,6 +214,55 @@ static pf_status open_database(spool *s)
     return status;
 }
 
+static void close_database(spool *s)
+{
+    for (int i = 0; i < SQL_STATEMENTS; i++) {
+        sqlite3_finalize(s->statements[i]);
+        s->statements[i] = NULL;
+    }
+    (void)sqlite3_close(s->db);
+    s->db = NULL;
+}
+
+/* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
+ * some need not know. A file that cannot be set aside stays in use; without a new one every call tries again (enter).
+ */
+static pf_status heal(spool *s)
+{
+    char aside[PF_SALVAGE_PATH_MAX];
+    s->is_damaged = false;
+    s->stats.errors++;
+    pf_status status = pf_spool_set_aside(s->path, aside, &s->failure);
+    if (status != PF_OK)
+        return status;
+    close_database(s);
+    status = open_database(s);
+    if (status != PF_OK) {
+        close_database(s);
+        return status;
+    }
+    s->stats.objects = pf_spool_salvage(s->db, aside);
+    (void)pf_fail(&s->failure, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", s->path,
+                  s->stats.objects, aside);
+    int64_t bytes = 0;
+    status = ask(s, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
+    s->stats.bytes = (uint64_t)bytes;
+    s->stats.healed++;
+    return status;
+}
+
+/* Takes the mutex. False, without it: the file could not be opened again after it was found damaged, nor can it now. */
+static bool enter(spool *s)
+{
+    pthread_mutex_lock(&s->mutex);
+    if (s->db != NULL || open_database(s) == PF_OK)
+        return true;
+    close_database(s);
+    s->stats.errors++;
+    pthread_mutex_unlock(&s->mutex);
+    return false;
+}
+
 /* ---- calls; each takes the mutex ---- */
 
 /* Removes what has to go inside the open transaction. */
@@ -279,13 +332,12 @@ static pf_status set_value(spool *s, const char *key, const void *bytes, size_t 
     return run(s, which) ? PF_OK : fail_call(s, "setting a value");
 }
 
-/* One transaction: an object (or NULL), a value (or a NULL key). */
-static pf_status store(spool *s, const object *o, const char *key, const void *value, size_t value_n)
+/* One transaction: an object (or NULL), a value (or a NULL key). With the mutex. */
+static pf_status try_to_store(spool *s, const object *o, const char *key, const void *value, size_t value_n)
 {
     bool stored = false;
     uint64_t freed = 0;
     uint32_t gone = 0;
-    pthread_mutex_lock(&s->mutex);
     pf_status status = run(s, SQL_BEGIN) ? PF_OK : fail_call(s, "storing");
     if (status == PF_OK && o != NULL)
         status = evict(s, o, &freed, &gone);
@@ -308,6 +360,16 @@ static pf_status store(spool *s, const object *o, const char *key, const void *v
     /* SQLite ends the transaction itself on some errors. */
     if (status != PF_OK && sqlite3_get_autocommit(s->db) == 0)
         (void)run(s, SQL_ROLLBACK);
+    return status;
+}
+
+static pf_status store(spool *s, const object *o, const char *key, const void *value, size_t value_n)
+{
+    if (!enter(s))
+        return PF_ERR_IO;
+    pf_status status = try_to_store(s, o, key, value, value_n);
+    if (s->is_damaged && heal(s) == PF_OK)
+        status = try_to_store(s, o, key, value, value_n);
     pthread_mutex_unlock(&s->mutex);
     return status;
 }
@@ -347,7 +409,8 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
     uint64_t freed = 0;
     int code = SQLITE_ROW;
     *count = 0;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_VICTIMS];
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     (void)sqlite3_bind_int64(q, 2, importance);
@@ -371,7 +434,8 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
 static pf_status spool_keep_all(void *self)
 {
     spool *s = self;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     pf_status status = run(s, SQL_KEEP_ALL) ? PF_OK : fail_call(s, "keeping what is there");
     pthread_mutex_unlock(&s->mutex);
     return status;
@@ -393,7 +457,8 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
     pf_status status = PF_OK;
     if (after >= INT64_MAX)
         return PF_ERR_END;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_NEXT];
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     int code = sqlite3_step(q);
@@ -408,6 +473,8 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
         status = fail_call(s, "listing");
     }
     sqlite3_reset(q);
+    if (s->is_damaged) /* the caller asks again */
+        (void)heal(s);
     pthread_mutex_unlock(&s->mutex);
     return status;
 }
@@ -417,7 +484,8 @@ static pf_status spool_read(void *self, uint64_t row, void *bytes, size_t capaci
     spool *s = self;
     uint8_t hash[32];
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_READ];
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
@@ -440,6 +508,8 @@ static pf_status spool_read(void *self, uint64_t row, void *bytes, size_t capaci
         }
     }
     sqlite3_reset(q);
+    if (s->is_damaged) /* likewise */
+        (void)heal(s);
     pthread_mutex_unlock(&s->mutex);
     return status;
 }
@@ -448,7 +518,8 @@ static pf_status spool_remove(void *self, uint64_t row)
 {
     spool *s = self;
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_SIZE];
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
@@ -470,7 +541,8 @@ static pf_status spool_get(void *self, const char *key, void *bytes, size_t capa
 {
     spool *s = self;
     pf_status status = PF_OK;
-    pthread_mutex_lock(&s->mutex);
+    if (!enter(s))
+        return PF_ERR_IO;
     sqlite3_stmt *q = s->statements[SQL_GET];
     (void)sqlite3_bind_text(q, 1, key, -1, SQLITE_STATIC);
     int code = sqlite3_step(q);
@@ -514,9 +586,7 @@ static const char *spool_error(void *self)
 static void spool_close(void *self)
 {
     spool *s = self;
-    for (int i = 0; i < SQL_STATEMENTS; i++)
-        sqlite3_finalize(s->statements[i]);
-    (void)sqlite3_close(s->db);
+    close_database(s);
     pthread_mutex_destroy(&s->mutex);
     free(s->path);
     free(s);
@@ -550,6 +620,8 @@ pf_status pf_spool_open(pf_spool *opened, const pf_spool_config *config, char *e
     pthread_mutex_init(&s->mutex, NULL);
     s->quota = config->quota;
     pf_status status = open_database(s);
+    if (s->is_damaged)
+        status = heal(s);
     if (status != PF_OK) {
         pf_failure_copy(&s->failure, status, error, n);
         spool_close(s);

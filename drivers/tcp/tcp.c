@@ -93,7 +93,7 @@ static pf_status admit(tcp *t, bool *fresh)
     if (fd < 0) {
         if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
             return PF_ERR_AGAIN;
-        return pf_fail(&t->failure, PF_ERR_IO, "%s: accept: %s", t->name, strerror(errno));
+        return pf_fail(&t->failure, PF_ERR_IO, "accept: %s", strerror(errno));
     }
     line *place = free_place(t);
     if (!has_host(t, now)) {
@@ -142,7 +142,7 @@ static bool tcp_visitor(void *self, pf_transport *visitor)
 static pf_status hang_up(line *l, const char *why)
 {
     drop(l);
-    return pf_fail(&l->owner->failure, PF_ERR_CLOSED, "%s: %s", l->owner->name, why);
+    return pf_fail(&l->owner->failure, PF_ERR_CLOSED, "%s", why);
 }
 
 static pf_status tcp_read(void *self, uint8_t *bytes, size_t capacity, size_t *done)

@@ -16,11 +16,15 @@
 #define GUESTS_MAX           4
 #define GUESTS_OF_ADDRESS    2
 #define HANDSHAKE_NS         UINT64_C(5000000000)
+#define PATIENCE_NS          UINT64_C(1000000000) /* a handshake that lasts longer gives way to one that begins */
 #define LEAVING_NS           UINT64_C(1000000000) /* for the peer to read why */
 #define RECHECK_NS           UINT64_C(500000000)  /* between looks at the file of hosts */
 #define CERTIFICATE_MAX      8192                 /* bytes of a peer's chain */
 #define ACCEPTS_MAX          16                   /* of one call of service: the rest of the daemon waits */
 #define FINGERPRINT_IN_ERROR 16                   /* digits */
+/* What every host has. The others that OpenSSL offers, strangers could choose: ffdhe8192 takes a hundred times longer.
+ */
+#define GROUPS "X25519:P-256"
 
 typedef struct guest {
     struct tls *owner;
@@ -108,7 +112,7 @@ static pf_status open_context(tls *t)
      */
     bool ok = t->context != NULL && SSL_CTX_set_min_proto_version(t->context, TLS1_3_VERSION) == 1 &&
               SSL_CTX_set_max_proto_version(t->context, TLS1_3_VERSION) == 1 &&
-              SSL_CTX_set_num_tickets(t->context, 0) == 1 &&
+              SSL_CTX_set1_groups_list(t->context, GROUPS) == 1 && SSL_CTX_set_num_tickets(t->context, 0) == 1 &&
               SSL_CTX_use_certificate(t->context, pf_trust_certificate(t->trust)) == 1 &&
               SSL_CTX_use_PrivateKey(t->context, pf_trust_private_key(t->trust)) == 1;
     if (!ok) {
@@ -127,17 +131,36 @@ static pf_status open_context(tls *t)
 
 /* ---- guests */
 
-static guest *free_place(tls *t, const uint8_t address[16])
+/* Where all places are taken: that of the oldest, if it was sent away or has had its time. */
+static guest *make_place(tls *t, uint64_t now)
+{
+    guest *oldest = NULL;
+    for (int i = 0; i < GUESTS_MAX; i++)
+        if (oldest == NULL || t->guests[i].deadline_ns < oldest->deadline_ns)
+            oldest = &t->guests[i];
+    if (!oldest->is_leaving) {
+        if (now + HANDSHAKE_NS < oldest->deadline_ns + PATIENCE_NS)
+            return NULL;
+        t->stats.refused_late++;
+        pf_gate_note_failure(&t->gate, oldest->address, now);
+    }
+    drop(oldest);
+    return oldest;
+}
+
+static guest *free_place(tls *t, const uint8_t address[16], uint64_t now)
 {
     guest *place = NULL;
     int same = 0;
     for (int i = 0; i < GUESTS_MAX; i++) {
         if (t->guests[i].fd < 0)
             place = &t->guests[i];
-        else if (memcmp(t->guests[i].address, address, 16) == 0)
+        else if (!t->guests[i].is_leaving && memcmp(t->guests[i].address, address, 16) == 0)
             same++;
     }
-    return same < GUESTS_OF_ADDRESS ? place : NULL;
+    if (same >= GUESTS_OF_ADDRESS)
+        return NULL;
+    return place != NULL ? place : make_place(t, now);
 }
 
 /* Takes those that wait. One for whom there is no place is closed at once: left waiting it would keep the listener
@@ -151,15 +174,16 @@ static pf_status take_guests(tls *t, uint64_t now)
         if (fd < 0) {
             if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
                 return PF_OK;
-            return pf_fail(&t->failure, PF_ERR_IO, "%s: accept: %s", t->name, strerror(errno));
+            return pf_fail(&t->failure, PF_ERR_IO, "accept: %s", strerror(errno));
         }
         pf_gate_address(&peer, address);
-        guest *g = pf_gate_is_open(&t->gate, address, now) ? free_place(t, address) : NULL;
+        guest *g = pf_gate_is_open(&t->gate, address, now) ? free_place(t, address, now) : NULL;
         SSL *ssl = g != NULL ? SSL_new(t->context) : NULL;
         if (ssl == NULL || SSL_set_fd(ssl, fd) != 1) {
             SSL_free(ssl);
             (void)close(fd);
             t->stats.refused_often++;
+            (void)pf_fail(&t->failure, PF_ERR_CLOSED, "too many handshakes at once, or failed ones of one address");
             continue;
         }
         *g = (guest){.owner = t, .fd = fd, .ssl = ssl, .deadline_ns = now + HANDSHAKE_NS};

@@ -5,6 +5,7 @@
 #include "trust/private.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <openssl/err.h>
 #include <openssl/pem.h>
 #include <openssl/rand.h>
@@ -12,6 +13,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -53,6 +55,21 @@ static pf_status replace_file(pf_trust *t, const char *file, const char *bytes, 
     if (pf_file_replace(path, bytes, n, why, sizeof why) != PF_OK)
         return pf_fail(&t->failure, PF_ERR_IO, "%s", why);
     return PF_OK;
+}
+
+/* The daemon and `pipefishd --pair` change the folder one after the other; closing the descriptor unlocks it. */
+static pf_status lock_folder(pf_trust *t, int *fd)
+{
+    *fd = open(t->folder, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    int locked = -1;
+    while (*fd >= 0 && (locked = flock(*fd, LOCK_EX)) != 0 && errno == EINTR) {
+    }
+    if (locked == 0)
+        return PF_OK;
+    pf_status status = fail_errno(t, t->folder, "locking");
+    if (*fd >= 0)
+        (void)close(*fd);
+    return status;
 }
 
 /* ---- the device's key */
@@ -112,6 +129,7 @@ static pf_status make_identity(pf_trust *t)
     return status;
 }
 
+/* PF_ERR_END: there is none. */
 static pf_status load_identity(pf_trust *t)
 {
     char path[PATH_BYTES];
@@ -119,7 +137,7 @@ static pf_status load_identity(pf_trust *t)
     path_of(t, "device.pem", path);
     FILE *in = fopen(path, "rbe");
     if (in == NULL)
-        return errno == ENOENT ? make_identity(t) : fail_errno(t, path, "opening");
+        return errno == ENOENT ? PF_ERR_END : fail_errno(t, path, "opening");
     pf_status status = fstat(fileno(in), &s) == 0 ? PF_OK : fail_errno(t, path, "opening");
     if (status == PF_OK && (s.st_mode & 077) != 0)
         status = pf_fail(&t->failure, PF_ERR_UNSUPPORTED,
@@ -136,6 +154,22 @@ static pf_status load_identity(pf_trust *t)
     return status;
 }
 
+static pf_status open_identity(pf_trust *t)
+{
+    int lock;
+    pf_status status = load_identity(t);
+    if (status != PF_ERR_END)
+        return status;
+    status = lock_folder(t, &lock);
+    if (status != PF_OK)
+        return status;
+    status = load_identity(t); /* who had the lock before may have made it */
+    if (status == PF_ERR_END)
+        status = make_identity(t);
+    (void)close(lock);
+    return status;
+}
+
 /* ---- the hosts */
 
 static pf_status read_peers(pf_trust *t, const char *path)
@@ -144,11 +178,16 @@ static pf_status read_peers(pf_trust *t, const char *path)
     FILE *in = fopen(path, "rbe");
     if (in == NULL)
         return fail_errno(t, path, "opening");
+    /* The stamp first: what is changed behind it is read again at the next look. */
+    bool is_read = fstat(fileno(in), &t->peers_stat) == 0;
     size_t n = fread(text, 1, sizeof text, in);
-    bool is_read = ferror(in) == 0 && fstat(fileno(in), &t->peers_stat) == 0;
+    is_read = is_read && ferror(in) == 0;
     (void)fclose(in);
     if (!is_read)
         return fail_errno(t, path, "reading");
+    if ((t->peers_stat.st_mode & S_IWOTH) != 0)
+        return pf_fail(&t->failure, PF_ERR_UNSUPPORTED, "%s: anybody may write this file: look at it, then chmod o-w",
+                       path);
     if (n > PF_PEERS_BYTES)
         return pf_fail(&t->failure, PF_ERR_SPACE, "%s: larger than %u bytes", path, PF_PEERS_BYTES);
     pf_status status = pf_peers_parse(&t->peers, text, n, why, sizeof why);
@@ -189,9 +228,10 @@ pf_role pf_trust_role(pf_trust *trust, const uint8_t key[32], char *name)
     return p->role;
 }
 
-pf_status pf_trust_set(pf_trust *trust, const uint8_t key[32], pf_role role, const char *name)
+static pf_status change_peers(pf_trust *trust, const uint8_t key[32], pf_role role, const char *name)
 {
     char text[PF_PEERS_BYTES];
+    trust->has_peers = false; /* what is there now, whatever its stamp says */
     pf_status status = refresh(trust);
     if (status != PF_OK)
         return status;
@@ -208,6 +248,17 @@ pf_status pf_trust_set(pf_trust *trust, const uint8_t key[32], pf_role role, con
     size_t n = pf_peers_print(&changed, text, sizeof text);
     status = replace_file(trust, "peers", text, n);
     return status == PF_OK ? refresh(trust) : status;
+}
+
+pf_status pf_trust_set(pf_trust *trust, const uint8_t key[32], pf_role role, const char *name)
+{
+    int lock;
+    pf_status status = lock_folder(trust, &lock);
+    if (status != PF_OK)
+        return status;
+    status = change_peers(trust, key, role, name);
+    (void)close(lock);
+    return status;
 }
 
 /* ---- */
@@ -232,6 +283,19 @@ const char *pf_trust_error(const pf_trust *trust)
     return trust->failure.text;
 }
 
+static pf_status open_folder(pf_trust *t)
+{
+    struct stat s;
+    if (mkdir(t->folder, 0700) != 0 && errno != EEXIST)
+        return fail_errno(t, t->folder, "making the folder");
+    if (stat(t->folder, &s) != 0)
+        return fail_errno(t, t->folder, "opening");
+    if ((s.st_mode & S_IWOTH) != 0)
+        return pf_fail(&t->failure, PF_ERR_UNSUPPORTED, "%s: anybody may write in this folder of keys: chmod o-w",
+                       t->folder);
+    return PF_OK;
+}
+
 pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_t n)
 {
     pf_failure failure = {""};
@@ -242,8 +306,9 @@ pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_
         free(t);
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "trust: no memory"), error, n);
     }
-    pf_status status =
-        mkdir(folder, 0700) != 0 && errno != EEXIST ? fail_errno(t, folder, "making the folder") : load_identity(t);
+    pf_status status = open_folder(t);
+    if (status == PF_OK)
+        status = open_identity(t);
     if (status == PF_OK && !pf_certificate_key(t->certificate, t->key))
         status = fail_crypto(t, "hashing the device's key");
     if (status == PF_OK)

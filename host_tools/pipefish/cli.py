@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,12 +21,20 @@ class UsageError(PipefishError):
     """Arguments that do not go together."""
 
 
-DEVICE_HELP = "serial:/dev/ttyUSB0@3000000, /dev/ttyUSB0 (speed from --baud), tls://host:port or tcp://host:port"
+DEVICE_HELP = (
+    "serial:/dev/ttyUSB0@3000000 (hardware flow control: @3000000,rtscts), /dev/ttyUSB0 (speed from --baud), "
+    "tls://host:port or tcp://host:port"
+)
+
+
+def printable(text: str) -> str:
+    """As a terminal may have it: a survey's or a device's texts could hold codes that clear it or fake other lines."""
+    return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else f"\\u{ord(c):04x}" for c in text)
 
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
-    """Two aligned columns; rows whose value is None or "" are left out."""
-    shown = [(name, str(value)) for name, value in rows if value is not None and value != ""]
+    """Two aligned columns, a line a row; rows whose value is None or "" are left out."""
+    shown = [(name, str(value).replace("\n", "\\n")) for name, value in rows if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)
 
@@ -605,7 +614,7 @@ def main(argv: list[str] | None = None) -> int:
         args = build_parser().parse_args(argv)
         args.check(args)
         document, text = args.run(args)
-        print(json.dumps(document, indent=2) if args.json else text, flush=True)
+        print(json.dumps(document, indent=2) if args.json else printable(text), flush=True)
         return DONE
     except SystemExit as exit_:  # --help and --version
         return int(exit_.code or 0)
@@ -618,7 +627,7 @@ def main(argv: list[str] | None = None) -> int:
             print(json.dumps(error_document(error, code), indent=2), flush=True)
         if "--debug" in argv:
             raise
-        print(f"pipefish: {message_of(error)}", file=sys.stderr)
+        print(f"pipefish: {printable(message_of(error))}", file=sys.stderr)
         return code
 
 

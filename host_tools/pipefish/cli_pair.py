@@ -63,8 +63,8 @@ def run_pair(args: argparse.Namespace) -> Result:
     text = table([("this host's key", key), *((f"device {n}", k) for k, n in devices.items())])
     text += (
         "\n\nTo pair by the cable:   pipefish pair /dev/ttyUSB0\n"
-        "Without it, on the device (ssh, or its console), as the daemon's user:\n"
-        f'  pipefishd --pair "{args.role} {key} {name}"\n'
+        "Without it, on the device (ssh, or its console):\n"
+        f'  sudo pipefishd --pair "{args.role} {key} {name}"\n'
         "and with the key that this prints, here:\n"
         "  pipefish pair --device-key KEY --device-name crawler"
     )

@@ -312,7 +312,13 @@ class Client:
         for event in self.link.input(b"", now):
             self._serve(event)
         self._down()
+        self._pause(now)
+
+    def _pause(self, now: int) -> None:
+        """Until the line is opened again: longer each time, until the device answers. One that opens and closes at once
+        costs the device a handshake each time."""
         self._retry_ns = now + int(self._backoff_s * 1e9)
+        self._backoff_s = min(2 * self._backoff_s, BACKOFF_S[1])
 
     def _reopen(self, most_s: float) -> None:
         pause_s = (self._retry_ns - time.monotonic_ns()) / 1e9
@@ -322,5 +328,4 @@ class Client:
         try:
             self.open()
         except TransportClosed:
-            self._retry_ns = time.monotonic_ns() + int(self._backoff_s * 1e9)
-            self._backoff_s = min(2 * self._backoff_s, BACKOFF_S[1])
+            self._pause(time.monotonic_ns())

@@ -5,11 +5,14 @@ carry keys; their dates and issuers mean nothing."""
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import fcntl
 import hashlib
 import os
 import re
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 from pipefish.errors import PipefishError
@@ -22,6 +25,24 @@ def key_folder() -> Path:
     """Where this user's key and devices are: $XDG_CONFIG_HOME/pipefish or ~/.config/pipefish."""
     home = os.environ.get("XDG_CONFIG_HOME")
     return (Path(home) if home else Path.home() / ".config") / "pipefish"
+
+
+@contextlib.contextmanager
+def _locked() -> Iterator[None]:
+    """The folder, made if it is not there, for one program at a time, which reads, changes and writes what is in it.
+
+    Raises PipefishError."""
+    folder = key_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise PipefishError(f"{folder}: {error.strerror}") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def parse_key(text: str) -> str:
@@ -58,7 +79,6 @@ def _make_host_key(path: Path) -> None:
         .not_valid_after(datetime.datetime(9999, 12, 31))
         .sign(key, None)
     )
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     draft = path.with_suffix(f".{os.getpid()}")
     with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
@@ -73,7 +93,9 @@ def host_key_file() -> Path:
     path = key_folder() / "host.pem"
     try:
         if not path.exists():
-            _make_host_key(path)
+            with _locked():
+                if not path.exists():
+                    _make_host_key(path)
         elif path.stat().st_mode & 0o077:
             raise PipefishError(f"{path}: others may read this private key; remove it and pair again, or chmod 600")
     except OSError as error:
@@ -134,21 +156,17 @@ def remember_device(key: str, name: str) -> None:
     """Adds a device to those known, or gives it another name. Raises PipefishError."""
     if not name.strip() or not name.isprintable():
         raise PipefishError(f"'{name}' is no name for a device")
-    devices = known_devices() | {parse_key(key): name.strip()}
-    path = key_folder() / "devices"
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise PipefishError(f"{path.parent}: {error.strerror}") from error
-    _write_devices(devices)
+    with _locked():
+        _write_devices(known_devices() | {parse_key(key): name.strip()})
 
 
 def forget_device(key_or_name: str) -> str:
     """Removes a device; returns its name. Raises PipefishError if it is not known."""
-    devices = known_devices()
-    for key, name in devices.items():
-        if key_or_name in (key, name):
-            del devices[key]
-            _write_devices(devices)
-            return name
+    with _locked():
+        devices = known_devices()
+        for key, name in devices.items():
+            if key_or_name in (key, name):
+                del devices[key]
+                _write_devices(devices)
+                return name
     raise PipefishError(f"no device '{key_or_name}' is known here")

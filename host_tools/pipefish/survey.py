@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CAUSES = {1: "first", 2: "encoder", 3: "parallax", 4: "few common tracks"}
 UNKNOWN_ERROR_NS = 2**64 - 1  # ClockSync.error_ns: the offset is a guess from the time of reception
+KEYFRAMES_MAX = 1_000_000  # of a survey: 25 km at one each 25 mm. A number that is made up must not cost its memory
+UPTIME_MAX_NS = 2**63  # 292 years; with a wall time added it still fits the 64 bits of MCAP's times
 
 TOPICS: dict[str, type] = {
     "/keyframe": pb.Keyframe,
@@ -32,6 +34,16 @@ TOPICS: dict[str, type] = {
     "/status": pb.Status,
     "/receipt": pb.Receipt,
 }
+
+
+def check_numbers(message: pb.Keyframe | pb.SurveyStart | pb.SurveyEnd | pb.Status) -> None:
+    """Raises ValueError for a message of a survey with numbers that no device can have meant."""
+    if isinstance(message, pb.Keyframe) and message.index >= KEYFRAMES_MAX:
+        raise ValueError(f"keyframe {message.index}: a survey has at most {KEYFRAMES_MAX}")
+    if isinstance(message, pb.SurveyEnd) and message.keyframes > KEYFRAMES_MAX:
+        raise ValueError(f"{message.keyframes} keyframes: a survey has at most {KEYFRAMES_MAX}")
+    if message.time.monotonic_ns >= UPTIME_MAX_NS:
+        raise ValueError(f"a time of {message.time.monotonic_ns} ns since the device's start")
 
 
 @dataclass
@@ -288,6 +300,8 @@ class Survey:
     def _take(self, topic: str, record: Message, offset: int, seen: dict[int, Keyframe]) -> None:
         try:
             message = TOPICS[topic].FromString(record.data)
+            if topic != "/receipt":
+                check_numbers(message)
             match topic:
                 case "/keyframe":
                     seen[message.index] = Keyframe(
@@ -476,8 +490,12 @@ class Survey:
 
 def lost_indices(end: pb.SurveyEnd) -> set[int]:
     """The keyframes of a survey that its end lists as lost; some may have arrived (pipefish.proto)."""
-    ranges = zip(end.lost_first, end.lost_count, strict=False)
-    return {i for first, count in ranges for i in range(first, min(first + count, end.keyframes))}
+    lost: set[int] = set()
+    past = 0  # ranges that overlap are not gone through twice, however many there are
+    for first, count in sorted(zip(end.lost_first, end.lost_count, strict=False)):
+        lost.update(range(max(first, past), min(first + count, end.keyframes)))
+        past = max(past, min(first + count, end.keyframes))
+    return lost
 
 
 def profile_summary(binary: bytes) -> dict[str, Any] | None:

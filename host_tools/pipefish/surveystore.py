@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError, file_error
-from pipefish.survey import Observations
+from pipefish.survey import Observations, check_numbers
 from pipefish.surveywrite import (
     OBJECT_END,
     OBJECT_KEYFRAME,
@@ -164,6 +164,7 @@ class SurveyStore:
         kinds = {OBJECT_START: pb.SurveyStart, OBJECT_KEYFRAME: pb.Keyframe, OBJECT_END: pb.SurveyEnd}
         try:
             message = kinds[kind].FromString(data)
+            check_numbers(message)
             if kind == OBJECT_KEYFRAME:
                 Observations.from_message(message.observations)
             if not message.survey_id:

@@ -28,7 +28,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
 from pipefish.errors import FormatError, PipefishError, file_error
 from pipefish.mcapscan import McapScan
-from pipefish.survey import UNKNOWN_ERROR_NS, Observations, lost_indices
+from pipefish.survey import UNKNOWN_ERROR_NS, UPTIME_MAX_NS, Observations, check_numbers, lost_indices
 
 FORMAT_VERSION = 1  # of the layout in docs/survey.md
 OBJECT_START, OBJECT_KEYFRAME, OBJECT_END = 1, 2, 3  # pf_object_kind
@@ -157,17 +157,21 @@ class Content:
         return len(lost_indices(self.end) - self.indices) if self.end else 0
 
     def note(self, topic: str, data: bytes) -> None:
-        """Takes in one message of the file. Raises DecodeError."""
+        """Takes in one message of the file. Raises DecodeError, ValueError."""
         match topic:
             case "/survey/start":
                 start = pb.SurveyStart.FromString(data)
+                check_numbers(start)
                 self.start = self.start or start
                 self.survey_id = start.survey_id
             case "/survey/end":
-                self.end = pb.SurveyEnd.FromString(data)
-                self.survey_id = self.end.survey_id
+                end = pb.SurveyEnd.FromString(data)
+                check_numbers(end)
+                self.end = end
+                self.survey_id = end.survey_id
             case "/keyframe":
                 keyframe = pb.Keyframe.FromString(data)
+                check_numbers(keyframe)
                 self.indices.add(keyframe.index)
                 self.survey_id = keyframe.survey_id
             case "/receipt":
@@ -266,7 +270,7 @@ class SurveyWriter:
                         raise FormatError(self.partial, f"offset {item.offset}", "not a partial survey of pipefish")
                     try:
                         self.content.note(topic, record.data)
-                    except DecodeError as error:
+                    except (DecodeError, ValueError) as error:
                         raise FormatError(self.partial, f"offset {item.offset}", f"{topic}: {error}") from error
                     self._add(topic, record.log_time, record.publish_time, record.sequence, record.data)
             self._writer.flush()
@@ -352,7 +356,8 @@ class SurveyWriter:
 
     def note_status(self, status: pb.Status, log_time: int, now_unix_ns: int) -> None:
         """Adds the device's counters; written with the next object, not by itself."""
-        self._add("/status", max(0, log_time), now_unix_ns, 0, status.SerializeToString())
+        if status.time.monotonic_ns < UPTIME_MAX_NS:
+            self._add("/status", max(0, log_time), now_unix_ns, 0, status.SerializeToString())
 
     def finish(self, notes: dict[str, str]) -> None:
         """Closes the file and gives it its final name. `notes` join the metadata record "pipefish".
@@ -427,6 +432,6 @@ def read_content(path: Path) -> Content:
             elif isinstance(record, Message):
                 try:
                     content.note(topics.get(record.channel_id, ""), record.data)
-                except DecodeError as error:
+                except (DecodeError, ValueError) as error:
                     raise FormatError(path, f"offset {item.offset}", str(error)) from error
     return content

@@ -17,6 +17,7 @@ from pipefish.errors import PipefishError
 DEFAULT_BAUD = 921600
 DEFAULT_PORT = 7447
 CONNECT_TIMEOUT_S = 5.0
+RTSCTS = ",rtscts"  # behind the speed in a serial line's address
 
 
 class TransportClosed(PipefishError):
@@ -86,12 +87,13 @@ class Transport(ABC):
 
 
 class SerialTransport(Transport):
-    """A serial device, 8N1 without flow control; locked against other programs."""
+    """A serial device, 8N1, with hardware flow control if asked for; locked against other programs."""
 
-    def __init__(self, path: str, baud: int) -> None:
-        self.name = f"serial:{path}@{baud}"
+    def __init__(self, path: str, baud: int, rtscts: bool = False) -> None:
+        self.name = f"serial:{path}@{baud}" + (RTSCTS if rtscts else "")
         self.path = path
         self.baud = baud
+        self.rtscts = rtscts
         self._port = None
 
     def open(self) -> None:
@@ -99,10 +101,13 @@ class SerialTransport(Transport):
 
         self.close()
         try:
-            self._port = serial.Serial(self.path, self.baud, timeout=0, write_timeout=0, exclusive=True)
+            self._port = serial.Serial(
+                self.path, self.baud, timeout=0, write_timeout=0, exclusive=True, rtscts=self.rtscts
+            )
             self._port.reset_input_buffer()
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-            raise TransportClosed(f"{self.path}: {_reason(error)}", error) from error
+            hint = " (is this user in the device's group, dialout?)" if _number(error) == errno.EACCES else ""
+            raise TransportClosed(f"{self.path}: {_reason(error)}{hint}", error) from error
 
     def fileno(self) -> int:
         return self._port.fileno() if self._port is not None else -1
@@ -138,6 +143,8 @@ class SerialTransport(Transport):
 class TcpTransport(Transport):
     """A TCP connection."""
 
+    _heard = False  # the device has said something since it was opened
+
     scheme = "tcp"
 
     def __init__(self, host: str, port: int) -> None:
@@ -149,6 +156,7 @@ class TcpTransport(Transport):
         self.close()
         try:
             self._socket = socket.create_connection(self.address, timeout=CONNECT_TIMEOUT_S)
+            self._heard = False
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setblocking(False)
         except OSError as error:
@@ -167,8 +175,15 @@ class TcpTransport(Transport):
         except OSError as error:
             raise TransportClosed(f"{self.name}: {_reason(error)}") from error
         if not data:
-            raise TransportClosed(f"{self.name}: the device closed the connection")
+            raise self._ended()
+        self._heard = True
         return data
+
+    def _ended(self) -> TransportClosed:
+        why = "the device closed the connection"
+        if not self._heard:
+            why = "other hosts are connected to the device, as many as it takes"
+        return TransportClosed(f"{self.name}: {why}", reason=why)
 
     def write(self, data: bytes) -> int:
         if self._socket is None:
@@ -215,7 +230,6 @@ class TlsTransport(TcpTransport):
     def __init__(self, host: str, port: int) -> None:
         super().__init__(host, port)
         self.device = ""
-        self._heard = False
 
     def _context(self) -> ssl.SSLContext:
         from pipefish.keys import host_key_file
@@ -266,7 +280,6 @@ class TlsTransport(TcpTransport):
                 "pipefish pair"
             )
         self.device = devices[key]
-        self._heard = False
 
     def read(self) -> bytes:
         if self._socket is None:
@@ -284,12 +297,7 @@ class TlsTransport(TcpTransport):
         except OSError as error:
             raise self._failed(error) from error
         if not data:
-            why = (
-                "the device closed the connection"
-                if self._heard
-                else "other hosts are connected to the device, as many as it takes"
-            )
-            raise TransportClosed(f"{self.name}: {why}", reason=why)
+            raise self._ended()
         self._heard = True
         return bytes(data)
 
@@ -305,13 +313,13 @@ class TlsTransport(TcpTransport):
 
 
 def open_transport(address: str, baud: int | None = None) -> Transport:
-    """A transport, not yet opened, for `serial:/dev/ttyUSB0@3000000`, `/dev/ttyUSB0` (speed from `baud`), `tls://host:port`
-    or `tcp://host:port`.
+    """A transport, not yet opened, for `serial:/dev/ttyUSB0@3000000`, `/dev/ttyUSB0` (speed from `baud`), the same with
+    `@3000000,rtscts` for hardware flow control, `tls://host:port` or `tcp://host:port`.
 
     Raises PipefishError if the address makes no sense.
     """
     if address.startswith(("tcp://", "tls://")):
-        match = re.fullmatch(r"t(?:cp|ls)://(\[[0-9a-fA-F:.]+\]|[^\[\]/:]+)(?::(\d+))?/?", address)
+        match = re.fullmatch(r"t(?:cp|ls)://(\[[0-9a-fA-F:.]+(?:%[\w.-]+)?\]|[^\[\]/:]+)(?::(\d+))?/?", address)
         port = int(match[2] or DEFAULT_PORT) if match else 0
         if not match or not 0 < port < 65536:
             raise PipefishError(
@@ -323,7 +331,9 @@ def open_transport(address: str, baud: int | None = None) -> Transport:
         raise PipefishError(
             f"'{address}' is no device; write /dev/ttyUSB0, serial:/dev/ttyUSB0@3000000, tls://host:port or tcp://host:port"
         )
-    path, at, speed = path.rpartition("@") if re.search(r"@\d*$", path) else (path, "", "")
+    path, at, speed = path.rpartition("@") if re.search(rf"@\d*({RTSCTS})?$", path) else (path, "", "")
+    rtscts = speed.endswith(RTSCTS)
+    speed = speed.removesuffix(RTSCTS)
     if at:
         if not speed:
             raise PipefishError(f"'{address}' has no speed after the @; write for example serial:{path}@{DEFAULT_BAUD}")
@@ -331,4 +341,4 @@ def open_transport(address: str, baud: int | None = None) -> Transport:
     baud = DEFAULT_BAUD if baud is None else baud
     if not 1200 <= baud <= 12_000_000:
         raise PipefishError(f"{baud} baud is out of range (1200 to 12000000)")
-    return SerialTransport(path, baud)
+    return SerialTransport(path, baud, rtscts)

@@ -110,10 +110,11 @@ class Board:
 
     folder   of this test: disk.img, share/ (the board's /mnt), console.log
     port     of the host, that leads to the board's port 7448
+    has_system   Debian with systemd and dpkg instead of a shell; what it writes outside /data is lost with the power
     """
 
-    def __init__(self, folder: Path, port: int) -> None:
-        self.folder, self.port = folder, port
+    def __init__(self, folder: Path, port: int, has_system: bool = False) -> None:
+        self.folder, self.port, self.has_system = folder, port, has_system
         self.share = folder / "share"
         self.share.mkdir(parents=True)
         shutil.copy(PROGRAMS / "tests/hil/pipefish-world", self.share)
@@ -125,7 +126,7 @@ class Board:
         self.initramfs = folder / "initramfs"
         archive = ["cpio", "-o", "-H", "newc", "--quiet", "-R", "0:0"]
         init = subprocess.run(
-            archive, cwd=ROOT / "tests" / "hil" / "guest", input=b"init\n", capture_output=True, check=True
+            archive, cwd=ROOT / "tests" / "hil" / "guest", input=b"init\nagent\n", capture_output=True, check=True
         )
         packed = (CACHE / "initramfs").read_bytes()
         self.initramfs.write_bytes(packed + bytes(-len(packed) % 4) + init.stdout)
@@ -142,10 +143,12 @@ class Board:
             *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"),
             *("-serial", f"file:{self.folder}/console.log"),
             *("-kernel", str(CACHE / "vmlinuz"), "-initrd", str(self.initramfs)),
-            *("-append", "console=ttyAMA0 loglevel=4 panic=-1 rdinit=/init"),
+            *("-append", "console=ttyAMA0 loglevel=4 panic=-1 rdinit=/init" + " system" * self.has_system),
             *("-virtfs", f"local,path={self.share},mount_tag=host,security_model=none"),
             *("-drive", f"file={self.disk},if=none,id=disk,format=raw,cache=writeback"),
             *("-device", "virtio-blk-pci,drive=disk"),
+            *(("-drive", f"file={CACHE}/system.img,if=none,id=system,format=raw,snapshot=on") * self.has_system),
+            *(("-device", "virtio-blk-pci,drive=system") * self.has_system),
             *("-device", "virtio-serial-pci"),
             *("-chardev", f"socket,id=agent,path={self.folder}/agent.sock,server=on,wait=off"),
             *("-device", "virtserialport,chardev=agent,name=agent,nr=1"),
@@ -176,7 +179,7 @@ class Board:
         if not self._line().startswith("READY"):
             raise BoardError("the board did not boot: " + self.console())
         self.boot_s = time.monotonic() - start
-        self.run("mount /dev/vda /data")
+        self.run("mkdir -p /data; mount /dev/vda /data")
         return self.boot_s
 
     def _line(self) -> str:

@@ -45,8 +45,8 @@ def crawl(recording: Recording, tmp_path: Path) -> Iterator[Callable[..., Crawl]
     """Boots a board and gives a survey on it: crawl(setting=value, ...), a dot in a name written as two underscores."""
     made: list[Crawl] = []
 
-    def make(**settings: str) -> Crawl:
-        board = Board(tmp_path / f"b{len(made)}", free_port())
+    def make(has_system: bool = False, **settings: str) -> Crawl:
+        board = Board(tmp_path / f"b{len(made)}", free_port(), has_system)
         survey = Crawl(board, recording, tmp_path, {k.replace("__", "."): v for k, v in settings.items()})
         made.append(survey)
         board.power_on()

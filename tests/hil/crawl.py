@@ -139,6 +139,35 @@ class Crawl:
         )
         self.starts += 1
 
+    def install(self, package: Path) -> None:
+        """As its owner does: the package by dpkg, settings in its file, the service enabled and started. The log
+        goes to the shared folder as that of start_daemon."""
+        board = self.board
+        (board.share / package.name).write_bytes(package.read_bytes())
+        board.run(f"dpkg -i /mnt/{package.name}")
+        settings = {
+            "camera.index": "/var/lib/pipefish/index",
+            "camera.profile": "/etc/pipefish/crawl.profile",
+            "spool.path": "/var/lib/pipefish/spool.db",
+            "daemon.status_file": "/run/pipefish/status.json",
+            "status.interval_ms": "200",
+        }
+        sections: dict[str, list[str]] = {}
+        for line in self._arguments(settings, "/etc/pipefish"):
+            section, _, rest = line.partition(".")
+            sections.setdefault(section, []).append(rest.replace("=", " = ", 1))
+        text = "".join(f"[{name}]\n" + "\n".join(lines) + "\n" for name, lines in sections.items())
+        (board.share / "pipefishd.ini").write_text(text)
+        log = "[Service]\nStandardError=append:/mnt/daemon0.log\n"
+        (board.share / "log.conf").write_text(log)
+        folder = "/etc/systemd/system/pipefishd.service.d"
+        board.run(f"mkdir -p {folder} && cp /mnt/log.conf {folder} && systemctl daemon-reload")
+        board.run("cp /mnt/pipefishd.ini /mnt/crawl.profile /etc/pipefish/ && pipefishd --check-config")
+        board.run("install -d -o pipefish -g pipefish -m 750 /var/lib/pipefish /var/lib/pipefish/index")
+        board.run("ln -s /run/pipefish/status.json /run/status.json; touch /mnt/daemon0.log")
+        self.starts = 1
+        board.run("systemctl enable pipefishd && systemctl start pipefishd")
+
     def wait_for(self, text: str, timeout: float = 80) -> float:
         """Until the daemon's log of this start has `text`; the seconds that took."""
         start = time.monotonic()

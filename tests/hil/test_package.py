@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import re
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 from board import CACHE, PACKAGES
+from crawl import Result
+from test_board import RATE, SERIAL, SIZE, frames, usb
 
 
 def output(*command: object) -> str:
@@ -45,3 +48,38 @@ def test_the_package_brings_the_unit_the_user_and_the_settings(package: Path, tm
     for script in ("postinst", "prerm", "postrm"):
         assert output("sh", "-n", tmp_path / "DEBIAN" / script) == ""
         assert (tmp_path / "DEBIAN" / script).stat().st_mode & 0o111
+
+
+def test_the_package_installed_by_dpkg_and_started_by_systemd_takes_a_survey(package: Path, crawl, note):
+    """A killed daemon is started again by systemd and goes on; stopped, it drains. Its unit's fences are up."""
+    survey = crawl(has_system=True, **SERIAL, **SIZE)
+    board = survey.board
+    survey.install(package)
+    survey.wait_for("begins")
+    assert "ok installed" in board.run("dpkg -s pipefishd")
+    assert board.run("id -nG pipefish").split() == ["pipefish", "dialout", "video"]
+    assert board.run("stat -c '%U:%G %a' /dev/gpiochip0 /var/lib/pipefish").splitlines() == [
+        "root:pipefish 660",
+        "pipefish:pipefish 750",
+    ]
+    survey.start_receiver(usb(survey))
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(15), "15 frames")
+    process = board.run("systemctl show -P MainPID pipefishd").strip()
+    shown = board.run(f"cat /proc/{process}/status")
+    assert re.search(r"NoNewPrivs:\s+1", shown) and re.search(r"CapBnd:\s+0+$", shown, re.M), shown
+    assert re.search(r"Seccomp:\s+2", shown) and not re.search(r"Uid:\s+0", shown), shown
+    start = time.monotonic()
+    board.run(f"kill -9 {process}")
+    survey.wait_for("goes on")
+    recovery = time.monotonic() - start
+    board.wait(world)
+    result = Result("package under systemd, killed", recovery_s=recovery, boot_s=board.boot_s)
+    result.stage_us = board.status()["stage"]
+    board.run("systemctl stop pipefishd")
+    received = survey.finish()
+    assert board.run("systemctl show -P Result,NRestarts pipefishd").split() == ["success", "1"]
+    board.run("cp -r /var/lib/pipefish/index /mnt/ && dpkg -r pipefishd && dpkg -P pipefishd")
+    assert board.run("ls -d /var/lib/pipefish /etc/pipefish 2>/dev/null; id pipefish 2>/dev/null", check=False) == ""
+    note(survey.check(received, result))
+    assert len(survey.indices()) == 2

@@ -12,7 +12,7 @@ from device import Device
 from pipefish import cli
 from pipefish.camera import Camera
 from pipefish.survey import Survey
-from synthetic import SURVEY, survey_objects, write_survey
+from synthetic import SURVEY, start, survey_objects, write_survey
 
 COMMANDS = [
     ["demo"],
@@ -60,6 +60,19 @@ def test_info_tells_the_survey(survey, capsys):
     assert cli.main(["info", str(survey), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["keyframes"] == 6 and document["complete"] and document["length_m"] == pytest.approx(0.25)
+
+
+def test_texts_of_a_survey_cannot_steer_the_terminal(tmp_path, capsys):
+    """Whoever made the file: escape sequences retitle and clear terminals, line breaks fake rows."""
+    name = "\x1b]0;mine\x07\x1b[2Jpipe\nstate  complete\u202e"
+    write_survey(tmp_path / "a.mcap", objects=[start(name=name), *survey_objects(2)[1:]])
+    assert cli.main(["info", str(tmp_path / "a.mcap")]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("survey") and r"\u001b]0;mine\u0007\u001b[2Jpipe\nstate  complete\u202e" in text
+    assert cli.main(["info", str(tmp_path / "\x1b[31mred.mcap")]) == 1
+    assert r"\u001b[31mred.mcap" in capsys.readouterr().err
+    assert cli.main(["info", str(tmp_path / "a.mcap"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == name
 
 
 def test_show_writes_what_it_says(survey, tmp_path, capsys):

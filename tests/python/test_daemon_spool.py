@@ -1,12 +1,25 @@
 """pipefishd: a full spool, and being killed: nothing acknowledged is lost, nothing comes twice."""
 
+import os
 import random
 import time
 from pathlib import Path
 
 import pytest
 
-from crawler import EVERY_FRAME, RESET_GAP, SEED, Crawler, Store, receive_all, run, serve, wait_for_log, write_recording
+from crawler import (
+    EVERY_FRAME,
+    RESET_GAP,
+    SEED,
+    Crawler,
+    Store,
+    receive_all,
+    run,
+    serve,
+    spooled,
+    wait_for_log,
+    write_recording,
+)
 from pipefish.survey import lost_indices
 
 
@@ -18,6 +31,37 @@ def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawle
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
     assert list(end_message.lost_first) == []
+
+
+def test_a_spool_with_a_bad_page_is_replaced_and_what_is_whole_is_delivered(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=0", *EVERY_FRAME)
+    assert crawler.wait() == 0
+    spool = crawler.config.parent / "spool.db"
+    whole = sum(spooled(crawler).values())
+    data = bytearray(spool.read_bytes())
+    data[100:400] = bytes(300)  # the schema
+    spool.write_bytes(data)
+    data[:4096] = bytes(4096)
+    (spool.parent / "other.db").write_bytes(data)
+    refused = run("--config", crawler.config, "--set", f"spool.path={spool.parent}/other.db")
+    assert refused.returncode == 1, "whose mark and schema are gone is not known to be a spool"
+    store = Store(crawler.port)
+    crawler.start(*EVERY_FRAME)
+    assert receive_all(crawler, store) == 0
+    assert "was damaged" in crawler.text() and (spool.parent / "spool.db.damaged-1").exists()
+    assert len(store.ends) == 1 and whole > 20
+    # The head of the file is gone, and the tables with it; a page in its midst costs only what lies there.
+    crawler.start("--set", "daemon.drain_s=0", "--set", "survey.name=again", *EVERY_FRAME)
+    assert crawler.wait() == 0
+    before = sum(spooled(crawler).values())
+    data = bytearray(spool.read_bytes())
+    middle = len(data) // 8192 * 4096
+    data[middle : middle + 4096] = os.urandom(4096)
+    spool.write_bytes(data)
+    store = Store(crawler.port)
+    crawler.start("--set", "survey.name=third", *EVERY_FRAME)
+    assert receive_all(crawler, store) == 0
+    assert len(store.objects) >= before - 3 and len(store.ends) == 2
 
 
 def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):

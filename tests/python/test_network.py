@@ -6,6 +6,8 @@ import os
 import socket
 import ssl
 import subprocess
+import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -23,7 +25,7 @@ from pipefish.cli import main
 from pipefish.client import BUSY, VIEWER, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
-from pipefish.transport import Refused, TlsTransport
+from pipefish.transport import Refused, TlsTransport, TransportClosed
 
 
 @pytest.fixture(autouse=True)
@@ -382,6 +384,7 @@ def test_others_look_on_while_a_host_receives_and_can_change_nothing(device: Cra
     with taker.client() as client:
         client.run(lambda: client.up and taker.statuses, 10)
     assert len(store.objects) > 5 and network(device)["refused_busy"] == 0
+    assert "host is there: tester, operator" in device.text() and "looks on: second, calibrator" in device.text()
 
 
 def test_the_same_host_looks_on_while_it_receives(device: Crawler, capsys):
@@ -421,6 +424,7 @@ def test_more_than_three_who_look_on_are_sent_away_and_harm_nobody(device: Crawl
     while device.status()["link"]["visitors"]:
         assert time.monotonic() < end, "the device does not notice that they have gone"
         time.sleep(0.05)
+    wait_for_log(device, "turned away: tester wanted to look on")
 
 
 def test_a_revoked_key_ends_looking_on_too(device: Crawler, tmp_path, monkeypatch):
@@ -433,6 +437,82 @@ def test_a_revoked_key_ends_looking_on_too(device: Crawler, tmp_path, monkeypatc
         let_in(device, "revoked", other, "second")
         second.run(lambda: not second.up, 5)
         second.close()
+
+
+def test_an_upload_that_a_calibrator_began_is_not_finished_by_who_may_not(device: Crawler):
+    """The link keeps the parts of an object over sessions, whoever was allowed to begin it."""
+    let_in(device, "calibrator")
+    profile = hashlib.shake_256(b"no profile").digest(8000)
+
+    class Upload(Handlers):
+        refused = False
+
+        def on_refused(self, name: bytes) -> None:
+            self.refused = True
+
+    def begin(most: int) -> tuple[Client, Upload]:
+        upload = Upload()
+        client = Client(TlsTransport("127.0.0.1", device.port), upload)
+        client.open()
+        write, sent = client.transport.write, 0
+
+        def write_some(data: bytes) -> int:
+            nonlocal sent
+            if sent >= most:
+                raise TransportClosed("cut")
+            taken = write(data[: most - sent])
+            sent += taken
+            return taken
+
+        client.transport.write = write_some
+        client.link.send_object(hashlib.sha256(profile).digest(), 4, profile)
+        return client, upload
+
+    client, _ = begin(6000)
+    client.run(lambda: client.up, 5)
+    end = time.monotonic() + 5
+    client.run(lambda: not client.up or time.monotonic() > end, 5)
+    assert client.link.stats["fragments_sent"] > 3
+    client.close()
+    let_in(device, "operator")
+    client, upload = begin(1 << 20)
+    client.run(lambda: upload.refused, 10)
+    assert client.link.stats["fragments_sent"] < 8, "the device had kept the first parts: this test proves something"
+    assert "profile_store" not in device.text()
+    client.close()
+
+
+def test_a_stranger_cannot_choose_a_slow_key_exchange(device: Crawler):
+    key = let_in(device, "operator")
+    assert key
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    context.set_ecdh_curve("secp521r1")  # the one thing that Python can offer instead; finite fields are shut with it
+    with pytest.raises(ssl.SSLError), socket.create_connection(("127.0.0.1", device.port), 5) as s:
+        context.wrap_socket(s)
+    network(device, refused_handshake=1)
+
+
+def test_a_handshake_that_lasts_gives_way_to_one_that_begins(device: Crawler):
+    let_in(device, "operator")
+    slow = [connect_from(f"127.0.0.{2 + i // 2}", device.port) for i in range(4)]
+    try:
+        client = open_client_late(device)
+        assert network(device, refused_late=1)["refused_late"] < 4, "all four have been given up anyway"
+        client.close()
+    finally:
+        for s in slow:
+            s.close()
+
+
+def open_client_late(crawler: Crawler) -> Client:
+    """A client that comes again and again until it is let in."""
+    client = Client(TlsTransport("127.0.0.1", crawler.port), Handlers())
+    with contextlib.suppress(TransportClosed):
+        client.open()
+    client.run(lambda: client.up, 10)
+    return client
 
 
 def test_a_host_that_lost_its_way_takes_its_own_place_over(device: Crawler):
@@ -468,6 +548,61 @@ def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawle
     client.run(lambda: client.up, 5)
     client.close()
     assert device.process.poll() is None
+
+
+def test_pairings_at_the_same_time_are_all_kept(device: Crawler):
+    """A revocation that another pairing writes over would let a lost laptop in."""
+    commands = [
+        [find_daemon(), "--config", device.config, "--pair", f"operator {i:064x} host{i}"] for i in range(10, 22)
+    ]
+    processes = [subprocess.Popen(c, stdout=subprocess.PIPE, text=True) for c in commands]
+    said = {p.communicate()[0].split("this device's key: ")[1] for p in processes}
+    assert len(said) == 1 and not any(p.returncode for p in processes)
+    assert len((device.config.parent / "trust" / "peers").read_text().splitlines()) == 12
+
+
+def test_a_device_that_is_new_makes_one_key_however_many_pair(tmp_path: Path):
+    crawler = Crawler(tmp_path, link__transport="tls", link__trust=tmp_path / "trust")
+    commands = [
+        [find_daemon(), "--config", crawler.config, "--pair", f"operator {i:064x} host{i}"] for i in range(10, 18)
+    ]
+    processes = [subprocess.Popen(c, stdout=subprocess.PIPE, text=True) for c in commands]
+    assert len({p.communicate()[0].split("this device's key: ")[1] for p in processes}) == 1
+
+
+def test_programs_of_one_host_that_begin_together_have_one_key_and_forget_no_device(tmp_path: Path):
+    code = "import sys; from pipefish import keys; print(keys.host_key()); keys.remember_device(sys.argv[1] * 32, 'it')"
+    programs = [
+        subprocess.Popen([sys.executable, "-c", code, f"{i:02x}"], stdout=subprocess.PIPE, text=True) for i in range(6)
+    ]
+    assert {p.communicate()[0] for p in programs} == {keys.host_key() + "\n"}
+    assert len(keys.known_devices()) == 6
+
+
+@pytest.mark.parametrize("what", ["", "peers"])
+def test_keys_that_anybody_may_write_are_refused(device: Crawler, tmp_path: Path, what: str):
+    let_in(device, "operator")
+    path = tmp_path / "trust" / what
+    path.chmod(path.stat().st_mode | 0o002)
+    pair = [find_daemon(), "--config", device.config, "--pair", f"operator {'ab' * 32} somebody"]
+    told = subprocess.run(pair, capture_output=True, text=True, check=False)
+    assert told.returncode == 1 and "anybody may write" in told.stderr and "chmod o-w" in told.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+@pytest.mark.parametrize("is_there", [False, True])
+def test_who_pairs_as_root_leaves_files_that_the_daemon_can_read(tmp_path: Path, is_there: bool):
+    nobody = 65534
+    with tempfile.TemporaryDirectory() as home:  # tmp_path lies in folders that are root's alone
+        folder = Path(home) / "trust"
+        os.chown(home, nobody, nobody)
+        if is_there:
+            folder.mkdir()
+            os.chown(folder, nobody, nobody)
+        crawler = Crawler(tmp_path, link__transport="tls", link__trust=folder)
+        pair = [find_daemon(), "--config", crawler.config, "--pair", f"operator {'ab' * 32} somebody"]
+        subprocess.run(pair, capture_output=True, check=True)
+        assert {p.name: p.stat().st_uid for p in folder.iterdir()} == {"device.pem": nobody, "peers": nobody}
 
 
 def test_pairing_by_the_cable_lets_a_host_in_and_remembers_the_device(tmp_path: Path, capsys):

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
 import pytest
 
 from device import Device
+from pipefish import client
 from pipefish.errors import PipefishError
 from pipefish.receive import Interrupted, receive
 from pipefish.survey import Survey
@@ -200,6 +203,39 @@ def test_an_object_of_unknown_kind_stops_reception_and_stays_on_the_device(tmp_p
         assert not device.refused and strange[0] in device.spool
 
 
+def test_a_host_that_is_sent_away_comes_again_less_and_less_often(monkeypatch):
+    """Each time costs the device a handshake."""
+
+    class Line(TcpTransport):
+        opened = 0
+
+        def open(self) -> None:
+            self.opened += 1
+
+        def waiting(self) -> int:
+            raise TransportClosed("sent away", reason="sent away")
+
+    now = 0
+
+    class Clock:
+        @staticmethod
+        def monotonic_ns() -> int:
+            return now
+
+        @staticmethod
+        def sleep(seconds: float) -> None:
+            nonlocal now
+            now += int(seconds * 1e9)
+
+    monkeypatch.setattr(client, "time", Clock)
+    line = Line("127.0.0.1", 1)
+    asker = client.Client(line, client.Handlers())
+    asker.open()
+    with pytest.raises(client.NoDevice, match="sent away"):
+        asker.run(lambda: False, 60)
+    assert 10 < line.opened < 25, "0.1 s, 0.2 s, ... 5 s"
+
+
 def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
     for device, why in (("tcp://127.0.0.1:1", "Connection refused"), (str(tmp_path / "ttyUSB9"), "No such file")):
         for quiet in (False, True):
@@ -223,7 +259,7 @@ def test_a_line_that_we_may_not_open_fails_at_once(tmp_path, monkeypatch):
         raise serial.SerialException(errno.EACCES, "could not open port")
 
     monkeypatch.setattr(serial, "Serial", denied)
-    wait_for("/dev/ttyUSB0", "ttyUSB0: Permission denied")
+    wait_for("/dev/ttyUSB0", "ttyUSB0: Permission denied .*dialout")
 
 
 def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
@@ -348,6 +384,7 @@ def test_a_silent_line_ends_with_the_timeout(tmp_path):
         ("serial:/dev/ttyUSB0@3000000", None, "serial:/dev/ttyUSB0@3000000"),
         ("/dev/ttyAMA0", 115200, "serial:/dev/ttyAMA0@115200"),
         ("/dev/serial/by-id/usb@1-port0", None, "serial:/dev/serial/by-id/usb@1-port0@921600"),
+        ("/dev/ttyUSB0@3000000,rtscts", None, "serial:/dev/ttyUSB0@3000000,rtscts"),
     ],
 )
 def test_serial_addresses(address, baud, name):
@@ -355,10 +392,25 @@ def test_serial_addresses(address, baud, name):
     assert isinstance(transport, SerialTransport) and transport.name == name
 
 
+@pytest.mark.parametrize("flow", ["", ",rtscts"])
+def test_flow_control_of_a_serial_line_is_what_its_address_says(flow):
+    master, slave = os.openpty()
+    transport = open_transport(f"serial:{os.ttyname(slave)}@115200{flow}")
+    transport.open()
+    try:
+        assert bool(termios.tcgetattr(slave)[2] & termios.CRTSCTS) == bool(flow)
+    finally:
+        transport.close()
+        os.close(master)
+        os.close(slave)
+
+
 def test_tcp_addresses():
     assert open_transport("tcp://pi.local").address == ("pi.local", 7447)
     transport = open_transport("tcp://[::1]:99")
     assert isinstance(transport, TcpTransport) and transport.address == ("::1", 99)
+    # what a direct cable without an address server has: a link-local address with its interface
+    assert open_transport("tls://[fe80::1%eth0]:99").address == ("fe80::1%eth0", 99)
 
 
 @pytest.mark.parametrize("address", ["", "tcp://", "tcp://a:0", "tcp://a:b", "http://a", "/dev/x@", "/dev/x@5"])

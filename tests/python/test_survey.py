@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import FormatError, PipefishError
-from pipefish.survey import Observations, Survey
+from pipefish.survey import Observations, Survey, lost_indices
 from pipefish.surveystore import SurveyStore
-from pipefish.surveywrite import OBJECT_END, SurveyWriter
+from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, SurveyWriter
 from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 
@@ -288,6 +288,51 @@ def test_a_long_range_of_lost_keyframes_is_understood_and_what_arrived_of_it_is_
     survey = Survey.open(path)
     assert survey.complete
     assert survey.lost == survey.missing == [*range(1, 1500), *range(1501, 2001), *range(2500, 3000)]
+
+
+def made_up(what: str) -> tuple[int, pb.Keyframe | pb.SurveyEnd]:
+    """A message with a number that no device can have meant: a kind and the message."""
+    if what == "count":
+        message = pb.SurveyEnd.FromString(end(3)[2])
+        message.keyframes = 2**32 - 1
+        return OBJECT_END, message
+    message = pb.Keyframe.FromString(keyframe(0)[2])
+    if what == "index":
+        message.index = 2**32 - 1
+    else:
+        message.time.monotonic_ns = 2**64 - 1
+    return OBJECT_KEYFRAME, message
+
+
+@pytest.mark.parametrize("what", ["count", "index", "time"])
+def test_numbers_that_are_made_up_cost_no_memory_and_are_named(tmp_path, what, monkeypatch):
+    """4,294,967,295 keyframes as a set of numbers would take all of a computer's memory, from a file of a kilobyte."""
+    from pipefish import surveystore, surveywrite
+
+    kind, message = made_up(what)
+    store = SurveyStore(tmp_path / "a.mcap")
+    with pytest.raises(PipefishError, match="stays on the device"):
+        store.store(*as_object(kind, message), CLOCK, 1)
+    store.close()
+    if what == "time":  # no file can hold it
+        return
+    for module in (surveystore, surveywrite):
+        monkeypatch.setattr(module, "check_numbers", lambda message: None)
+    monkeypatch.setattr(surveywrite.Content, "missing", [])
+    store = SurveyStore(tmp_path / "b.mcap")
+    store_all(store, [start(), as_object(kind, message)])
+    store.close()
+    monkeypatch.undo()
+    for read in (Survey.open, surveywrite.read_content):
+        with pytest.raises(FormatError, match="at most 1000000"):
+            read(tmp_path / "b.mcap.partial")
+
+
+def test_ranges_of_lost_keyframes_that_overlap_are_gone_through_once():
+    message = pb.SurveyEnd.FromString(end(900_000)[2])
+    message.lost_first.extend([5] * 50_000)
+    message.lost_count.extend([2**32 - 1] * 50_000)  # one by one: a day
+    assert len(lost_indices(message)) == 900_000 - 5
 
 
 def test_pictures_survive_recompression_by_other_tools(tmp_path):

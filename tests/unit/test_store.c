@@ -106,10 +106,13 @@ static pf_status remove_object(void *self, uint64_t row)
     return status;
 }
 
+static int victims_asked;
+
 static pf_status victims(void *self, uint64_t after, uint32_t importance, size_t n,
                          pf_spool_victim found[PF_SPOOL_VICTIMS_MAX], uint32_t *count)
 {
     (void)self;
+    victims_asked++;
     (void)after;
     (void)importance;
     (void)n;
@@ -118,10 +121,12 @@ static pf_status victims(void *self, uint64_t after, uint32_t importance, size_t
     return PF_ERR_SPACE;
 }
 
+static pf_status keep_status;
+
 static pf_status keep_all(void *self)
 {
     (void)self;
-    return PF_OK;
+    return keep_status;
 }
 
 static void get_stats(void *self, pf_spool_stats *stats)
@@ -155,6 +160,8 @@ void setUp(void)
 {
     pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
     memset(&fake, 0, sizeof fake);
+    keep_status = PF_OK;
+    victims_asked = 0;
     fake.mutex = mutex;
     wake_fd = eventfd(0, EFD_NONBLOCK);
 }
@@ -290,6 +297,26 @@ static void test_a_failing_disk_is_tried_again(void)
 }
 
 /* Proves: what is stored with a keyframe never lists a keyframe that the next boot will make again as lost. */
+/* Proves: on a disk that is full already at the start the daemon begins all the same, so that what is there can be
+ * sent; nothing of the surveys before is given up until the disk has taken that they are to be kept. */
+static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
+{
+    keep_status = PF_ERR_SPACE;
+    fake.is_full = true;
+    open_store(false);
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    pf_store_settle(store);
+    TEST_ASSERT_EQUAL_INT(0, victims_asked);
+    TEST_ASSERT_EQUAL_UINT64(1, stats().keyframes_dropped);
+    (void)pthread_mutex_lock(&fake.mutex);
+    keep_status = PF_OK;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    give(PF_OBJECT_KEYFRAME, 1, "");
+    pf_store_settle(store);
+    TEST_ASSERT_EQUAL_INT(1, victims_asked);
+    close_store();
+}
+
 static void test_losses_of_later_keyframes_are_not_kept(void)
 {
     pf_survey kept;
@@ -432,6 +459,7 @@ int main(void)
     RUN_TEST(test_a_break_outlives_the_keyframe_that_carried_it);
     RUN_TEST(test_a_break_that_waits_for_room_is_told_once);
     RUN_TEST(test_a_failing_disk_is_tried_again);
+    RUN_TEST(test_a_disk_that_is_full_at_the_start_gives_nothing_up);
     RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
     RUN_TEST(test_flush_and_quit_count_what_is_lost);
     RUN_TEST(test_a_full_spool_gives_up_the_least_important);

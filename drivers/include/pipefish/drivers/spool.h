@@ -19,6 +19,7 @@ typedef struct pf_spool_item {
 typedef struct pf_spool_stats {
     uint64_t objects, bytes;                        /* waiting now */
     uint64_t stored, acknowledged, evicted, errors; /* since opening */
+    uint64_t healed; /* times the file was found damaged and replaced; error() says by what right after opening */
 } pf_spool_stats;
 
 /* Of an object that may have to make room for others; those stored without one never have to. */
@@ -82,7 +83,10 @@ typedef struct pf_spool_config {
     uint64_t quota;   /* most bytes of objects; 0 = no limit */
 } pf_spool_config;
 
-/* Opens or creates. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool), PF_ERR_VERSION.
+/* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
+ * new one begun with every object that can still be read: under its row, but never to make room for others. Anybody
+ * else's file is refused. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
+ * PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
 

@@ -49,7 +49,7 @@ typedef struct pf_trust pf_trust;
 
 /* Opens a folder, makes it (mode 0700) and the device's key if they are not there. On failure *trust is untouched and
  * error[n] says what. PF_OK; PF_ERR_IO; PF_ERR_FORMAT (device.pem or peers is damaged); PF_ERR_UNSUPPORTED (others may
- * read the key); PF_ERR_SPACE. */
+ * read the key, or write the folder or its file of hosts); PF_ERR_SPACE. */
 pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_t n);
 void pf_trust_close(pf_trust *trust); /* NULL is allowed */
 
@@ -65,10 +65,11 @@ pf_status pf_trust_set(pf_trust *trust, const uint8_t key[32], pf_role role, con
 
 const char *pf_trust_error(const pf_trust *trust); /* last failure in words */
 
-/* Listens with mutual TLS 1.3: only hosts whose key the trust knows get through. One host at a time; a second that is
- * let in takes the line over if it has the same key, or if the first has been silent for `silence_ms`, and is sent away
- * otherwise. Handshakes: at most 4 at once, 2 of one address, 5 s each; an address that failed 5 times in a minute has
- * to wait for the end of it. `trust` must outlive the transport. Same results as pf_tcp_listen. */
+/* Listens with mutual TLS 1.3: only hosts whose key the trust knows get through. One host has the line, up to
+ * PF_VISITORS_MAX others look on; the next has it when the first has gone or been silent for `silence_ms`, 3/8 of that
+ * if it has the same key. Handshakes: at most 4 at once, 2 of one address, 5 s each, 1 s while others wait for the
+ * place; an address that failed 5 times in a minute has to wait for the end of it. `trust` must outlive the transport.
+ * Same results as pf_tcp_listen. */
 typedef struct pf_tls_config {
     const char *address; /* numeric; "0.0.0.0", "::" = all */
     uint16_t port;       /* 0 = any */

@@ -1,0 +1,458 @@
+/* The spool on media that fail. */
+#include "spool_objects.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <signal.h>
+#include <sqlite3.h>
+#include <sys/resource.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <time.h>
+
+/* ---- syncs: SQLite's calls land here, the program's symbols come first ---- */
+
+static unsigned long syncs;
+
+int fsync(int fd)
+{
+    syncs++;
+    return (int)syscall(SYS_fsync, fd);
+}
+
+int fdatasync(int fd)
+{
+    syncs++;
+    return (int)syscall(SYS_fdatasync, fd);
+}
+
+/* Proves: each store and each removal is told to the medium before it is reported; a kill would not show that. */
+static void test_every_change_is_synced(void)
+{
+    pf_spool_item item;
+    open_spool("synced.db", 0);
+    for (uint64_t id = 1; id <= 10; id++) {
+        unsigned long before = syncs;
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+        TEST_ASSERT_TRUE_MESSAGE(syncs > before, "put");
+        before = syncs;
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, "id", &id, sizeof id));
+        TEST_ASSERT_TRUE_MESSAGE(syncs > before, "set");
+    }
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
+    unsigned long before = syncs;
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
+    TEST_ASSERT_TRUE_MESSAGE(syncs > before, "remove");
+}
+
+/* ---- kill -9 ---- */
+
+typedef struct report {
+    uint64_t id;
+    char what; /* 'P'ut and stored, 'r'emoving now, 'R'emoved */
+} report;
+
+#define WAITING_MAX 12u
+
+/* The child: stores and removes for ever, and reports each step after (or, for a removal, also before) it. */
+static void store_for_ever(int pipe_fd, uint64_t id)
+{
+    report r;
+    memset(&r, 0, sizeof r);
+    open_spool("killed.db", 0);
+    for (;; id++) {
+        size_t n = make_object(id);
+        r = (report){.id = id, .what = 'P'};
+        if (spool.ops->put_and_set(spool.self, 2, object_name, object_bytes, n, "last", &id, sizeof id) != PF_OK ||
+            write(pipe_fd, &r, sizeof r) != sizeof r)
+            _exit(1);
+        while (stats().objects > WAITING_MAX) {
+            pf_spool_item item;
+            if (spool.ops->next(spool.self, 0, &item) != PF_OK)
+                _exit(1);
+            r = (report){.id = check_item(&item), .what = 'r'};
+            if (write(pipe_fd, &r, sizeof r) != sizeof r || spool.ops->remove(spool.self, item.row) != PF_OK)
+                _exit(1);
+            r.what = 'R';
+            if (write(pipe_fd, &r, sizeof r) != sizeof r)
+                _exit(1);
+        }
+    }
+}
+
+#define IDS_MAX 200000u
+static char state[IDS_MAX]; /* 0, 'P', 'r' or 'R' by id: the last report */
+
+/* What the spool must hold after a cut. Returns the highest id it holds. */
+static uint64_t check_after_cut(uint64_t highest_reported)
+{
+    static bool is_there[IDS_MAX];
+    uint64_t row = 0, highest = 0, last = 0;
+    size_t n;
+    pf_spool_item item;
+    memset(is_there, 0, sizeof is_there);
+    open_spool("killed.db", 0);
+    while (spool.ops->next(spool.self, row, &item) == PF_OK) {
+        uint64_t id = check_item(&item);
+        TEST_ASSERT_TRUE_MESSAGE(id > highest, "twice, or out of order");
+        TEST_ASSERT_TRUE_MESSAGE(state[id] != 'R', "removed, and back again");
+        is_there[id] = true;
+        highest = id;
+        row = item.row;
+    }
+    for (uint64_t id = 1; id <= highest_reported; id++)
+        TEST_ASSERT_TRUE_MESSAGE(state[id] != 'P' || is_there[id], "reported as stored, and lost");
+    TEST_ASSERT_TRUE_MESSAGE(highest <= highest_reported + 1, "more than the one under way");
+    pf_status got = spool.ops->get(spool.self, "last", &last, sizeof last, &n);
+    TEST_ASSERT_TRUE(highest_reported == 0 || got == PF_OK);
+    TEST_ASSERT_TRUE_MESSAGE(last >= highest_reported && (highest == 0 || last == highest),
+                             "value and object are not one transaction");
+    close_spool();
+    return last;
+}
+
+/* Proves: whatever was reported as stored is there and intact after kill -9 at any time, what was reported as removed
+ * stays removed, and the value set with an object is the last object's.
+ * Does not prove: a power cut, where the medium may lie about what it has written. */
+static void test_kill_at_any_time_loses_nothing(void)
+{
+    uint64_t random = 42, highest = 0, reports = 0;
+    for (int cut = 0; cut < 60; cut++) {
+        int ends[2];
+        TEST_ASSERT_EQUAL_INT(0, pipe(ends));
+        fflush(stdout);
+        pid_t child = fork();
+        TEST_ASSERT_TRUE(child >= 0);
+        if (child == 0) {
+            close(ends[0]);
+            store_for_ever(ends[1], highest + 1);
+        }
+        close(ends[1]);
+        struct timespec t = {0, (long)(temporary_random(&random) % 40000000u)};
+        nanosleep(&t, NULL);
+        TEST_ASSERT_EQUAL_INT(0, kill(child, SIGKILL));
+        report r;
+        while (read(ends[0], &r, sizeof r) == sizeof r) {
+            TEST_ASSERT_TRUE(r.id < IDS_MAX - 1);
+            state[r.id] = r.what;
+            if (r.id > highest)
+                highest = r.id;
+            reports++;
+        }
+        int status;
+        TEST_ASSERT_EQUAL_INT(child, waitpid(child, &status, 0));
+        TEST_ASSERT_TRUE_MESSAGE(WIFSIGNALED(status), "the child failed by itself");
+        close(ends[0]);
+        uint64_t last = check_after_cut(highest);
+        if (last > highest) { /* it was under way, and made it */
+            highest = last;
+            state[last] = 'P';
+        }
+    }
+    TEST_ASSERT_TRUE_MESSAGE(reports > 60, "the child hardly ran");
+}
+
+/* Opens a damaged file and takes everything out of it that it gives: the answer may be an error, never wrong bytes. */
+static void drain_damaged(const char *path)
+{
+    pf_spool_config config = {path, 0};
+    error[0] = '\0';
+    pf_status status = pf_spool_open(&spool, &config, error, sizeof error);
+    if (status != PF_OK) {
+        TEST_ASSERT_TRUE_MESSAGE(status == PF_ERR_FORMAT || status == PF_ERR_IO || status == PF_ERR_VERSION, error);
+        TEST_ASSERT_NOT_NULL(strstr(error, path));
+        return;
+    }
+    pf_spool_item item;
+    uint64_t row = 0;
+    size_t n;
+    for (int i = 0; i < 100 && spool.ops->next(spool.self, row, &item) == PF_OK; i++) {
+        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
+        if (status == PF_OK)
+            (void)check_item(&item);
+        else
+            TEST_ASSERT_TRUE(spool.ops->error(spool.self)[0] != '\0');
+        row = item.row;
+    }
+    close_spool();
+}
+
+/* Proves: a spool cut short, or with bytes changed anywhere, gives errors or intact objects, never wrong bytes. */
+static void test_damaged_spool_never_gives_wrong_bytes(void)
+{
+    static uint8_t good[1 << 20], bad[1 << 20];
+    uint64_t random = 3;
+    open_spool("good.db", 0);
+    for (uint64_t id = 1; id <= 8; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    close_spool();
+    size_t n = slurp(temporary_path("good.db"), good, sizeof good);
+    TEST_ASSERT_TRUE(n > 4096 && n < sizeof good);
+    for (size_t cut = 0; cut < n; cut += 1 + n / 61)
+        drain_damaged(temporary_write("cut.db", good, cut));
+    for (int round = 0; round < 150; round++) {
+        memcpy(bad, good, n);
+        size_t range = round % 3 == 0 ? 100 : round % 3 == 1 ? 20000 : n; /* header, inner pages, anywhere */
+        for (int k = 0; k < 8; k++)
+            bad[temporary_random(&random) % range] = (uint8_t)temporary_random(&random);
+        drain_damaged(temporary_write("bad.db", bad, n));
+    }
+}
+
+/* Proves: when the medium takes no more, the error is reported and counted, what was stored stays, and it goes on when
+ * there is space again. The limit of a file's size stands for the full medium. */
+static void test_full_medium(void)
+{
+    struct rlimit old, small;
+    signal(SIGXFSZ, SIG_IGN);
+    open_spool("full.db", 0);
+    TEST_ASSERT_EQUAL_INT(PF_OK, put(1));
+    TEST_ASSERT_EQUAL_INT(0, getrlimit(RLIMIT_FSIZE, &old));
+    small = old;
+    small.rlim_cur = 300000;
+    TEST_ASSERT_EQUAL_INT(0, setrlimit(RLIMIT_FSIZE, &small));
+    uint64_t id = 2;
+    pf_status status = PF_OK;
+    while (status == PF_OK && id < 100)
+        status = put(id++);
+    uint64_t failed = id - 1, errors = stats().errors, objects = stats().objects;
+    TEST_ASSERT_EQUAL_INT(0, setrlimit(RLIMIT_FSIZE, &old));
+    TEST_ASSERT_TRUE(status == PF_ERR_IO || status == PF_ERR_SPACE);
+    TEST_ASSERT_EQUAL_UINT64(1, errors);
+    TEST_ASSERT_EQUAL_UINT64(failed - 1, objects);
+    TEST_ASSERT_EQUAL_INT(PF_OK, put(failed));
+    close_spool();
+    open_spool("full.db", 0);
+    pf_spool_item item;
+    uint64_t row = 0;
+    for (id = 1; id <= failed; id++) {
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, row, &item));
+        TEST_ASSERT_EQUAL_UINT64(id, check_item(&item));
+        row = item.row;
+    }
+}
+
+/* ---- a damaged file is replaced */
+
+static void damage(const char *path, long at, size_t n)
+{
+    uint8_t junk[8192];
+    FILE *f = fopen(path, "r+b");
+    TEST_ASSERT_NOT_NULL(f);
+    for (size_t i = 0; i < sizeof junk; i++)
+        junk[i] = (uint8_t)(37 * i + 11);
+    TEST_ASSERT_EQUAL_INT(0, fseek(f, at, SEEK_SET));
+    TEST_ASSERT_EQUAL_size_t(n, fwrite(junk, 1, n, f));
+    fclose(f);
+}
+
+/* Checks that what is in the spool is whole and in order; how many. */
+static uint64_t count_whole(void)
+{
+    pf_spool_item item;
+    uint64_t row = 0, n = 0, last = 0;
+    for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
+        uint64_t id = check_item(&item);
+        TEST_ASSERT_TRUE(id > last);
+        last = id;
+    }
+    return n;
+}
+
+/* As the daemon does: what has other bytes than its name says is removed, what cannot be read is asked for again. */
+static void sift(void)
+{
+    pf_spool_item item;
+    uint64_t row = 0;
+    size_t n;
+    pf_status status;
+    for (int i = 0; i < 100; i++) {
+        status = spool.ops->next(spool.self, row, &item);
+        if (status == PF_ERR_END)
+            return;
+        if (status != PF_OK)
+            continue;
+        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
+        if (status == PF_ERR_CHECKSUM)
+            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
+        if (status != PF_ERR_IO)
+            row = item.row;
+    }
+    TEST_FAIL_MESSAGE("no end of it");
+}
+
+/* Proves: whatever page of a spool is overwritten, the daemon gets one that takes objects, with those that could be
+ * reached, and what it has is whole; the damaged file is kept under another name. What is no spool is not touched
+ * (test_spool.c). */
+static void test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved(void)
+{
+    static uint8_t good[2 << 20];
+    uint64_t worst = UINT64_MAX, value = 7;
+    size_t size;
+    open_spool("worn.db", 0);
+    for (uint64_t id = 1; id <= 20; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, "survey", &value, sizeof value));
+    close_spool();
+    size = slurp(temporary_path("worn.db"), good, sizeof good);
+    TEST_ASSERT_TRUE(size < sizeof good);
+    for (size_t page = 0; page + 4096 <= size; page += page < 12 * 4096 ? 4096 : 11 * 4096) {
+        const char *path = temporary_write("worn.db", good, size);
+        damage(path, (long)(page == 0 ? 100 : page), page == 0 ? 300 : 4096);
+        open_spool("worn.db", 0);
+        sift(); /* may find it only now */
+        uint64_t there = count_whole();
+        worst = page >= 8 * 4096 && there < worst ? there : worst;
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(30));
+        TEST_ASSERT_EQUAL_UINT64(there + 1, count_whole());
+        if (page == 0) {
+            TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "saved from it"));
+            TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
+        }
+        close_spool();
+        for (int i = 1; i < 4; i++) {
+            char aside[64];
+            (void)snprintf(aside, sizeof aside, "worn.db.damaged-%d", i);
+            TEST_ASSERT_TRUE(i > 1 || page > 0 || access(temporary_path(aside), F_OK) == 0);
+            (void)unlink(temporary_path(aside));
+        }
+    }
+    TEST_ASSERT_TRUE(worst >= 15); /* a page of one object's bytes costs that one; one of the tree costs a few */
+}
+
+/* Proves: a page that goes bad while the spool is in use costs what lies in it, and the survey goes on; rows that
+ * somebody holds keep their numbers. */
+static void test_damage_found_in_use_is_healed(void)
+{
+    open_spool("used.db", 0);
+    for (uint64_t id = 1; id <= 20; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    close_spool();
+    open_spool("used.db", 0);
+    for (long page = 2; page < 6; page++)
+        damage(temporary_path("used.db"), page * 4096, 4096);
+    for (uint64_t id = 21; id <= 24; id++)
+        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, put(id), spool.ops->error(spool.self));
+    sift();
+    TEST_ASSERT_TRUE(count_whole() >= 4);
+}
+
+/* ---- a medium that refuses: SQLite's own way to put other system calls in place */
+
+static int refuse_with;  /* errno of every write; 0 = none fails */
+static uint64_t allowed; /* writes before that */
+
+static bool refuses(void)
+{
+    if (refuse_with == 0 || (allowed > 0 && allowed--))
+        return false;
+    errno = refuse_with;
+    return true;
+}
+
+static ssize_t write_or_not(int fd, const void *bytes, size_t n)
+{
+    return refuses() ? -1 : write(fd, bytes, n);
+}
+
+static ssize_t pwrite_or_not(int fd, const void *bytes, size_t n, off_t at)
+{
+    return refuses() ? -1 : pwrite(fd, bytes, n, at);
+}
+
+static int fallocate_or_not(int fd, off_t at, off_t n)
+{
+    return refuses() ? errno : posix_fallocate(fd, at, n);
+}
+
+static int ftruncate_or_not(int fd, off_t n)
+{
+    return refuses() ? -1 : ftruncate(fd, n);
+}
+
+static void hook(const char *name, sqlite3_syscall_ptr call)
+{
+    sqlite3_vfs *vfs = sqlite3_vfs_find(NULL);
+    (void)vfs->xSetSystemCall(vfs, name, call);
+}
+
+/* Proves: on a medium that is full, read-only or broken from any write on, nothing that was reported as stored is lost,
+ * nothing that was reported as removed comes back, each failure is said and counted, and all goes on once it takes
+ * writes again; also when the program ends meanwhile. */
+static void test_a_medium_that_refuses_writes_loses_nothing(void)
+{
+    static const int errors[] = {ENOSPC, EROFS, EIO};
+    hook("write", (sqlite3_syscall_ptr)write_or_not);
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_or_not);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_or_not);
+    hook("fallocate", (sqlite3_syscall_ptr)fallocate_or_not);
+    hook("ftruncate", (sqlite3_syscall_ptr)ftruncate_or_not);
+    uint64_t refused = 0;
+    for (uint64_t round = 0; round < 3 * 40; round++) {
+        char name[32];
+        bool is_there[40] = {false};
+        uint64_t errors_before, row = 0, n = 0;
+        pf_spool_item item;
+        (void)snprintf(name, sizeof name, "refuse%u.db", (unsigned)round);
+        open_spool(name, 0);
+        refuse_with = 0;
+        for (uint64_t id = 1; id <= 8; id++)
+            is_there[id] = put(id) == PF_OK;
+        errors_before = stats().errors;
+        allowed = round / 3 * 3;
+        refuse_with = errors[round % 3];
+        for (uint64_t id = 9; id <= 24; id++) {
+            pf_status status = put(id);
+            is_there[id] = status == PF_OK;
+            TEST_ASSERT_TRUE(status == PF_OK || status == PF_ERR_SPACE || status == PF_ERR_IO);
+            if (status != PF_OK)
+                TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), name));
+            refused += status != PF_OK;
+            if (id % 4 == 0 && spool.ops->next(spool.self, 0, &item) == PF_OK) {
+                uint64_t oldest = check_item(&item);
+                if (spool.ops->remove(spool.self, item.row) == PF_OK)
+                    is_there[oldest] = false;
+            }
+        }
+        TEST_ASSERT_TRUE(stats().errors >= errors_before + (is_there[24] ? 0 : 1));
+        if (round % 2 == 0) { /* it ends while nothing can be written */
+            close_spool();
+            refuse_with = 0;
+            open_spool(name, 0);
+        }
+        refuse_with = 0;
+        for (uint64_t id = 30; id < 34; id++) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+            is_there[id] = true;
+        }
+        close_spool();
+        open_spool(name, 0);
+        for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
+            uint64_t id = check_item(&item);
+            TEST_ASSERT_TRUE_MESSAGE(is_there[id], "removed, or refused, and there");
+            is_there[id] = false;
+        }
+        for (uint64_t id = 0; id < 40; id++)
+            TEST_ASSERT_FALSE_MESSAGE(is_there[id], "reported as stored, and lost");
+        TEST_ASSERT_EQUAL_UINT64(n, stats().objects);
+        close_spool();
+    }
+    TEST_ASSERT_TRUE(refused > 500);
+    for (size_t i = 0; i < 5; i++)
+        hook(((const char *[]){"write", "pwrite", "pwrite64", "fallocate", "ftruncate"})[i], NULL);
+}
+
+int main(void)
+{
+    temporary_make();
+    UNITY_BEGIN();
+    RUN_TEST(test_every_change_is_synced);
+    RUN_TEST(test_kill_at_any_time_loses_nothing);
+    RUN_TEST(test_damaged_spool_never_gives_wrong_bytes);
+    RUN_TEST(test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved);
+    RUN_TEST(test_damage_found_in_use_is_healed);
+    RUN_TEST(test_full_medium);
+    RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);
+    temporary_remove();
+    return UNITY_END();
+}
