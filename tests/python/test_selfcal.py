@@ -17,7 +17,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish import _engine, health, selfcal_input
 from pipefish.cli import main
-from pipefish.health import BUDGET, _chi2_tail
+from pipefish.health import _chi2_tail
 from pipefish.selfcal import self_calibrate
 from pipefish.structure import reconstruct
 from selfcal_drives import ENCODER, health_of, survey
@@ -44,7 +44,7 @@ def test_two_pairs_find_the_lens(kind):
 
 
 def test_poses_are_those_of_the_pairs():
-    setup = make_setup(2, "fisheye", pairs=1, noise=0.2, outliers=0.2)
+    setup = make_setup(2, "fisheye", pairs=1, noise=0.2, outliers=0.2, points=200)
     found = self_calibrate(setup.pairs, SIZE)
     true = setup.poses[0]
     turn = found.pairs[0].pose[:, :3] @ true[:, :3].T
@@ -55,7 +55,7 @@ def test_poses_are_those_of_the_pairs():
 @pytest.mark.parametrize("case", DEGENERATE)
 def test_what_cannot_be_seen_is_refused_with_its_reason(case):
     for seed, kind in enumerate(("perspective", "fisheye")):
-        setup = make_setup(10_100 + seed, kind, case)
+        setup = make_setup(10_100 + seed, kind, case, points=200)
         found = self_calibrate(setup.pairs, SIZE)
         assert found.status == case
         assert found.camera is None
@@ -89,20 +89,20 @@ def test_the_signed_error_is_oliensis_square(tmp_path):
         f, g, t = (v / np.linalg.norm(v) for v in random.normal(size=(3, 3)))
         e = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
         basis = np.linalg.svd(t[None])[2][1:]
-        angle = np.linspace(0, np.pi, 200001)
+        angle = np.linspace(0, np.pi, 100001)
         n = np.cos(angle)[:, None] * basis[0] + np.sin(angle)[:, None] * basis[1]
         brute = ((n @ f) ** 2 + (n @ g) ** 2).min()
         assert _engine.ray_angles_squared(e, f[None], g[None]) == pytest.approx(brute, rel=1e-6, abs=1e-9)
 
 
 def test_threads_and_runs_give_the_same_bits():
-    setup = make_setup(5, "wide")
+    setup = make_setup(5, "wide", points=120)
     a, b = (self_calibrate(setup.pairs, SIZE, threads=n).camera for n in (1, 2))
     assert (a.f_u, a.c_u, a.k2, a.k5) == (b.f_u, b.c_u, b.k2, b.k5)
 
 
 def test_profile_says_how_it_came_about_and_loads(tmp_path):
-    setup = make_setup(6, "fisheye", noise=0.3)
+    setup = make_setup(6, "fisheye", noise=0.3, points=200)
     found = self_calibrate(setup.pairs, SIZE)
     found.camera.save(tmp_path / "camera.json")
     back = pf.Camera.load(tmp_path / "camera.json")
@@ -132,7 +132,7 @@ def test_few_matches_are_no_error():
 
 
 def test_command_reads_matches_and_refuses_in_one_line(tmp_path, capsys):
-    good, bad = make_setup(7, "wide", noise=0.3), make_setup(10_100, "fisheye", "axial")
+    good, bad = make_setup(7, "wide", noise=0.3, points=200), make_setup(10_100, "fisheye", "axial", points=200)
     np.savez(tmp_path / "good.npz", xy1=good.pairs[0][0], xy2=good.pairs[0][1])
     np.savetxt(tmp_path / "bad.csv", np.hstack(bad.pairs[0]), delimiter=",", header="x1,y1,x2,y2", comments="")
     out = tmp_path / "camera.json"
@@ -192,7 +192,7 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
     """From the file a device sends: the scale within three sigmas and 2 %, with an uncertainty that a reconstruction
     takes up; straight on, what is missing is named."""
     camera = fisheye(100)
-    drive = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, pan=0.6)
+    drive = tube_drive(4, 1.5, limits=(20.0, 89.0), density=300.0, camera=camera, pan=0.6)
     file = survey_of(drive, tmp_path / "pan.mcap")
     assert main(["selfcal", str(file), "-o", str(tmp_path / "camera.json"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -201,7 +201,7 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
     assert abs(found.f_u - camera.f_u) < min(3 * math.sqrt(found.covariance[0, 0]), 0.02 * camera.f_u)
     measured = reconstruct(drive.tracks, found, drive.driven, encoder=ENCODER, threads=1)
     assert 0 < np.median(np.einsum("nii->n", measured.systematic)) < 0.01**2  # a hundredth of a metre
-    straight = tube_drive(4, 1.5, limits=(20.0, 89.0), density=400.0, camera=camera, wobble=0.0)
+    straight = tube_drive(4, 1.5, limits=(20.0, 89.0), density=300.0, camera=camera, wobble=0.0)
     file = survey_of(straight, tmp_path / "straight.mcap")
     assert main(["selfcal", str(file), "-o", str(tmp_path / "no.json")]) == 1
     error = capsys.readouterr().err
@@ -213,28 +213,24 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
 
 @pytest.mark.parametrize("case", ["bend", "radius"])
 def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
-    assert health_of(1, case, "", density=400.0)["verdict"] == "profile still valid"
+    assert health_of(1, case, "", density=300.0, length=3.0)["verdict"] == "profile still valid"
     for change, name, size in (("scale", "angle scale", -1.0), ("centre", "centre u", -3.0)):
-        found = health_of(1, case, change, density=400.0)
+        found = health_of(1, case, change, density=300.0, length=3.0)
         assert found["verdict"] == "drifted, recalibrate"
         value, sigma = found["changes"][name]
         assert abs(value - size) < 4 * sigma
 
 
-def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius():
-    for change in ("", "alpha"):
-        found = health_of(2, "straight", change, density=400.0)
-        assert found["verdict"] == "cannot tell"
-        assert found["alpha_sigma"] > 2 * BUDGET
-
-
-def test_turns_that_noise_feigns_in_a_straight_drive_count_for_nothing():
-    """They would leave sigma(alpha) at a few per cent, less with the length: so little was not seen."""
-    assert health_of(3, "straight", "alpha", density=400.0)["alpha_sigma"] == math.inf
+@pytest.mark.parametrize("change", ["", "alpha"])
+def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius(change):
+    """Turns that noise feigns would leave sigma(alpha) at a few per cent: they count for nothing."""
+    found = health_of(3, "straight", change, density=300.0, length=3.0)
+    assert found["verdict"] == "cannot tell"
+    assert found["alpha_sigma"] == math.inf
 
 
 def bent_drive(**camera):
-    return survey(1, "bend", density=400.0, camera=fisheye(100, **camera))
+    return survey(1, "bend", density=300.0, camera=fisheye(100, **camera))
 
 
 def test_a_profile_without_the_pupil_shift_is_not_accused(monkeypatch):
