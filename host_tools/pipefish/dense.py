@@ -495,8 +495,8 @@ def dense_wall(
         scatter=scatter,
         pairs_used=len(parts),
     )
-    found.regions.extend(find_regions(found))
     found.steps.extend(find_steps(found))
+    found.regions.extend(find_regions(found))
     return found
 
 

@@ -180,6 +180,14 @@ def test_a_joint_that_steps_aside_or_in_width_is_found(found: DenseWall, aside: 
         assert abs(r["clock"] - 2.5) < 0.15
 
 
+def test_what_a_step_makes_of_the_wall_beside_it_is_no_region(found: DenseWall) -> None:
+    after = np.where(found.s >= 0.45, 0.003, 0)[:, None] * np.cos(found.clock - 2.5)
+    plain = replace(found, deviation=found.deviation + after, steps=[])
+    assert len(find_regions(plain)) > 1
+    (r,) = find_regions(replace(plain, steps=find_steps(plain)))
+    assert abs(r["s"] + 0.1 - DEPOSIT["s"]) < 0.012
+
+
 def test_neither_a_deposit_nor_a_slope_nor_an_oval_is_a_step(found: DenseWall) -> None:
     assert found.steps == [] and np.isfinite(found.deviation).sum() > 8000
     slope = 0.02 * (found.s - 0.45)[:, None] * np.cos(found.clock - 1.0)
