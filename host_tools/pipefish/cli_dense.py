@@ -70,6 +70,14 @@ def run_dense(args: argparse.Namespace) -> Result:
                 f"{r['chainage']:.3f}, {r['clock_text']}, {length_text(r['length'], unit)} long",
             )
         )
+    for r in document["steps"][:20]:
+        rows.append(
+            (
+                "step",
+                f"{length_text(r['step'], unit)} +- {length_text(1.96 * r['sigma'], unit)} (95 %) towards "
+                f"{r['clock_text']} at {r['chainage']:.3f}, radius {length_text(r['widening'], unit)} wider",
+            )
+        )
     return document, table([*rows, *(("written", f) for f in files)])
 
 

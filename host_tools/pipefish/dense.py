@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipefish import _engine
 from pipefish.camera import Camera
 from pipefish.dense_regions import find_regions
+from pipefish.dense_steps import find_steps
 from pipefish.errors import ArgumentError
 from pipefish.matching import Seeds, grey, match_quasi_dense
 from pipefish.wallmodel import Floats, WallModel, predicted_seeds, seen_on_wall
@@ -61,6 +62,7 @@ class DenseWall:
     points             (rows, columns, 3) of the cells' middles, moved by their deviation; NaN where not measured
     scatter            what the pairs' own scatter multiplied the sigmas of theory by
     regions            connected cells that are off the tube by over 3 sigma: see `find_regions`
+    steps              where the pipe steps aside or changes its width at once: see `find_steps`
     """
 
     wall: WallModel
@@ -74,6 +76,7 @@ class DenseWall:
     scatter: float
     pairs_used: int
     regions: list[dict[str, float]] = field(default_factory=list)
+    steps: list[dict[str, float]] = field(default_factory=list)
 
     @property
     def points(self) -> Floats:
@@ -492,6 +495,7 @@ def dense_wall(
         scatter=scatter,
         pairs_used=len(parts),
     )
+    found.steps.extend(find_steps(found))
     found.regions.extend(find_regions(found))
     return found
 

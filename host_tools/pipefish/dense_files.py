@@ -52,7 +52,7 @@ def _table(first: str, along: Floats, clock: Floats, values: Floats) -> bytes:
 
 def map_picture(found: DenseWall, chainage: Floats, unit: str) -> NDArray[np.uint8]:
     """(H,W,3): the deviation in colours above, the unrolled pipe below, chainage to the right, clock downwards from
-    twelve o'clock; regions framed."""
+    twelve o'clock; regions framed, steps marked."""
     from PIL import Image, ImageDraw, ImageFont
 
     rows, columns = found.deviation.shape
@@ -84,6 +84,10 @@ def map_picture(found: DenseWall, chainage: Floats, unit: str) -> NDArray[np.uin
             draw.text((x, y0 + height + 6), f"{s:g}", "black", font, anchor="ma")
         for r in found.regions:
             _frame(draw, found, r, zoom, left, y0)
+        for r in found.steps:
+            x = left + zoom * rows * r["s"] / found.wall.length
+            for y in (y0 - 4, y0 + height - 8):
+                draw.line([(x, y), (x, y + 12)], fill=(220, 30, 140), width=2)
     draw.text((left, 8), "off the fitted tube (blue: inside)", "black", font)
     for k in range(160):
         value = np.array([2 * k / 159 - 1])
@@ -150,6 +154,14 @@ def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: 
                 "kind": "inwards" if r["height"] < 0 else "outwards",
             }
             regions.append(place | r | {"clock_text": clock_text(r["clock"])})
+    steps = []
+    for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
+        for r in found.steps[:: strip.sign]:
+            way = 0.0 if strip.sign > 0 else math.pi  # what follows by chainage is what comes before by s
+            clock = (r["clock"] + way) % (2 * math.pi)
+            place = {"piece": n, "chainage": strip.origin + strip.sign * r["s"]}
+            found_there = {"clock": clock, "widening": strip.sign * r["widening"], "clock_text": clock_text(clock)}
+            steps.append(place | r | found_there)
     values = np.concatenate([f.deviation[np.isfinite(f.deviation)] for f in maps])
     sigmas = np.concatenate([f.sigma[np.isfinite(f.deviation)] for f in maps])
     return plain(
@@ -166,6 +178,7 @@ def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: 
             "sigma_median": float(np.median(sigmas)) if len(sigmas) else None,
             **radius_sigmas(summary),
             "regions": regions,
+            "steps": steps,
         }
     )
 

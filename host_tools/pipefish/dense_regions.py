@@ -19,9 +19,10 @@ REGION_SIGMA, REGION_CELLS = 3.0, 12
 
 def find_regions(found: DenseWall) -> list[dict[str, float]]:
     """Connected cells (12 or more) whose 3 x 3 neighbourhood stands over 3 sigma and a 500th of the diameter in or out
-    of the ellipse through the wall half a diameter around, which leaves out what a tube's smoothness makes of ovality
-    and bends. Largest volume first: s, clock (radians) of the middle; length (along), extent (around, radians); height
-    (the 90th percentile, negative: it stands into the pipe); sigma of it; area; volume."""
+    of the ellipse through the wall half a diameter around, on its own side of found.steps: that leaves out what a
+    tube's smoothness makes of ovality and bends. Largest volume first: s, clock (radians) of the middle; length
+    (along), extent (around, radians); height (the 90th percentile, negative: it stands into the pipe); sigma of it;
+    area; volume."""
     measured = np.isfinite(found.deviation)
     weight = np.where(measured, np.nan_to_num(found.sigma, nan=1.0) ** -2.0, 0)
     total = _wrapped_box(weight)
@@ -58,19 +59,24 @@ def find_regions(found: DenseWall) -> list[dict[str, float]]:
 
 
 def _ellipses(found: DenseWall) -> Floats:
-    """(rows, columns): mean, shift and ellipse through the cells a quarter diameter to either side, robustly."""
+    """(rows, columns): mean, shift and ellipse through the cells a quarter diameter to either side, robustly, but not
+    beyond a step of the pipe."""
     angle = np.outer([1, 1, 2, 2], found.clock) - np.array([[0], [np.pi / 2], [0], [np.pi / 2]])
     terms = np.vstack([np.ones(len(found.clock)), np.cos(angle)])  # (5, columns)
     value = np.nan_to_num(found.deviation)
     weight = np.isfinite(found.deviation).astype(float)
     spacing = found.s[1] - found.s[0] if len(found.s) > 1 else 1.0
     half = max(1, round(0.5 * found.wall.mean_radius / spacing))
+    row = np.arange(len(value))
+    cuts = np.concatenate([[0], np.searchsorted(found.s, sorted(r["s"] for r in found.steps)), [len(value)]])
+    section = np.searchsorted(cuts, row, "right")
+    low, high = np.maximum(row - half, cuts[section - 1]), np.minimum(row + half + 1, cuts[section])
     fitted = np.zeros_like(value)
     bound = 3 * max(float(np.median(found.sigma[weight > 0])), 1e-9) if weight.any() else 1.0
     for _ in range(4):
         h = np.einsum("ac,rc,bc->rab", terms, weight, terms)
         g = np.einsum("ac,rc->ra", terms, weight * value)
-        h, g = (np.array([a[max(k - half, 0) : k + half + 1].sum(axis=0) for k in range(len(a))]) for a in (h, g))
+        h, g = (np.array([a[i:j].sum(axis=0) for i, j in zip(low, high, strict=True)]) for a in (h, g))
         h += 1e-3 * np.eye(5)
         fitted = np.linalg.solve(h, g[..., None])[..., 0] @ terms
         off = (value - fitted) / bound

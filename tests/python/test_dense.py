@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_columns
 from pipefish.dense import CALIBRATION_PX, DenseWall
-from pipefish.dense_files import strips_of
+from pipefish.dense_files import Strip, document_of, strips_of
 from pipefish.dense_regions import find_regions
+from pipefish.dense_steps import find_steps
 from pipefish.measured_files import RING
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
 from pipefish.wall import pieces_of
@@ -156,10 +158,51 @@ def test_a_deposit_is_found_where_it_is(found: DenseWall) -> None:
 
 def test_a_bare_pipe_has_no_regions(found: DenseWall) -> None:
     """The same map with the deposit's cells replaced by their errors."""
-    from dataclasses import replace
-
     plain = replace(found, deviation=np.where(np.isfinite(found.deviation), errors(found), np.nan), regions=[])
     assert find_regions(plain) == []
+
+
+def stepped(found: DenseWall, at: float, aside: float, clock: float, wider: float) -> DenseWall:
+    """The map where from `at` on the pipe lies aside and is wider, less what a smooth tube takes up of it: a slope over
+    0.16 m."""
+    after = np.clip((found.s - at) / 0.16 + 0.5, 0, 1)
+    left = (found.s >= at) - after
+    moved = left[:, None] * (aside * np.cos(found.clock - clock) + wider)[None]
+    return replace(found, deviation=found.deviation + moved, regions=[], steps=[])
+
+
+@pytest.mark.parametrize(("aside", "wider"), [(0.003, 0.0), (0.0, -0.002), (0.002, 0.0015)])
+def test_a_joint_that_steps_aside_or_in_width_is_found(found: DenseWall, aside: float, wider: float) -> None:
+    (r,) = find_steps(stepped(found, 0.45, aside, 2.5, wider))
+    assert abs(r["s"] - 0.45) < 0.006
+    assert abs(r["step"] - aside) < 0.2 * max(aside, 0.002) and abs(r["widening"] - wider) < 0.2 * max(aside, 0.002)
+    if aside:
+        assert abs(r["clock"] - 2.5) < 0.15
+
+
+def test_what_a_step_makes_of_the_wall_beside_it_is_no_region(found: DenseWall) -> None:
+    after = np.where(found.s >= 0.45, 0.003, 0)[:, None] * np.cos(found.clock - 2.5)
+    plain = replace(found, deviation=found.deviation + after, steps=[])
+    assert len(find_regions(plain)) > 1
+    (r,) = find_regions(replace(plain, steps=find_steps(plain)))
+    assert abs(r["s"] + 0.1 - DEPOSIT["s"]) < 0.012
+
+
+def test_neither_a_deposit_nor_a_slope_nor_an_oval_is_a_step(found: DenseWall) -> None:
+    assert found.steps == [] and np.isfinite(found.deviation).sum() > 8000
+    slope = 0.02 * (found.s - 0.45)[:, None] * np.cos(found.clock - 1.0)
+    oval = 0.003 * (found.s >= 0.45)[:, None] * np.cos(2 * found.clock)
+    assert find_steps(replace(found, deviation=found.deviation + slope + oval)) == []
+
+
+def test_a_step_is_told_along_the_chainage_which_may_run_against_s(found: DenseWall) -> None:
+    with_step = stepped(found, 0.45, 0.003, 2.5, 0.001)
+    with_step.steps.extend(find_steps(with_step))
+    for sign in (1, -1):
+        (r,) = document_of([with_step], [Strip(found.wall, 5.0, sign)], "metre")["steps"]
+        assert abs(r["chainage"] - (5.0 + sign * 0.45)) < 0.006
+        assert abs(r["widening"] - sign * 0.001) < 0.0004
+        assert abs(r["clock"] - (2.5 if sign > 0 else 2.5 + np.pi)) < 0.15
 
 
 @pytest.mark.parametrize(("share", "beside"), [(1.1, 0.003), (0.9, 0.0)])
