@@ -7,16 +7,26 @@ from typing import Any
 
 from pipefish.cli import Result, add_command, positive, table
 
+MAX_PIXELS = 2_000_000  # of a picture: memory is a kilobyte a pixel and more
+
 
 def run_segment(args: argparse.Namespace) -> Result:
     """Segments two pictures into layers and writes them."""
-    from pipefish.matching import match_quasi_dense
+    from pipefish.errors import FormatError
+    from pipefish.matching import grey, match_quasi_dense
     from pipefish.matching_files import read_pixels
     from pipefish.progress import Progress
     from pipefish.segmentation import planes, segment_motion
     from pipefish.segmentation_files import document, write_segmentation
 
     one, two = read_pixels(args.first), read_pixels(args.second)
+    for picture, name in ((one, args.first), (two, args.second)):
+        if picture.shape[0] * picture.shape[1] > MAX_PIXELS:
+            size = f"{picture.shape[1]}x{picture.shape[0]}"
+            raise FormatError(name, None, f"{size} is more than {MAX_PIXELS} pixels: make both pictures smaller first")
+        grey(picture, name)
+    if any(p.ndim == 2 or (p == p[..., :1]).all() for p in (one, two)):  # three times the same says no more than once
+        one, two = grey(one, args.first), grey(two, args.second)
     with Progress("matching and segmenting", total=1.0, quiet=args.json) as bar:
         bar.update(0, "matching")
         m = match_quasi_dense(one, two, threads=args.threads)

@@ -18,7 +18,6 @@ from .grouping import group_matches
 from .matching import Matches, grey, match_quasi_dense
 
 Floats32 = NDArray[np.float32]
-MAX_PIXELS = 1_000_000
 LEAST = 30  # vertices of a group that a layer may start from
 
 

@@ -101,8 +101,8 @@ def scene(**kind) -> Pair:
 
 
 @cache
-def segmented(light: float = 200.0, **kind) -> pf.Segmentation:
-    return pf.segment_motion(*scene(**kind).images, light=light)
+def segmented(**kind) -> pf.Segmentation:
+    return pf.segment_motion(*scene(**kind).images)
 
 
 def test_bent_and_relit_patches_are_found_in_both_pictures():
@@ -143,7 +143,8 @@ def test_threads_do_not_change_the_result():
 
 def test_light_that_may_not_vary_over_a_layer_loses_much_of_it():
     """So the field of light is needed, and is what makes the first test pass."""
-    pair, s = scene(seed=1), segmented(light=1e6, seed=1)
+    pair = scene(seed=1)
+    s = pf.segment_motion(*pair.images, light=1e6, rounds=2)
     names = paired(s.labels1, pair.labels[0])
     assert overlap(s.labels1, pair.labels[0], names) <= 0.85
 
@@ -168,7 +169,7 @@ def test_layers_may_be_much_smaller_in_one_picture():
 
 def test_grey_pictures_do_too():
     pair = scene(seed=1)
-    s = pf.segment_motion(*(image.mean(axis=2) for image in pair.images))
+    s = pf.segment_motion(*(image.mean(axis=2) for image in pair.images), rounds=2)
     names = paired(s.labels1, pair.labels[0])
     assert overlap(s.labels1, pair.labels[0], names) >= 0.85 and s.layers[0].gain1.shape[2] == 1
 
@@ -202,6 +203,19 @@ def test_the_command_writes_labels_fields_and_pictures(tmp_path: Path, capsys: p
         assert np.isfinite(flow["flow1"][labels == 1]).mean() > 0.99
         assert flow["flow2"].shape == (180, 240, 2) and light["gain1"].shape == (180, 240, 3)
     assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 2 * 186)
+
+
+def test_the_command_takes_grey_with_colour_and_names_a_picture_that_is_too_large(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    Image.fromarray(np.zeros((40, 50, 3), np.uint8)).save(tmp_path / "colour.png")
+    Image.fromarray(np.full((40, 60), 300, np.uint16)).save(tmp_path / "deep.png")
+    Image.fromarray(np.zeros((1001, 2000), np.uint8)).save(tmp_path / "large.png")
+    out = ["-o", str(tmp_path / "out"), "--json"]
+    assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "deep.png"), *out]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "no common motion"
+    assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "large.png"), *out]) == 1
+    assert "large.png: 2000x1001" in capsys.readouterr().err
 
 
 def test_bad_arguments_are_named():

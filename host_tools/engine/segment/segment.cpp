@@ -61,7 +61,7 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
             state.merge();
             note("merge");
         }
-        if (round > 1 && before - trace.back().energy < 2e-3 * std::abs(before))
+        if (round > 1 && before - trace.back().energy < 5e-3 * std::abs(before)) // labels of 0.2 % of pixels
             break;
     }
     if (state.layers() > 0)
