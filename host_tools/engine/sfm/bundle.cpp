@@ -26,7 +26,7 @@ struct State {
     std::vector<Vector3d> centre, point;
     double wheel = 0.0;
     Vector3d down = Vector3d::UnitY();
-    double sag = 0.0;
+    Vector3d sag = Vector3d::Zero();
     Eigen::VectorXd camera;
 };
 
@@ -114,7 +114,7 @@ public:
                                   camera_columns_ ? by_camera.data() : nullptr) != PF_OK) {
                 continue;
             }
-            const Vector2d r = o.whiten * (uv + state_.sag * o.sag - o.sight.uv);
+            const Vector2d r = o.whiten * (uv + sag_columns(o.sag) * state_.sag - o.sight.uv);
             const Rows<2, 3> whitened = o.whiten * slope / yardstick();
             const Rows<2, 3> j_point = whitened * turn.r;
             Rows<2, 3> j_turn;
@@ -135,7 +135,7 @@ public:
                 j_border.col(0) = -whitened * x;
             }
             if (sag_at_ >= 0) {
-                j_border.col(sag_at_) = o.whiten * o.sag;
+                j_border.middleCols<3>(sag_at_) = o.whiten * sag_columns(o.sag);
             }
             for (int c = 0; c < camera_columns_; c++) {
                 j_border.col(camera_at_ + c) =
@@ -160,7 +160,8 @@ public:
                 return std::numeric_limits<double>::infinity();
             }
             const Observation &o = table_[place_[k]];
-            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + state_.sag * o.sag - o.sight.uv;
+            const Vector2d error =
+                Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + sag_columns(o.sag) * state_.sag - o.sight.uv;
             sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
         }
         return sum;
@@ -184,7 +185,7 @@ public:
                 (saved_.down + geometry::tangent_basis(saved_.down) * step.g.segment<2>(down_at_)).normalized();
         }
         if (sag_at_ >= 0) {
-            state_.sag = saved_.sag + step.g[sag_at_];
+            state_.sag = saved_.sag + step.g.segment<3>(sag_at_);
         }
         if (camera_columns_ > 0) {
             state_.camera = saved_.camera + step.g.tail(camera_columns_);
@@ -324,8 +325,9 @@ private:
             state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
         }
         if (options_.sag_sigma > 0.0) {
-            sag_at_ = border_++;
-            extra_rows_++;
+            sag_at_ = border_;
+            border_ += 3;
+            extra_rows_ += 3;
         }
         if (options_.camera_prior) {
             camera_at_ = border_;
@@ -398,7 +400,7 @@ private:
             }
         }
         if (sag_at_ >= 0) {
-            sum += std::pow(state_.sag / options_.sag_sigma, 2);
+            sum += (state_.sag / options_.sag_sigma).squaredNorm();
         }
         if (camera_columns_ > 0) {
             sum += (camera_root_ * state_.camera).squaredNorm();
@@ -434,10 +436,10 @@ private:
             linearize_gravity(sink);
         }
         if (sag_at_ >= 0) {
-            RowsX j = RowsX::Zero(1, border_);
-            j(0, sag_at_) = 1.0 / options_.sag_sigma;
-            const double r = state_.sag / options_.sag_sigma;
-            sink.add(1, &r, plain, nullptr, {}, {}, j.data());
+            RowsX j = RowsX::Zero(3, border_);
+            j.middleCols<3>(sag_at_) = Matrix3d::Identity() / options_.sag_sigma;
+            const Vector3d r = state_.sag / options_.sag_sigma;
+            sink.add(3, r.data(), plain, nullptr, {}, {}, j.data());
         }
         if (camera_columns_ > 0) {
             RowsX j = RowsX::Zero(camera_columns_, border_);

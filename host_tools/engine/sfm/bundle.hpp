@@ -60,7 +60,7 @@ struct BundleOptions {
     const Odometry *odometry = nullptr;
     const Gravity *gravity = nullptr;
     const CameraPrior *camera_prior = nullptr;
-    double sag_sigma = 0.0; // px^2, of the tracks' common sag (tracks.hpp), about 0; 0: there is none
+    double sag_sigma = 0.0; // px^2, of each part of the tracks' common sag (tracks.hpp), about 0; 0: there is none
     const std::vector<int> *only =
         nullptr; // places of the observations to use, as BundleReport::used; null: by the gate
 };
@@ -72,9 +72,9 @@ struct BundleReport {
     double variance_factor = 1.0; // cost over degrees of freedom: 1 = noise as stated
     double wheel = 0.0;           // w
     Vector3d down = Vector3d::Zero();
-    double sag = 0.0;       // px^2
-    Eigen::VectorXd camera; // changes of the camera's parameters
-    std::vector<int> used;  // places in the table of the observations, by point
+    Vector3d sag = Vector3d::Zero(); // px^2, as sag_columns() takes it
+    Eigen::VectorXd camera;          // changes of the camera's parameters
+    std::vector<int> used;           // places in the table of the observations, by point
 };
 
 class BundleCovariance
@@ -94,7 +94,10 @@ public:
         return known_.f[frames() - 1 - frame][0];
     }                                                                // rotation (left), centre
     const std::vector<Matrix3d> &points() const { return known_.e; } // as the map's points
-    const Eigen::MatrixXd &border() const { return known_.g; } // wheel, gravity (2), sag, camera: those of the options
+    const Eigen::MatrixXd &border() const
+    {
+        return known_.g;
+    } // wheel, gravity (2), sag (3), camera: those of the options
 
     // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
     Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const
