@@ -16,8 +16,11 @@ FINDINGS = ("deposits", "holes", "cracks", "laterals", "roots", "water")  # lie 
 
 
 def bare(scene: Scene) -> Scene:
-    """The scene's pipe without what is found in it: what its diameters are."""
-    return Scene({**scene.spec, **{name: [] for name in FINDINGS}})
+    """The scene's pipe without what is found in it, joints' grooves filled: what its diameters are."""
+    spec = {**scene.spec, **{name: [] for name in FINDINGS}}
+    spec["joints"] = [{**joint, "depth": 0.0} for joint in spec["joints"]]
+    spec["joint_series"] = {**spec["joint_series"], "depth": 0.0}
+    return Scene(spec)
 
 
 def true_section(scene: Scene, s: float) -> tuple[float, float, float]:
