@@ -13,18 +13,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from accept_recon import FOLDER
 
-import pipefish as pf
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.errors import PipefishError
 from pipefish.measure import Measurement, measure
 from pipefish.measured_remarks import not_measured
 from pipefish.measuretruth import against_truth
+from pipefish.simcamera import calibrated
 from pipefish.simulate import Scene, simulate
 from pipefish.survey import Survey
-from tube_tracks import rotation
 
 LEFT, UP_RIGHT = -math.pi / 2, 0.6
 SCENES: dict[str, dict[str, Any]] = {
@@ -58,29 +56,6 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 
 Limits = tuple[str, float, float, float]  # name, value, low, high
-
-
-def calibrated(scene: Scene, views: int = 80, noise: float = 0.05) -> pf.Camera:
-    """The scene's camera as a calibration finds it: a board of 70 corners, 25 mm apart, at 0.1 to 0.7 m all over the
-    field, corners with `noise` px."""
-    spec, pose, random = scene.spec["lens"], scene.pose(0), np.random.default_rng(5)
-    x, y = np.meshgrid(np.arange(10) - 4.5, np.arange(7) - 3.0)
-    board = 0.025 * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    seen = []
-    for number in range(views):
-        distance = random.choice([0.12, 0.2, 0.35, 0.6]) * random.uniform(0.8, 1.2)
-        theta, phi = 1.5 * math.sqrt(random.uniform(0, 1)), random.uniform(0, 2 * math.pi)
-        ahead = np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
-        across = np.cross([0.0, 1.0, 0.1], ahead)
-        across /= np.linalg.norm(across)
-        turn = np.stack([across, np.cross(ahead, across), ahead], 1) @ rotation(random.normal(0, 0.35, 3))
-        placed = board @ turn.T + distance * ahead
-        pixels, ok = scene.project(0, (placed - pose[:, 3]) @ pose[:, :3])
-        ok &= (pixels >= 0).all(1) & (pixels <= [spec["width"] - 1, spec["height"] - 1]).all(1)
-        if ok.sum() >= 20:
-            noisy = pixels[ok] + random.normal(0, noise, (int(ok.sum()), 2))
-            seen.append(pf.View(board[ok], noisy, board=0, camera=0, name=str(number)))
-    return pf.calibrate(seen, image_size=(spec["width"], spec["height"]), model="auto", board="flat").camera
 
 
 def recorded(name: str, spec: dict[str, Any]) -> Recording:
@@ -153,6 +128,7 @@ def video_figures(name: str) -> list[Limits]:
         ("encoder_pct", truth["encoder_pct"], -math.inf, math.inf),
         ("diameter_held", truth["diameter_covered"], 0.9, math.inf),
         ("ovality_rms_points", truth["ovality_rms_points"], -math.inf, 0.3),
+        ("ovality_held", truth["ovality_covered"], 0.9, math.inf),
         ("share_measured", truth["stations_measured"] / truth["stations"], 0.95, math.inf),
     ]
     if truth["bend_degrees"] is not None:

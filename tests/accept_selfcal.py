@@ -21,7 +21,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "python"))
 
-from accept_recon_video import calibrated, recorded  # noqa: E402
+from accept_recon_video import recorded  # noqa: E402
 from accept_rows import Row, at_least, at_most, exactly, figure, kept_series, print_rows  # noqa: E402
 
 from calib_data_sets import jy_stereo, ov_plane  # noqa: E402
@@ -31,6 +31,7 @@ from pipefish.matching_files import read_grey  # noqa: E402
 from pipefish.measure import measure  # noqa: E402
 from pipefish.selfcal import self_calibrate  # noqa: E402
 from pipefish.selfcal_input import COMMON_SIGMA, match_pictures  # noqa: E402
+from pipefish.simcamera import calibrated  # noqa: E402
 from pipefish.simulate import Scene  # noqa: E402
 from pipefish.survey import Survey  # noqa: E402
 from selfcal_drives import drifted, health_of  # noqa: E402

@@ -24,6 +24,7 @@ BAUD = 3_000_000
 BENCH_TIMEOUT_S = 120
 START_TIMEOUT_S = 10
 DRAIN_S = 900  # tracking is faster than the cable: 10 m are tracked in 20 s and sent in two minutes
+CALIBRATION_VIEWS = 40
 LOG_LINES = 12  # of a program that failed, shown with the error
 
 
@@ -74,11 +75,12 @@ class Recording:
 
 def simulated(folder: Path, frames: int | None, fresh: bool, quiet: bool) -> Recording:
     """The demo's recording, simulated unless the same one is there already."""
-    from pipefish.simulate import scene_key, simulate
+    from pipefish.simcamera import calibrated
+    from pipefish.simulate import Scene, scene_key, simulate
 
     recording = Recording.at(folder / PRESET)
     stamp = folder / "stamp.json"
-    wanted = {"scene": scene_key(PRESET), "frames": frames, "software": __version__}
+    wanted = {"scene": scene_key(PRESET), "frames": frames, "software": __version__, "profile": CALIBRATION_VIEWS}
     if not fresh:
         with contextlib.suppress(OSError, ValueError):
             if json.loads(stamp.read_text()) == {**wanted, "files": recording.key()}:
@@ -88,6 +90,8 @@ def simulated(folder: Path, frames: int | None, fresh: bool, quiet: bool) -> Rec
     stamp.unlink(missing_ok=True)
     say("simulation: a 6 m DN300 concrete pipe with a bend and an oval stretch", quiet)
     simulate(PRESET, folder / PRESET, frames=frames, quiet=quiet)
+    say(f"calibration: the simulated camera, from {CALIBRATION_VIEWS} views of a board", quiet)
+    calibrated(Scene.load(PRESET), CALIBRATION_VIEWS).save(recording.profile)
     stamp.write_text(json.dumps({**wanted, "files": recording.key()}))
     return recording
 

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pipefish import _engine
+from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
@@ -35,10 +36,10 @@ ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
 TRACK_WALK_PX = 0.3
 # What all tracks have in common does not average out: 0.01 px a keyframe bends the scale by per cents in 6 m where
 # vision outvotes the encoder. The largest part of it has a known form and is estimated: px^2, the second moment
-# of a window of 21 px is 37; 70 were found, of a tracker that corrects for it 25. For the rest vision's word
+# of a window of 21 px is 37; 70 to 90 were found, of a tracker that corrects for it 25. For the rest vision's word
 # counts less: scatter of the diameter in concrete and brick with 0.3 px 0.10 and 0.88 %, with 0.5 px 0.07 and
 # 0.09 %, with 0.8 px 0.06 and 0.10 %.
-TRACK_SAG_PX2 = 100.0
+TRACK_SAG_PX2 = 50.0
 TRACK_FLOOR_PX = 0.5
 # A check of the profile asks for drifts beside the lens's own ripples, not for a scale that holds along the pipe: of
 # these sigmas it takes so much, 0.3 px and 0.18 px a radian. By their errors alone tracks of drawn brick and concrete
@@ -267,7 +268,7 @@ def measure(
     structure = _while_telling(
         lambda: reconstruct(
             weighed,
-            camera,
+            assumed(camera),
             chainage,
             encoder=quality,
             attitude=attitude,
@@ -275,6 +276,7 @@ def measure(
             method=method,
             threads=threads,
             sag_sigma=TRACK_SAG_PX2,
+            hold_camera=camera.covariance is None,  # tracks are no better than what is assumed
             drift=drift_prior(weighed, camera, TRACK_SHARPER),
             shutter=shutter,
         ),
@@ -373,13 +375,15 @@ def _travel(tracks: Tracks, camera: Camera) -> np.ndarray:
 
 
 def _sag(tracks: Tracks, camera: Camera, sag: np.ndarray, item: np.ndarray) -> np.ndarray:
-    """(n,2) pixels by which observations `item` (n,) are off for that sag (n,), px^2."""
+    """(n,2) pixels by which observations `item` (n,) are off for that sag (n,3), px^2."""
     theta = np.nan_to_num(_angles(tracks, camera))
     size = _engine.sag(
         np.ascontiguousarray(theta[_first_seen(tracks)][item]), np.ascontiguousarray(theta[item]), camera.f_u
     )
     out = tracks.pixels[item] - np.array([camera.c_u, camera.c_v])
-    return (sag * size / np.maximum(np.linalg.norm(out, axis=1), 1e-9))[:, None] * out
+    out /= np.maximum(np.linalg.norm(out, axis=1), 1e-9)[:, None]
+    along = sag[:, 0] + sag[:, 1] * (out[:, 0] ** 2 - out[:, 1] ** 2) + sag[:, 2] * 2 * out[:, 0] * out[:, 1]
+    return (along * size)[:, None] * out
 
 
 def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Residuals:
@@ -393,7 +397,10 @@ def _residuals(tracks: Tracks, structure: Reconstruction, camera: Camera) -> Res
     j, k = j[item], k[item]
     poses = structure.poses_at(k, tracks.pixels[item])
     seen = np.einsum("nij,nj->ni", poses[:, :, :3], structure.points[j]) + poses[:, :, 3]
-    pixels, ok = camera.project(seen)
+    pixels, ok = np.empty((len(item), 2)), np.zeros(len(item), bool)
+    for segment in range(len(structure.sigma)):
+        inside = np.flatnonzero(structure.segment[k] == segment)
+        pixels[inside], ok[inside] = structure.camera_of(camera, segment).project(seen[inside])
     item, j, k, seen, pixels = item[ok], j[ok], k[ok], seen[ok], pixels[ok]
     residual = tracks.pixels[item] - pixels - _sag(tracks, camera, np.array(structure.sag)[structure.segment[k]], item)
     covariance = tracks.covariance[item]  # a survey's tracks have them
@@ -469,7 +476,7 @@ def _sigmas(m: Measurement) -> None:
         if exact is None:
             continue
         d = stations["d_mean"]
-        if exact.camera is not None:
+        if exact.camera is not None and m.camera.covariance is not None:  # what is assumed of others has no radial part
             cameras[stretch.segment] = factor * np.interp(stations["s"], exact.s, exact.camera) / d
             stretch.camera = cameras[stretch.segment]
         if m.scale.diameter_from_prior:  # of the wander along the path the tube's sigma tells

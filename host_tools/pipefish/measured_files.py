@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipefish import __version__
+from pipefish.assumed import assumed_px
 from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
@@ -177,6 +178,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "rms_px": camera.rms_px,
                 "pupil_e1": camera.pupil_e1,
                 "covariance": camera.covariance is not None,
+                "assumed_px": None if camera.covariance is not None else assumed_px(camera),
                 "source": camera.source,
                 "created": camera.created.isoformat() if camera.created else None,
                 "profile": json.loads(camera.to_json()),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipefish.assumed import assumed_px
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
 from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
@@ -90,8 +91,11 @@ def remark(m: Measurement) -> None:
         remarks.append(m.health.text)
     remarks += _water_remark(m) + _invert_remark(m)
     if m.camera.covariance is None:
+        whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
         remarks.append(
-            "The camera profile has no covariance: systematic errors of the calibration are not in the intervals."
+            "The camera profile has no covariance: what its radial function and its pupil are off is not in the "
+            f"intervals of diameters. Ovality counts it as asymmetric by {assumed_px(m.camera):.2g} px all over the "
+            f"picture ({whence})."
         )
     if m.structure.down is None:
         remarks.append("No inclinometer: the clock is relative to the first keyframe.")

@@ -108,7 +108,7 @@ class Report(Charts):
         )
         if "ovality_sigma" in s:
             rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
-            if camera is not None:
+            if s["ovality_systematic"] > 0:
                 rows.append(("  systematic (camera)", f"± {Z95 * 100 * s['ovality_systematic']:.2f} points"))
         for text in scale_texts(self.document["scale"]):
             name, _, told = text.partition(": ")
@@ -179,7 +179,10 @@ class Report(Charts):
                 "pupil shift",
                 f"{1000 * camera['pupil_e1']:.3g} mm per rad²" if camera["pupil_e1"] else "none in the profile",
             ),
-            ("covariance", "yes" if camera["covariance"] else "none: its error is in no interval"),
+            (
+                "covariance",
+                "yes" if camera["covariance"] else f"none: asymmetry of {camera['assumed_px']:.2g} px assumed",
+            ),
             ("source", camera["source"] or "-"),
         ]
         survey = [

@@ -6,6 +6,7 @@ The simulator shares no code with the camera model that everything else uses: it
 from __future__ import annotations
 
 import copy
+import dataclasses
 import hashlib
 import json
 import math
@@ -424,8 +425,8 @@ def fitted_camera(scene: Scene) -> Any:
     """The p9 camera closest to the scene's lens at the wall of its pipe: least squares of image radius over angle.
 
     The fit is central and the lens is not, so it holds at one distance: wall points at the pipe's radius, seen from the
-    camera centre. `rms_px` is the residual there, without the asymmetry. For a lens that is a profile: that profile. A
-    pipefish.Camera.
+    camera centre. `rms_px` is the residual there, over the picture: mostly the asymmetry, which it has none of. For a
+    lens that is a profile: that profile. A pipefish.Camera.
     """
     from pipefish.camera import Camera
 
@@ -439,10 +440,9 @@ def fitted_camera(scene: Scene) -> Any:
     theta = np.arctan2(wall, pupil + wall / np.tan(ray))  # of the wall point on that ray, from the camera centre
     powers = theta[:, None] ** np.array([1, 3, 5, 7, 9])
     coefficients = np.linalg.lstsq(powers, radius, rcond=None)[0]
-    rms = float(np.sqrt(np.mean((powers @ coefficients - radius) ** 2)))
     focal = float(coefficients[0])
     k2, k3, k4, k5 = (coefficients[1:] / focal).tolist()
-    return Camera(
+    camera = Camera(
         width=spec["width"],
         height=spec["height"],
         f_u=focal,
@@ -459,9 +459,18 @@ def fitted_camera(scene: Scene) -> Any:
         circle_radius=scene.circle_radius,
         name="simulated fisheye",
         source="simulated",
-        rms_px=rms,
         theta_covered=float(theta[-1]),
     )
+    phi = np.arange(36) * (2 * np.pi / 36)
+    place = np.searchsorted(radius, radius[-1] * np.sqrt((np.arange(40) + 0.5) / 40))  # rings of equal area
+    around = np.stack([np.cos(phi), np.sin(phi)], axis=-1) * wall
+    ahead = wall / np.tan(theta[place])
+    points = np.array([[x, y, z] for z in ahead for x, y in around])
+    pose = scene.pose(0)
+    seen, ok = scene.project(0, (points - pose[:, 3]) @ pose[:, :3])
+    found, within = camera.project(points)
+    off = (seen - found)[ok & within]
+    return dataclasses.replace(camera, rms_px=float(np.sqrt(np.mean(off**2))))
 
 
 def scene_key(name: str) -> dict[str, Any]:

@@ -22,6 +22,10 @@ from .survey import Tracks
 
 Floats = npt.NDArray[np.float64]
 
+#: Of a held camera's covariance this share goes into the adjustment: so little that the camera neither moves nor is
+#: sharpened, and enough for what it adds to be told from rounding. What it adds is divided by it.
+HELD = 1e-4
+
 #: Why a stretch was not measured, in words.
 REASONS = {
     "weak_texture": "too few tracks in common",
@@ -100,10 +104,12 @@ class Reconstruction:
     standing         frames not used: nothing had moved since the one before
     gaps             list of Gap
     down             (3,) direction of gravity in the world, None without an inclinometer
-    sag              px^2, of each segment: the tracks' common sag
+    sag              (3,) px^2, of each segment: the tracks' common sag all around alike, and what along a radius at
+                     phi its cosine and sine of 2 phi add
     line_time        seconds, and its sigma, as the survey's own rows tell it; None without a rolling shutter
     shutter          what was said of a rolling shutter; poses are those of its middle row: see poses_at()
-    camera_change    change of the camera's parameters as estimated with their prior, names in camera_parameters
+    camera_change    (segments, n) change of the camera's parameters as estimated with their prior, names in
+                     camera_parameters; None where the profile has no covariance. See camera_of()
     cost             sum of half the squared residuals
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
                      covariance (m,m); poses, points and tracks as they are then; noise, the factor
@@ -137,12 +143,13 @@ class Reconstruction:
     camera_change: Floats | None
     camera_parameters: tuple[str, ...]
     cost: float
-    sag: list[float] = field(default_factory=list)
+    sag: list[Floats] = field(default_factory=list)
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
     drift: list[dict[str, Any]] = field(default_factory=list, repr=False)
     shutter: RollingShutter | None = field(default=None, repr=False)
     line_time: tuple[float, float] | None = None
+    camera_share: float = 1.0  # of its covariance that went into the adjustment: HELD of a held camera
     parts: list[tuple[Any, Any]] = field(default_factory=list, repr=False)  # the engine's covariances of each segment
     turns: list[Floats] = field(default_factory=list, repr=False)  # world from segment, rotations
 
@@ -186,8 +193,24 @@ class Reconstruction:
             raise ArgumentError("systematic: the camera's profile has no covariance")
         first = int(np.searchsorted(self.point_segment, number))
         rows = np.ascontiguousarray(rows @ self.turns[number])
-        found = (total if systematic else random).functions((places - first).astype(np.int32), rows)
-        return found * (1.0 if systematic else self.variance_factor[number])
+        inside = (places - first).astype(np.int32)
+        found = random.functions(inside, rows)
+        if systematic:
+            return found + (total.functions(inside, rows) - found) / self.camera_share
+        return found * self.variance_factor[number]
+
+    def camera_of(self, camera: Camera, segment: int) -> Camera:
+        """The camera with which a segment's poses and points agree: as estimated with its prior."""
+        if self.camera_change is None:
+            return camera
+        values: dict[str, Any] = {}
+        for name, change in zip(self.camera_parameters, self.camera_change[segment], strict=True):
+            key, _, index = name.partition("[")
+            if index:
+                values.setdefault(key, list(getattr(camera, key)))[int(index[:-1])] += float(change)
+            else:
+                values[key] = getattr(camera, key) + float(change)
+        return dataclasses.replace(camera, covariance=None, covariance_parameters=(), **values)
 
     @property
     def length(self) -> float:
@@ -265,6 +288,7 @@ def reconstruct(
     seed: int = 0,
     still: float = 0.5,
     sag_sigma: float = 0.0,
+    hold_camera: bool = False,
     drift: tuple[Sequence[str], Floats, float] | None = None,
     shutter: RollingShutter | None = None,
 ) -> Reconstruction:
@@ -280,6 +304,7 @@ def reconstruct(
     still      px: frames in which tracks moved less (median) are not used
     sag_sigma  px^2, above 0: tracks have a common sag that is not known, as those of a tracker with a window have in a
                tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
+    hold_camera   the camera stays as it is, and its covariance is propagated as it is: no tracks sharpen it
     drift      names of the camera's parameters, their covariance, as wide as they may have changed since it was
                calibrated, and a factor on the noise of the tracks: the adjustment is then made once more with them
                free, for Reconstruction.drift alone
@@ -302,6 +327,7 @@ def reconstruct(
         down = _down(attitude, frames)
     if shutter is not None:
         shutter = _checked(shutter, frames, camera)
+    share = HELD if hold_camera else 1.0
     uncertain = [PARAMETERS.index(name) for name in camera.covariance_parameters]
     found = _engine.reconstruct(
         camera._profile,
@@ -322,7 +348,7 @@ def reconstruct(
         down,
         float(attitude_sigma),
         uncertain,
-        None if camera.covariance is None else np.ascontiguousarray(camera.covariance),
+        None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
         [PARAMETERS.index(name) for name in drift[0]] if drift else [],
         np.ascontiguousarray(drift[1]) if drift else None,
         float(drift[2]) if drift else 1.0,
@@ -331,7 +357,7 @@ def reconstruct(
         0.0 if shutter is None else shutter.line_time,
         0.0 if shutter is None else shutter.middle_row,
     )
-    out = _result(found, names, frames, step, encoder, camera)
+    out = _result(found, names, frames, step, encoder, camera, share)
     out.shutter = shutter
     if shutter is not None:
         out.line_time = _line_time(found["segments"], shutter.line_time)
@@ -347,6 +373,7 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
         return np.zeros((0, 3, 3))
     if rec.unit != "metre":
         camera = dataclasses.replace(camera, pupil_e1=0.0)  # a length, and lengths are not known
+    cameras = [rec.camera_of(camera, segment) for segment in range(len(rec.sigma))]
     place = np.minimum(np.searchsorted(rec.frames, tracks.frame), len(rec.frames) - 1)
     here = rec.frames[place] == tracks.frame
     # Points are in the order of segment and track; a track may have one in each of several segments.
@@ -359,7 +386,10 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
     poses = rec.poses_at(place, tracks.pixels[item])
     turn = poses[:, :, :3]
     seen = np.einsum("nij,nj->ni", turn, rec.points[number]) + poses[:, :, 3]
-    pixels, ok, slope = camera.project_jacobian(seen)[:3]
+    pixels, ok, slope = np.empty((len(item), 2)), np.zeros(len(item), bool), np.empty((len(item), 2, 3))
+    for segment, own in enumerate(cameras):
+        inside = np.flatnonzero(rec.segment[place] == segment)
+        pixels[inside], ok[inside], slope[inside] = own.project_jacobian(seen[inside])[:3]
     spread = np.broadcast_to(sigma**2 * np.eye(2), (len(item), 2, 2))
     if tracks.covariance is not None:
         spread = tracks.covariance[item]
@@ -402,6 +432,7 @@ def _result(
     step: Floats | None,
     encoder: Encoder,
     camera: Camera,
+    share: float,
 ) -> Reconstruction:
     """The engine's answer in terms of the caller's frames and tracks."""
     used = found["frames"].astype(np.int64)
@@ -421,8 +452,8 @@ def _result(
         pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
         pose_covariances[-1][0] = 0.0  # held; the engine has the unit matrix there
         if s["total"] is not None:
-            systematic.append(r @ (s["total"].point - s["random"].point) @ r.T)
-            pose_systematic.append(spin @ (s["total"].pose - s["random"].pose) @ spin.T)
+            systematic.append(r @ (s["total"].point - s["random"].point) @ r.T / share)
+            pose_systematic.append(spin @ (s["total"].pose - s["random"].pose) @ spin.T / share)
     metric = bool(segments) and all(s["metric"] for s in segments)
     status = "failed" if not segments else "partial" if gaps or len(segments) > 1 else "ok"
     reason = "" if status == "ok" else "; ".join(str(gap) for gap in gaps[:3])
@@ -455,8 +486,9 @@ def _result(
         standing=sorted(set(range(count)) - set(used.tolist())),
         gaps=gaps,
         down=first["down"] if first and np.any(first["down"]) else None,
-        camera_change=first["camera"] if first and len(first["camera"]) else None,
+        camera_change=np.array([s["camera"] for s in segments]) if first and len(first["camera"]) else None,
         camera_parameters=camera.covariance_parameters,
+        camera_share=share,
         cost=sum(s["cost"] for s in segments),
         sag=[s["sag"] for s in segments],
         iterations=[s["iterations"] for s in segments],

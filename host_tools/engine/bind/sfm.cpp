@@ -228,7 +228,7 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["iterations"] = segment.report.summary.iterations;
     out["converged"] = segment.report.summary.status == pipefish::optim::Status::converged;
     out["wheel"] = segment.report.wheel;
-    out["sag"] = segment.report.sag;
+    out["sag"] = to_numpy<double>(segment.report.sag.data(), {3});
     out["late"] = segment.late;
     out["late_sigma"] = segment.late_sigma;
     out["down"] = to_numpy<double>(segment.report.down.data(), {3});
@@ -357,7 +357,7 @@ void bind_sfm(nb::module_ &m)
         .def_prop_ro("point", &point_covariances, nb::rv_policy::move, "(N,3,3)")
         .def_prop_ro(
             "border", [](const sfm::BundleCovariance &c) { return matrix_to_numpy(c.border()); }, nb::rv_policy::move,
-            "Of wheel, gravity (2), sag, line time and camera, those that were estimated.")
+            "Of wheel, gravity (2), sag (3), line time and camera, those that were estimated.")
         .def("functions", &functions, nb::arg("points").noconvert(), nb::arg("jacobian").noconvert(),
              "(m,m) covariance of m linear functions of points (n,) int32: jacobian (m,n,3).");
     m.def("reconstruct", &reconstruct, nb::arg("camera"), nb::arg("frames"), nb::arg("tracks"),

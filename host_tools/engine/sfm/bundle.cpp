@@ -26,8 +26,8 @@ struct State {
     std::vector<Vector3d> centre, point;
     double wheel = 0.0;
     Vector3d down = Vector3d::UnitY();
-    double sag = 0.0;
     double late = 1.0; // of the stated line time
+    Vector3d sag = Vector3d::Zero();
     Eigen::VectorXd camera;
 };
 
@@ -115,7 +115,7 @@ public:
                                   camera_columns_ ? by_camera.data() : nullptr) != PF_OK) {
                 continue;
             }
-            const Vector2d r = o.whiten * (uv + state_.sag * o.sag - o.sight.uv);
+            const Vector2d r = o.whiten * (uv + sag_columns(o.sag) * state_.sag - o.sight.uv);
             const Rows<2, 3> whitened = o.whiten * slope / yardstick();
             const Rows<2, 3> j_point = whitened * turn.r;
             Rows<2, 3> j_turn;
@@ -136,7 +136,7 @@ public:
                 j_border.col(0) = -whitened * x;
             }
             if (sag_at_ >= 0) {
-                j_border.col(sag_at_) = o.whiten * o.sag;
+                j_border.middleCols<3>(sag_at_) = o.whiten * sag_columns(o.sag);
             }
             if (late_at_ >= 0) { // further on the way: turned more, and moved
                 const size_t f = static_cast<size_t>(frames[0]), other = static_cast<size_t>(frames[1]);
@@ -166,7 +166,8 @@ public:
                 return std::numeric_limits<double>::infinity();
             }
             const Observation &o = table_[place_[k]];
-            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + state_.sag * o.sag - o.sight.uv;
+            const Vector2d error =
+                Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + sag_columns(o.sag) * state_.sag - o.sight.uv;
             sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
         }
         return sum;
@@ -190,7 +191,7 @@ public:
                 (saved_.down + geometry::tangent_basis(saved_.down) * step.g.segment<2>(down_at_)).normalized();
         }
         if (sag_at_ >= 0) {
-            state_.sag = saved_.sag + step.g[sag_at_];
+            state_.sag = saved_.sag + step.g.segment<3>(sag_at_);
         }
         if (late_at_ >= 0) {
             state_.late = saved_.late + step.g[late_at_];
@@ -334,8 +335,9 @@ private:
             state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
         }
         if (options_.sag_sigma > 0.0) {
-            sag_at_ = border_++;
-            extra_rows_++;
+            sag_at_ = border_;
+            border_ += 3;
+            extra_rows_ += 3;
         }
         if (options_.late_sigma > 0.0 && rolls()) {
             late_at_ = border_++;
@@ -412,7 +414,7 @@ private:
             }
         }
         if (sag_at_ >= 0) {
-            sum += std::pow(state_.sag / options_.sag_sigma, 2);
+            sum += (state_.sag / options_.sag_sigma).squaredNorm();
         }
         if (late_at_ >= 0) {
             sum += std::pow((state_.late - 1.0) / options_.late_sigma, 2);
@@ -450,17 +452,17 @@ private:
         if (options_.gravity) {
             linearize_gravity(sink);
         }
-        const auto add_prior = [&](int at, double r, double sigma) {
-            RowsX j = RowsX::Zero(1, border_);
-            j(0, at) = 1.0 / sigma;
-            r /= sigma;
-            sink.add(1, &r, plain, nullptr, {}, {}, j.data());
-        };
         if (sag_at_ >= 0) {
-            add_prior(sag_at_, state_.sag, options_.sag_sigma);
+            RowsX j = RowsX::Zero(3, border_);
+            j.middleCols<3>(sag_at_) = Matrix3d::Identity() / options_.sag_sigma;
+            const Vector3d r = state_.sag / options_.sag_sigma;
+            sink.add(3, r.data(), plain, nullptr, {}, {}, j.data());
         }
         if (late_at_ >= 0) {
-            add_prior(late_at_, state_.late - 1.0, options_.late_sigma);
+            RowsX j = RowsX::Zero(1, border_);
+            j(0, late_at_) = 1.0 / options_.late_sigma;
+            const double r = (state_.late - 1.0) / options_.late_sigma;
+            sink.add(1, &r, plain, nullptr, {}, {}, j.data());
         }
         if (camera_columns_ > 0) {
             RowsX j = RowsX::Zero(camera_columns_, border_);

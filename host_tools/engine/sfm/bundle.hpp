@@ -60,7 +60,7 @@ struct BundleOptions {
     const Odometry *odometry = nullptr;
     const Gravity *gravity = nullptr;
     const CameraPrior *camera_prior = nullptr;
-    double sag_sigma = 0.0;  // px^2, of the tracks' common sag (tracks.hpp), about 0; 0: there is none
+    double sag_sigma = 0.0;  // px^2, of each part of the tracks' common sag (tracks.hpp), about 0; 0: there is none
     double late_sigma = 0.0; // of the line time as a share of the stated one, about 1; 0: it is as stated
     const std::vector<int> *only =
         nullptr; // places of the observations to use, as BundleReport::used; null: by the gate
@@ -73,11 +73,11 @@ struct BundleReport {
     double variance_factor = 1.0; // cost over degrees of freedom: 1 = noise as stated
     double wheel = 0.0;           // w
     Vector3d down = Vector3d::Zero();
-    double sag = 0.0;       // px^2
-    double late = 1.0;      // line time over the stated one
-    int late_at = -1;       // its place in the border; -1: it was not estimated
-    Eigen::VectorXd camera; // changes of the camera's parameters
-    std::vector<int> used;  // places in the table of the observations, by point
+    Vector3d sag = Vector3d::Zero(); // px^2, as sag_columns() takes it
+    double late = 1.0;               // line time over the stated one
+    int late_at = -1;                // its place in the border; -1: it was not estimated
+    Eigen::VectorXd camera;          // changes of the camera's parameters
+    std::vector<int> used;           // places in the table of the observations, by point
 };
 
 class BundleCovariance
@@ -100,7 +100,7 @@ public:
     const Eigen::MatrixXd &border() const
     {
         return known_.g;
-    } // wheel, gravity (2), sag, late, camera: those of the options
+    } // wheel, gravity (2), sag (3), late, camera: those of the options
 
     // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
     Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const

@@ -51,6 +51,17 @@ Moment moment_of(double late, int frame, int first, int end, std::span<const dou
 // Radians to px per px^2 of the moment, for a lens of f pixels a radian.
 double sag_of(double first, double now, double f);
 
+// What the sag's three parts, px^2, do to a pixel that is off by `sag` for each px^2: all around alike, and along the
+// image's axes and its diagonals. They are the window's second moment as a tensor: along a radius at phi it is
+// a + b cos 2 phi + c sin 2 phi, and a pipe whose tracks have more of it to the sides than up and down comes out oval.
+inline Eigen::Matrix<double, 2, 3> sag_columns(const Vector2d &sag)
+{
+    const double square = std::max(sag.squaredNorm(), 1e-300);
+    Eigen::Matrix<double, 2, 3> out;
+    out << sag, sag * ((sag[0] * sag[0] - sag[1] * sag[1]) / square), sag * (2.0 * sag[0] * sag[1] / square);
+    return out;
+}
+
 // Sorted by track, then frame; at most one observation a track and frame, all of them inside the camera's model.
 class TrackTable
 {

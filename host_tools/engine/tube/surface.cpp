@@ -69,6 +69,7 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
         throw std::invalid_argument("tube: the reference has no length");
     }
     diameter_ = 2.0 * median(reference.rho);
+    reach_ = std::max(1, static_cast<int>(std::lround(0.5 / options.knot)));
     lay_out(reference, options.knot);
     assign(reference);
     const double rho = 0.5 * diameter_;

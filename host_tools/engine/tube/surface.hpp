@@ -24,7 +24,7 @@ struct Reference {
 };
 
 struct SurfaceOptions {
-    double knot = 0.5;        // spacing of the knots, in diameters
+    double knot = 0.25;       // spacing of the knots, in diameters
     int order = 2;            // of the section's harmonics, 2 to 6; 0: by BIC
     int rounds = 12;          // of reweighting and smoothing
     bool smooth_only = false; // keep the smoothness as it starts: stiff, for looking for joints
@@ -112,6 +112,7 @@ private:
 
     const Cloud &cloud_;
     double diameter_ = 0.0;
+    int reach_ = 1; // knots each way that count as around one: half a diameter
     int order_ = 2, floats_ = 3;
     std::vector<Piece> piece_;
     std::vector<Eigen::Vector3d> control_, first_, second_;

@@ -57,7 +57,7 @@ void Surface::reweigh(bool all)
     }
 }
 
-// Around each control, from the points within 1.5 knots; from all where these are few.
+// Around each control, from the points within reach; from all where these are few.
 void Surface::measure_roughness()
 {
     constexpr size_t ENOUGH = 60;
@@ -69,7 +69,7 @@ void Surface::measure_roughness()
         }
         const Piece &piece = piece_[static_cast<size_t>(of_piece_[i])];
         const int middle = static_cast<int>(std::lround(u_[i]));
-        for (int k = std::max(0, middle - 1); k <= std::min(piece.intervals, middle + 1); k++) {
+        for (int k = std::max(0, middle - reach_); k <= std::min(piece.intervals, middle + reach_); k++) {
             const size_t c = static_cast<size_t>(piece.first + 1 + k);
             r[c].push_back(distance_[i]);
             noise[c].push_back(noise_[i]);
@@ -78,7 +78,9 @@ void Surface::measure_roughness()
         all_noise.push_back(noise_[i]);
     }
     // The fit takes about as many degrees of freedom as there are controls, less what smoothing gives back.
-    const int used = covariance_.empty() ? 0 : static_cast<int>(freedom_ * 3.0 / static_cast<double>(control_.size()));
+    const int used = covariance_.empty()
+                         ? 0
+                         : static_cast<int>(freedom_ * (2.0 * reach_ + 1.0) / static_cast<double>(control_.size()));
     const double overall = roughness(all_r, all_noise, static_cast<int>(covariance_.empty() ? 0.0 : freedom_));
     for (size_t c = 0; c < control_.size(); c++) {
         tau_[c] = r[c].size() >= ENOUGH ? roughness(r[c], noise[c], used) : overall;
@@ -100,7 +102,7 @@ void Surface::find_gaps()
         const Vector3d d = cloud_.points.col(static_cast<Eigen::Index>(i)) - f.centre;
         const size_t bin = azimuth_bin(std::atan2(d.dot(f.second), d.dot(f.first)));
         const int middle = static_cast<int>(std::lround(u_[i]));
-        for (int k = middle - 1; k <= middle + 1; k++) {
+        for (int k = middle - reach_; k <= middle + reach_; k++) {
             const int c = std::clamp(k, -1, piece.intervals + 1) + piece.first + 1;
             count[static_cast<size_t>(c)][bin]++;
         }
