@@ -126,7 +126,7 @@ def check_daemon_kills() -> list[Row]:
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 
 
-GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "b68f8aea"
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "48c82f67"
 
 
 def check_golden_replay() -> list[Row]:

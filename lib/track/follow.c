@@ -13,18 +13,18 @@
 #define CERTAIN     (2 << 16) /* a track found this near its start is next sought from half resolution on */
 #define GUESS_MOST  (4096 << 16)
 #define SAME_START  (4 << 16) /* starts closer than 4 px are the same to the coarse levels */
-#define WARPED_APART                                                                                                   \
-    24576 /* 3/8 px: the two starts of a warped template differ by 0.8 px; a small mark pulls no farther */
-#define STARTS      3
-#define COARSE      2u /* level at which starts are compared: a pixel of it is 4 px */
-#define COARSE_HALF 5
-#define MARGIN      1638      /* 0.05 of similarity */
-#define FLOW_LEAST  8u        /* tracks in a ring before its median is believed */
-#define NEAR_LEAST  5u        /* of those within 45 degrees */
-#define NEAR_PART   16        /* a sector at less than this part of its ring's pace does not count */
-#define FLOW_STIRS  (4 << 16) /* a ring that has moved 4 px */
-#define STILL_PART  4         /* a track that has made less than a quarter (half, across) of that way stands still */
-#define NEIGHBOURS  3
+/* 3/8 px: the two starts of a warped template differ by 0.8 px. A small mark pulls no farther. */
+#define WARPED_APART 24576
+#define STARTS       3
+#define COARSE       2u /* level at which starts are compared: a pixel of it is 4 px */
+#define COARSE_HALF  5
+#define MARGIN       1638      /* 0.05 of similarity */
+#define FLOW_LEAST   8u        /* tracks in a ring before its median is believed */
+#define NEAR_LEAST   5u        /* of those within 45 degrees */
+#define NEAR_PART    16        /* a sector at less than this part of its ring's pace does not count */
+#define FLOW_STIRS   (4 << 16) /* a ring that has moved 4 px */
+#define STILL_PART   4         /* a track that has made less than a quarter (half, across) of that way stands still */
+#define NEIGHBOURS   3
 /* Sums of both variances, px^2 Q20. Beyond 0.4 px a track is no longer known well enough that this is the point first
  * seen. Beyond 0.25 px it is lost where that is 8 times what it was at first sight: its marks have faded, been drawn
  * out, or no longer explain what is seen; with relief in a light that moves errors are then several times what is

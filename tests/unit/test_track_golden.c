@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xB1846605u
+#define GOLDEN 0xAB50B074u
 
 void setUp(void) {}
 void tearDown(void) {}

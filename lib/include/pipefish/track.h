@@ -240,6 +240,7 @@ typedef struct pf_wall { /* private */
     int64_t motion[10];  /* of the last frame; the last four are the tube's axis */
     int64_t known[4][4]; /* of the axis, as information, in units of ... */
     int64_t variance;    /* ... this; 0: nothing is known */
+    uint32_t light_q16;  /* the part of what tracks walk off alone that is the light's doing */
     uint64_t *id;        /* tracks of the last frame, ids ascending */
     pf_ray_q30 *ray;
     int32_t *off; /* how far each has walked since its first sight, three numbers: its cotangent, its azimuth; and what
@@ -249,8 +250,8 @@ typedef struct pf_wall { /* private */
     uint16_t *pair;
 } pf_wall;
 
-/* How far a track may walk off, Q16: 2 px, for pf_wall_settle takes half of it back. */
-#define PF_WALL_MOST_Q16 131072u
+/* How far a track may walk off, less what pf_wall_settle takes back: 1 px, Q16. */
+#define PF_WALL_MOST_Q16 65536u
 
 /* Bytes of workspace for a tracker of so many tracks. */
 #define PF_WALL_BYTES(max_tracks) (40u * (size_t)(max_tracks) + 9216u)
@@ -260,14 +261,16 @@ typedef struct pf_wall { /* private */
 pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size_t size);
 
 /* Learns from a frame just tracked: tracks[n], rays[n] are its table and bearings. Puts into astray[] (max_tracks) the
- * rows of tracks that have walked off the wall by `most_q16` px and by three times the median of all, unless their
- * neighbours do alike: then that is where the wall is. Returns how many. For pf_tracker_give_up. */
+ * rows of tracks that have walked off the wall by `most_q16` px and by three times the median of all, less what
+ * pf_wall_settle takes back, unless their neighbours do alike: then that is where the wall is. Returns how many. For
+ * pf_tracker_give_up. */
 uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                        pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray);
 
-/* The places of a keyframe: moves each of tracks[n], a copy of the table last checked, back by half of what it has
- * walked off and its seven nearest neighbours have not. What they walk off alike is the wall's own shape and stays. The
- * tracker goes on from where it found them. Cost: 20 n^2 instructions. */
+/* The places of a keyframe: of what each of tracks[n], a copy of the table last checked, has walked off and its seven
+ * nearest neighbours have not, takes back the part that is the light's doing by the median of all, at most half. What
+ * they walk off alike is the wall's own shape and stays. The tracker goes on from where it found them. Cost: 20 n^2
+ * instructions. */
 void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_project project, const void *camera);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
