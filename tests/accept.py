@@ -64,6 +64,11 @@ def check_pipes() -> list[Row]:
     return rows_of("accept_pipes.py", PYTHONPATH=peers_path())
 
 
+def check_match() -> list[Row]:
+    """Matches of views that lie far apart, against their homographies."""
+    return rows_of("accept_match.py")
+
+
 def check_recognise() -> list[Row]:
     """Objects in simulated and in real scenes, beside OpenCV's SIFT."""
     return rows_of("accept_recognise.py", "--pictures", BUILD / "accept/recognise", PYTHONPATH=peers_path())
@@ -178,6 +183,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "track": check_track,
     "pipes": check_pipes,
     "calib": check_calib,
+    "match": check_match,
     "recognise": check_recognise,
     "selfcal": check_selfcal,
     "segment": check_segment,

@@ -5,7 +5,7 @@ motion, which the camera centres and directions tell, so that the error of scale
 
     python tests/accept_dense.py
 
-prints a table, then one JSON list of {name, value, bound, holds}. Pictures stay in build/accept/recon/dn400.
+prints a table, then one JSON list of {name, value, bound, holds}. Pictures stay in build/accept/recon/dense-dn400.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from PIL import Image
 
 import pipefish as pf
 from pipefish.cli import main
+from pipefish.matching_files import read_grey
 
 Floats = NDArray[np.float64]
 Map = Callable[[Floats], Floats]
@@ -486,6 +487,18 @@ def test_the_command_names_a_bad_file(
     assert main(["match", str(one), str(two), "-o", str(tmp_path / "out"), *extra]) == 1
     assert what in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_deep_pictures_keep_their_values(tmp_path: Path) -> None:
+    """Pillow alone would clip values of 16 bits, and those of floats, to eight."""
+    value = np.linspace(0.1, 0.9, 64 * 64).reshape(64, 64)
+    for kind, given in (("i", np.rint(65535 * value).astype(np.int32)), ("f", value.astype(np.float32))):
+        Image.fromarray(given).save(tmp_path / f"{kind}.tif")
+        assert np.abs(read_grey(tmp_path / f"{kind}.tif") - value).max() < 1e-4
+    for given in (np.full((64, 64), 70_000, np.int32), np.full((64, 64), 255, np.float32)):
+        Image.fromarray(given).save(tmp_path / "wrong.tif")
+        with pytest.raises(pf.FormatError, match=r"wrong.tif: (values of 70000|picture: floating-point)"):
+            read_grey(tmp_path / "wrong.tif")
 
 
 # ---- real pictures

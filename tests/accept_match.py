@@ -1,0 +1,52 @@
+"""Matching over wide baselines: graf 1-3 to 1-6 against the homography of the wall, as `pipefish match` filters.
+
+That homography is the wall's alone: matches on the strip below the kerb, another plane, count as wrong.
+
+    python tests/accept_match.py
+
+prints a table, then one JSON list of {name, value, bound, holds}. Needs $PIPEFISH_DATA or ../shared/data.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+from accept_rows import Row, at_least, print_rows
+
+import pipefish as pf
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests/bench"))
+DATA = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data") / "homography/graf"
+BOUNDS = {3: 0.9, 4: 0.8, 5: 0.7, 6: 0.7}  # of the matches within 3 pixels
+LEAST = 150_000  # matches of 1-3
+
+
+def rows_of(view: int) -> list[Row]:
+    """One pair: share within 3 pixels, and how many there are."""
+    from match_views import load, mapped
+
+    one, two, h = load(DATA, view)
+    grown = pf.match_quasi_dense(one, two)
+    m = pf.filter_matches(grown, least=0, geometry="motion") if view == 3 else pf.filter_matches(grown)
+    right = float(np.mean(np.linalg.norm(mapped(h, m.xy1) - m.xy2, axis=1) < 3)) if len(m) else 0.0
+    rows = [at_least(f"match.graf_1_{view}_within_3px", right, BOUNDS[view])]
+    if view == 3:
+        rows.append(at_least("match.graf_1_3_matches", len(m), LEAST))
+    return rows
+
+
+def main() -> None:
+    """All pairs."""
+    if DATA.is_dir():
+        print_rows([row for view in BOUNDS for row in rows_of(view)])
+    else:
+        print(f"no {DATA}: nothing is measured", file=sys.stderr)
+        print_rows([])
+
+
+if __name__ == "__main__":
+    main()
