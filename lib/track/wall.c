@@ -428,7 +428,7 @@ static uint32_t part_of_light(pf_wall *wall)
         const int64_t off = wall->off[3u * k], fall = wall->off[3u * k + 2u];
         if (fall >= AGED || fall <= -AGED)
             wall->value[n++] =
-                (uint32_t)pf_clamp_i64((off < 0 ? -off : off) * ONE / (fall < 0 ? -fall : fall), INT32_MAX);
+                (uint32_t)pf_clamp_i64((off < 0 ? -off : off) * ONE / (fall < 0 ? -fall : fall), (int32_t)ONE / 4);
     }
     if (n <= BESIDE)
         return 0;
