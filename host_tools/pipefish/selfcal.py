@@ -43,8 +43,8 @@ REASONS = {
     "and has texture, which overlap by more than half",
     "standing": "hardly anything moved between the views: a camera that stands, or one picture twice. Move it, and pan "
     "or tilt it, between views",
-    "turning": "the camera only turned: without a change of place nothing is seen in depth. Move it as well, by "
-    "a tenth of the distance to the scene or more",
+    "turning": "the camera only turned: without a change of place nothing is seen in depth. Move it as well, by a "
+    "tenth of the distance to the scene or more",
     "low_coverage": "the matches span too little of the picture",
     "planar": "the matches are of a plane, which two views of say nothing about the angles of the lens",
     "no_rotation": "the camera moved without panning or tilting: bearings may all be stretched along its axis (alpha)",

@@ -163,6 +163,7 @@ def read(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -
         raise ArgumentError(f"{paths[files.index(True)]}: pictures or files of matches, not both")
     if len(paths) < 2:
         raise ArgumentError(
-            f"{paths[0]}: alone; give two pictures, or a file of matches (.npz, .csv, .txt), or a survey (.mcap)"
+            f"{paths[0]}: alone; give two pictures or more, or a file of matches (.npz, .csv, .txt), or a survey "
+            "(.mcap)"
         )
     return from_pictures(paths, threads, tell)
