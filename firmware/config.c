@@ -424,6 +424,10 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
         why = "tracker.cell: must be 0 or 16..256";
     else if (c->camera.driver != PF_CAMERA_REPLAY && c->encoder.metres_per_count != 0 && c->gpio.encoder[0] == '\0')
         why = "gpio.encoder: must be set for encoder.metres_per_count: no counts come without it";
+    else if ((c->gpio.encoder_a[0] == '\0') != (c->gpio.encoder_b[0] == '\0'))
+        why = "gpio.encoder_a and gpio.encoder_b: both or neither";
+    else if (c->gpio.encoder_a[0] != '\0' && c->gpio.encoder[0] == '\0')
+        why = "gpio.encoder: must be set (auto or lines) for encoder_a and encoder_b";
     if (why != NULL)
         (void)snprintf(error, n, "%s: %s", file, why);
     return why == NULL;

@@ -127,6 +127,15 @@ void pf_pixels_to_grey(const pf_pixel_format *format, const uint8_t *from, uint3
     }
 }
 
+/* Whether the end marker is there, whatever a camera puts after it: a frame that was cut short on its way has none, and
+ * the decoder makes grey of what is missing. */
+static bool is_whole(const uint8_t *from, size_t n)
+{
+    while (n >= 2 && !(from[n - 2] == 0xFF && from[n - 1] == 0xD9))
+        n--;
+    return n >= 2;
+}
+
 pf_status pf_jpeg_to_grey(void *turbo, const uint8_t *from, size_t n, uint32_t width, uint32_t height, uint8_t *grey,
                           pf_failure *failure)
 {
@@ -135,8 +144,11 @@ pf_status pf_jpeg_to_grey(void *turbo, const uint8_t *from, size_t n, uint32_t w
         return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is damaged: %s", tjGetErrorStr2(turbo));
     if (w != (int)width || h != (int)height)
         return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is of %d x %d", w, h);
+    if (!is_whole(from, n))
+        return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is cut short");
+    /* Warnings are damage, but for bytes too many before a marker, with which some cameras pad. */
     if (tjDecompress2(turbo, from, (unsigned long)n, grey, w, w, h, TJPF_GRAY, 0) != 0 &&
-        tjGetErrorCode(turbo) == TJERR_FATAL)
+        (tjGetErrorCode(turbo) == TJERR_FATAL || strstr(tjGetErrorStr2(turbo), "extraneous bytes") == NULL))
         return pf_fail(failure, PF_ERR_CHECKSUM, "a frame's JPEG is damaged: %s", tjGetErrorStr2(turbo));
     return PF_OK;
 }

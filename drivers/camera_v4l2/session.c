@@ -108,6 +108,7 @@ static pf_status v4l2_open(void *self, const pf_session_wish *wish, pf_session_i
                        "%s: %s", c->device, strerror(errno));
     pf_status status = pf_v4l2_negotiate(c, wish, info);
     if (status == PF_OK) {
+        c->is_compressed = info->format->layout == PF_LAYOUT_JPEG;
         pf_v4l2_controls_find(c, info);
         status = take_buffers(c, wish->buffers, info);
     }
@@ -161,6 +162,8 @@ static pf_status v4l2_take(void *self, uint32_t timeout_ms, pf_session_frame *fr
         .stamp_ns = stamp_of(&r.b),
         .is_stamp_first = (r.b.flags & V4L2_BUF_FLAG_TSTAMP_SRC_MASK) == V4L2_BUF_FLAG_TSTAMP_SRC_SOE,
         .is_damaged = (r.b.flags & V4L2_BUF_FLAG_ERROR) != 0};
+    if (frame->n == 0 && c->is_compressed) /* else what was in the buffer before would be taken for it */
+        frame->is_damaged = true;
     if (frame->n == 0 || frame->n > b->size) /* drivers of raw formats may leave it 0 */
         frame->n = b->size;
     return PF_OK;

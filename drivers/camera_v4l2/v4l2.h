@@ -42,7 +42,7 @@ typedef struct pf_v4l2 {
     pf_v4l2_io io;
     const char *device; /* the wish's */
     int fd;             /* -1 = not open */
-    bool is_streaming;
+    bool is_streaming, is_compressed;
     uint32_t type; /* V4L2_BUF_TYPE_VIDEO_CAPTURE or its _MPLANE */
     uint32_t n;
     pf_v4l2_buffer buffer[PF_SESSION_BUFFERS_MAX];

@@ -35,7 +35,7 @@ typedef struct board {
     int wake; /* eventfd */
     light lamp, led;
     pthread_mutex_t mutex; /* of all below, and of the lamp */
-    bool is_over, is_stopped;
+    bool is_over, is_stopped, lamp_is_broken;
     pf_indication indication;
     uint32_t ticks;
     button button[BUTTONS];
@@ -142,13 +142,32 @@ static bool read_button(button *b)
     return was_pressed || b->is_pressed;
 }
 
+/* The lamp of a crawler that is stopped goes off, however often that has to be tried. */
+static void keep_dark(board *b)
+{
+    if (b->is_stopped && has_light(&b->lamp) && b->lamp.level > 0)
+        b->lamp_is_broken = set_light(&b->lamp, 0) != PF_OK;
+}
+
 /* A button that cannot be read any more counts as pressed. */
 static void stop_if_pressed(board *b)
 {
     bool must = (b->button[0].edges != NULL && read_button(&b->button[0])) || b->button[0].is_broken;
-    if (must && has_light(&b->lamp))
-        (void)set_light(&b->lamp, 0);
     b->is_stopped = b->is_stopped || must;
+    keep_dark(b);
+}
+
+/* Each tick: an edge may be lost on its way (an expander on a bus, an overrun), a level stays. */
+static void check_stop(board *b)
+{
+    button *stop = &b->button[0];
+    uint32_t level = 0;
+    if (stop->edges != NULL && !stop->is_broken) {
+        stop->is_broken = pf_edges_levels(stop->edges, &level) != PF_OK;
+        stop->is_pressed = level != 0;
+        b->is_stopped = b->is_stopped || stop->is_pressed || stop->is_broken;
+    }
+    keep_dark(b);
 }
 
 static void show(board *b)
@@ -186,6 +205,7 @@ static void *watch(void *argument)
         if (now - tick >= TICK_MS * 1000000u) {
             tick = now;
             b->ticks++;
+            check_stop(b);
             show(b);
         }
     }
@@ -253,7 +273,7 @@ static void board_state(void *self, pf_gpio_state *state)
                              .missed = b->wheel.decoder.missed,
                              .repeated = b->wheel.decoder.repeated,
                              .illegal = b->wheel.decoder.illegal,
-                             .is_broken = b->wheel.is_broken};
+                             .is_broken = b->wheel.is_broken || b->lamp_is_broken};
     for (uint32_t i = 0; i < BUTTONS; i++)
         state->is_broken = state->is_broken || b->button[i].is_broken;
     memcpy(state->encoder, b->wheel.name, sizeof state->encoder);

@@ -15,7 +15,7 @@
 typedef struct bench {
     pf_sim_line *line;
     pf_link *ends[2]; /* crawler, host */
-    uint64_t now, delivered, objects, previews;
+    uint64_t now, delivered, objects, previews, replies, answered;
     uint32_t order[PF_LINK_SLOTS_MAX], queued; /* objects that wait for "stored" */
 } bench;
 
@@ -61,6 +61,9 @@ static void take_events(bench *b, uint32_t end)
             pf_link_answer_object(b->ends[end], event.slot, PF_ANSWER_ACCEPT);
         if (event.type == PF_LINK_LATEST && event.topic == PF_TOPIC_PREVIEW)
             b->previews++;
+        if (event.type == PF_LINK_CONTROL && end == 0) /* a status at its largest */
+            (void)pf_link_send_control(b->ends[0], preview, 500);
+        b->replies += event.type == PF_LINK_CONTROL && end == 1;
         if (event.type == PF_LINK_OBJECT) {
             b->delivered += event.size;
             pf_link_answer_object(b->ends[end], event.slot, PF_ANSWER_STORED);
@@ -123,6 +126,44 @@ static double run(uint32_t loss_ppm, bool mixed, double *cpu_ns_per_byte)
     return (double)b.delivered / ((double)BAUD / 10 * SECONDS);
 }
 
+/* Longest time between a request and its reply, ms, while the device sends objects as fast as a slower line takes them.
+ * In front of the reply wait one fragment, and what the operating system holds of 5 ms (transport.h, room). */
+static double run_control(void)
+{
+    const uint32_t baud = 921600;
+    bench b = {0};
+    pf_sim_line_config config = {
+        .baud = baud, .fifo = PF_LINK_FRAME_MAX + baud / 10 / 200, .latency_ns = 1000000, .seed = 8};
+    size_t n = pf_sim_line_workspace_size(&config);
+    void *line = allocate(n);
+    uint64_t asked = 0, most = 0;
+    if (pf_sim_line_init(&b.line, &config, line, n) != PF_OK)
+        exit(1);
+    b.ends[0] = make_end(PF_LINK_DEVICE);
+    b.ends[1] = make_end(PF_LINK_HOST);
+    for (b.now = 0; b.now < SECONDS * UINT64_C(1000000000); b.now += TICK_NS) {
+        if (asked == 0 && b.now > UINT64_C(1000000000) && b.now % 70000000 == 0 &&
+            pf_link_send_control(b.ends[1], preview, 32) == PF_OK)
+            asked = b.now;
+        feed(&b);
+        step(&b, 0);
+        step(&b, 1);
+        if (asked != 0 && b.replies > 0) {
+            most = b.now - asked > most ? b.now - asked : most;
+            asked = b.replies = 0;
+            b.answered++;
+        }
+    }
+    if (b.answered < 500) {
+        fprintf(stderr, "bench_link: only %u replies\n", (unsigned)b.answered);
+        exit(1);
+    }
+    free(b.ends[0]);
+    free(b.ends[1]);
+    free(line);
+    return (double)most / 1e6;
+}
+
 static void print_ratio(const char *name, double value)
 {
     printf("{\"name\": \"%s\", \"value\": %.4f, \"unit\": \"ratio\", \"peer\": \"line rate\", \"peer_value\": 1.0}\n",
@@ -141,6 +182,7 @@ int main(void)
     print_ratio("link.goodput_clean", run(0, false, &cpu));
     print_ratio("link.goodput_1pct", run(10000, false, &other));
     print_ratio("link.goodput_mixed", run(0, true, &other));
+    printf("{\"name\": \"link.control_rtt_most\", \"value\": %.2f, \"unit\": \"ms\"}\n", run_control());
     printf("{\"name\": \"link.cpu_ns_per_byte\", \"value\": %.2f, \"unit\": \"ns/byte\"}\n", cpu);
     return 0;
 }

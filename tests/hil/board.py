@@ -172,7 +172,7 @@ class Board:
             self._qemu = subprocess.Popen(self._command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         self.usb.plug()
         agent = socket.socket(socket.AF_UNIX)
-        agent.settimeout(BOOT_S)
+        agent.settimeout(BOOT_S * (3 if self.has_system else 1))
         agent.connect(str(self.folder / "agent.sock"))
         self._agent = agent
         self._input = agent.makefile("rb")
@@ -193,7 +193,7 @@ class Board:
 
     def run(self, command: str, timeout: float = COMMAND_S, check: bool = True) -> str:
         """Runs a shell command on the board; its output. With `check` a code other than 0 is an error."""
-        self._agent.settimeout(timeout)
+        self._agent.settimeout(timeout * (3 if self.has_system else 1))
         self._agent.sendall(command.replace("\n", " ").encode() + b"\n")
         word, code, size = self._line().split()
         assert word == "DONE"
@@ -212,7 +212,7 @@ class Board:
 
     def wait(self, process: int, timeout: float = COMMAND_S) -> None:
         """Until a process of spawn() has ended."""
-        end = time.monotonic() + timeout
+        end = time.monotonic() + timeout * (3 if self.has_system else 1)
         while self.is_running(process):
             if time.monotonic() > end:
                 raise BoardError(f"process {process} does not end: {self.console()}\n{self.logs()}")

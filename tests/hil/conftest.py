@@ -17,6 +17,16 @@ from crawl import HOST_DAEMON, PIPEFISH, Crawl, Recording, Result, free_port
 RESULTS: list[Result] = []
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--half", type=int, choices=(1, 2), help="every second scenario: `make hil` runs both at once")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    half = config.getoption("half", None)
+    if half:
+        items[:] = items[half - 1 :: 2]
+
+
 def pytest_sessionstart() -> None:
     RESULTS.clear()
 
@@ -63,13 +73,15 @@ def note() -> Callable[[Result], None]:
     return RESULTS.append
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """The table of scenarios, also as build/hil/summary.json."""
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """The table of scenarios, also as build/hil/summary.json (-1 and -2: each half's)."""
     if not RESULTS:
         return
     folder = ROOT / "build" / "hil"
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "summary.json").write_text(json.dumps([dataclasses.asdict(r) for r in RESULTS], indent=1) + "\n")
+    half = config.getoption("half", None)
+    rows = json.dumps([dataclasses.asdict(r) for r in RESULTS], indent=1)
+    (folder / f"summary{f'-{half}' if half else ''}.json").write_text(rows + "\n")
     terminalreporter.section("emulated board")
     terminalreporter.write_line(
         f"{'scenario':34}{'frames in':>10}{'keyframes':>10}{'lost':>6}{'twice':>6}{'recovery':>10}"

@@ -94,6 +94,7 @@ class Crawl:
         self.board, self.recording, self.folder = board, recording, folder
         self.settings = {**SETTINGS, **settings}
         self.output = folder / "survey.mcap"
+        self.patience = 3 if board.has_system else 1  # a whole system has much to do besides
         self.daemon = 0
         self.starts = 0
         self.environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "host")}
@@ -170,7 +171,7 @@ class Crawl:
 
     def wait_for(self, text: str, timeout: float = 80) -> float:
         """Until the daemon's log of this start has `text`; the seconds that took."""
-        start = time.monotonic()
+        start, timeout = time.monotonic(), timeout * self.patience
         log = self.board.share / f"daemon{self.starts - 1}.log"
         while text not in log.read_text(errors="replace"):
             if time.monotonic() - start > timeout:
@@ -180,7 +181,7 @@ class Crawl:
 
     def wait_until(self, condition, what: str, timeout: float = 120) -> float:
         """Until condition(status) of the daemon's status file; the seconds that took."""
-        start = time.monotonic()
+        start, timeout = time.monotonic(), timeout * self.patience
         while not condition(self.board.status()):
             if time.monotonic() - start > timeout:
                 raise AssertionError(f"not seen: {what}: {self.board.status()}\n{self.board.logs()}")
@@ -201,7 +202,7 @@ class Crawl:
     def start_receiver(self, device: str) -> None:
         with (self.folder / "receive.log").open("ab") as log:
             self._receiver = subprocess.Popen(
-                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", "150"],
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", str(150 * self.patience)],
                 env=self.environment,
                 stdout=log,
                 stderr=log,
@@ -214,7 +215,7 @@ class Crawl:
     def finish(self, timeout: float = 180) -> Survey:
         """Waits for the receiver; the survey it got."""
         try:
-            code = self._receiver.wait(timeout)
+            code = self._receiver.wait(timeout * self.patience)
         except subprocess.TimeoutExpired as error:
             raise AssertionError(f"the survey does not end\n{self._texts()}") from error
         assert code == 0, self._texts()

@@ -133,6 +133,8 @@ def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_p
         (["camera.driver=v4l2", "camera.device=/dev/absent"], "/dev/absent: No such file"),
         (["camera.driver=v4l2", "camera.format=RGB4"], "format RGB4 is not read"),
         (["camera.width=320"], "camera.width and camera.height: both or neither"),
+        (["gpio.encoder_a=A"], "gpio.encoder_a and gpio.encoder_b: both or neither"),
+        (["gpio.encoder_a=A", "gpio.encoder_b=B"], "gpio.encoder: must be set (auto or lines)"),
         (["gpio.lamp=NO_SUCH_LINE"], "no line is named NO_SUCH_LINE"),
         (["gpio.stop=gpiochip7:x"], "gpiochip7:x: must be a line's name, or chip:number"),
         (["gpio.lamp=/sys/class/leds/absent"], "/sys/class/leds/absent/"),

@@ -9,6 +9,7 @@
 #include <linux/videodev2.h>
 #include <math.h>
 #include <string.h>
+#include <turbojpeg.h>
 
 #define MS UINT64_C(1000000)
 
@@ -16,6 +17,43 @@ void setUp(void) {}
 void tearDown(void) {}
 
 /* ---- formats */
+
+/* Proves: a JPEG that is cut short, or has other bytes in its midst, is no frame; one with something after its end is.
+ */
+static void test_a_damaged_jpeg_is_no_frame(void)
+{
+    enum { W = 320, H = 240 };
+    static uint8_t grey[W * H], back[W * H], bytes[4 * W * H];
+    unsigned char *jpeg = NULL;
+    unsigned long n = 0;
+    uint32_t random = 1;
+    pf_failure failure;
+    tjhandle to = tjInitCompress(), from = tjInitDecompress();
+    for (size_t i = 0; i < sizeof grey; i++) {
+        random = random * 1664525u + 1013904223u;
+        grey[i] = (uint8_t)((i % W) / 2 + (random >> 27));
+    }
+    TEST_ASSERT_EQUAL_INT(0, tjCompress2(to, grey, W, W, H, TJPF_GRAY, &jpeg, &n, TJSAMP_GRAY, 90, 0));
+    memcpy(bytes, jpeg, n);
+    memset(bytes + n, 0x5A, 500);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_to_grey(from, bytes, n, W, H, back, &failure));
+    TEST_ASSERT_UINT8_WITHIN(12, grey[W * H - 1], back[W * H - 1]);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_jpeg_to_grey(from, bytes, n + 500, W, H, back, &failure));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CHECKSUM, pf_jpeg_to_grey(from, bytes, n, W, H - 1, back, &failure));
+    for (unsigned long cut = 0; cut < n; cut += 1 + n / 40)
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CHECKSUM, pf_jpeg_to_grey(from, bytes, cut, W, H, back, &failure));
+    for (size_t at = n / 4; at < 3 * n / 4; at += n / 8) {
+        memcpy(bytes, jpeg, n);
+        for (size_t i = 0; i < 1000; i++) {
+            random = random * 1664525u + 1013904223u;
+            bytes[at + i] = (uint8_t)(random >> 24);
+        }
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CHECKSUM, pf_jpeg_to_grey(from, bytes, n, W, H, back, &failure));
+    }
+    tjFree(jpeg);
+    (void)tjDestroy(to);
+    (void)tjDestroy(from);
+}
 
 static void test_every_raw_format_gives_its_grey(void)
 {
@@ -355,6 +393,7 @@ static void test_only_the_image_circle_counts(void)
 int main(void)
 {
     UNITY_BEGIN();
+    RUN_TEST(test_a_damaged_jpeg_is_no_frame);
     RUN_TEST(test_every_raw_format_gives_its_grey);
     RUN_TEST(test_colours_are_weighed_whichever_way_round);
     RUN_TEST(test_values_beyond_the_format_are_white_not_black);

@@ -27,7 +27,7 @@ typedef struct pf_gpio_state {
     uint32_t limits;            /* PF_LIMIT_ bits of the switches that are pressed */
     uint32_t missed;            /* encoder edges known to be lost */
     uint32_t repeated, illegal; /* encoder: see pf_quadrature */
-    bool is_broken;             /* a chip or an input has gone since opening */
+    bool is_broken;             /* a chip or an input has gone since opening, or the lamp does not go off */
     char encoder[80];           /* where counts come from; "" = nowhere */
 } pf_gpio_state;
 

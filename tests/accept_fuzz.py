@@ -1,0 +1,72 @@
+"""Every fuzz target for ten million inputs, in pieces that are kept: what was interrupted goes on where it stopped.
+
+Each piece begins from the corpus that the pieces before left in build/accept/corpus, and keeps what it finds there. A
+piece's figures hold for one build of its target. Pieces that would begin after --minutes are left out: the row then
+tells the count so far, and does not hold.
+
+    python tests/accept_fuzz.py                   prints one JSON list of {name, value, bound, holds}
+    python tests/accept_fuzz.py spool --minutes 10
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from accept_link import ROOT, pieces
+from accept_rows import Row, exactly, figure, print_rows
+
+TARGETS = ROOT / "build/clang/tests/fuzz"
+RUNS, PIECE = 10_000_000, 500_000
+
+
+def run_piece(target: Path, piece: int) -> dict:
+    """PIECE inputs: whether something was found, how many were run, and how many edges the corpus reaches."""
+    name = target.name.removeprefix("fuzz_")
+    kept, given = ROOT / "build/accept/corpus" / name, ROOT / "tests/fuzz/corpus" / name
+    kept.mkdir(parents=True, exist_ok=True)
+    corpora = [kept, *([given] if given.is_dir() else [])]
+    flags = [f"-runs={PIECE}", "-max_len=4096", f"-seed={piece + 1}", "-print_final_stats=1"]
+    found = ROOT / "build/accept/found"
+    found.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        [target, *flags, f"-artifact_prefix={found}/{name}-", *corpora], capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        print(done.stderr[-3000:], file=sys.stderr)
+    ran = re.search(r"stat::number_of_executed_units:\s+(\d+)", done.stderr)
+    edges = re.findall(r"cov: (\d+)", done.stderr)
+    return {
+        "runs": min(PIECE, int(ran.group(1))) if ran else 0,
+        "findings": int(done.returncode != 0),
+        "edges": int(edges[-1]) if edges else 0,
+    }
+
+
+def check(target: Path, minutes: float) -> list[Row]:
+    name = target.name.removeprefix("fuzz_")
+    done = list(pieces(f"fuzz-{name}", target, RUNS // PIECE, minutes, lambda piece: run_piece(target, piece)))
+    return [
+        exactly(f"fuzz.{name}_runs", sum(p["runs"] for p in done), RUNS),
+        exactly(f"fuzz.{name}_findings", sum(p["findings"] for p in done), 0),
+        figure(f"fuzz.{name}_edges", max((p["edges"] for p in done), default=0), "> 0", any(p["edges"] for p in done)),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("only", nargs="?", default="")
+    parser.add_argument("--minutes", type=float, default=60, help="for each target")
+    args = parser.parse_args()
+    targets = [t for t in sorted(TARGETS.glob("fuzz_*")) if t.is_file() and os.access(t, os.X_OK)]
+    if not targets:
+        raise SystemExit(f"no fuzz target in {TARGETS}: `make accept` builds them")
+    print_rows([row for t in targets if args.only in t.name for row in check(t, args.minutes)])
+
+
+if __name__ == "__main__":
+    main()
