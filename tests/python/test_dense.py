@@ -199,7 +199,7 @@ def test_a_step_is_told_along_the_chainage_which_may_run_against_s(found: DenseW
     with_step = stepped(found, 0.45, 0.003, 2.5, 0.001)
     with_step.steps.extend(find_steps(with_step))
     for sign in (1, -1):
-        (r,) = document_of([with_step], [Strip(found.wall, 5.0, sign)], "metre")["steps"]
+        (r,) = document_of([with_step], [Strip(found.wall, 5.0, sign)], "metre", {})["steps"]
         assert abs(r["chainage"] - (5.0 + sign * 0.45)) < 0.006
         assert abs(r["widening"] - sign * 0.001) < 0.0004
         assert abs(r["clock"] - (2.5 if sign > 0 else 2.5 + np.pi)) < 0.15
