@@ -73,7 +73,7 @@ fuzz-build: packages-test
 	@cmake --build --preset clang
 
 fuzz-smoke: fuzz-build
-	@ls build/clang/tests/fuzz | grep '^fuzz_[a-z_]*$$' | xargs -n 1 -P 2 tests/fuzz/smoke build/clang/tests/fuzz
+	@ls build/clang/tests/fuzz | grep '^fuzz_[a-z0-9_]*$$' | xargs -n 1 -P 2 tests/fuzz/smoke build/clang/tests/fuzz
 
 # The protocols, in every state that small bounds reach (tests/proof).
 proof: packages-test
