@@ -2,6 +2,7 @@
 
 import os
 import random
+import subprocess
 import time
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from pipefish.survey import lost_indices
 def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
     store = Store(crawler.port)
     crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
-    wait_for_log(crawler, "make room")
+    wait_for_log(crawler, "until there is room")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
@@ -62,6 +63,37 @@ def test_a_spool_with_a_bad_page_is_replaced_and_what_is_whole_is_delivered(craw
     crawler.start("--set", "survey.name=third", *EVERY_FRAME)
     assert receive_all(crawler, store) == 0
     assert len(store.objects) >= before - 3 and len(store.ends) == 2
+
+
+def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path, crawler: Crawler):
+    medium = tmp_path / "medium"
+    medium.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "tmpfs", medium], capture_output=True, text=True)
+    if mounted.returncode != 0:
+        pytest.skip(f"a daemon on a READ-ONLY file system is NOT tested: {mounted.stderr.strip()}")
+    try:
+        on_medium = ("--set", f"spool.path={medium}/spool.db", *EVERY_FRAME)
+        crawler.start("--set", "daemon.drain_s=0", *on_medium)
+        assert crawler.wait() == 0
+        subprocess.run(["mount", "-o", "remount,ro", medium], check=True)
+        store = Store(crawler.port)
+        crawler.start("--set", "survey.name=next", *on_medium)
+        with store.client() as client:
+            serve(crawler, client, lambda: store.ends and crawler.status().get("spool_trouble"))
+            assert "Read-only file system" in crawler.status()["spool_trouble"]
+            before = dict(store.objects)
+            assert crawler.status()["spool"]["objects"] == len(before), "what cannot be removed stays"
+            subprocess.run(["mount", "-o", "remount,rw", medium], check=True)
+            serve(crawler, client, lambda: False)
+        assert crawler.wait() == 0
+    finally:
+        subprocess.run(["umount", "-l", medium], check=True)
+    assert {*before} < {*store.objects} and set(store.arrivals.values()) == {1}
+    first, second = store.ends
+    for end in (first, second):
+        got = {k.index for k in store.keyframes if k.survey_id == end.survey_id}
+        assert got | lost_indices(end) == set(range(end.keyframes))
+    assert lost_indices(second) == set(), "a fast replay waits until it can be stored"
 
 
 def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
