@@ -9,6 +9,7 @@
 
 #include "clock.h"
 #include "config.h"
+#include "damage.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
@@ -50,6 +51,7 @@ struct pf_store {
     /* The thread's own: */
     bool was_blocked, was_evicting;       /* has said so */
     unsigned told;                        /* troubles that it has told */
+    uint64_t not_evicted;                 /* of what the spool counts as evicted */
     bool must_keep;                       /* what other surveys left still has ranks: nothing may go for it */
     char lost_break[PF_BREAK_REASON_MAX]; /* of a keyframe that was lost: the next one that is stored tells it */
 };
@@ -219,6 +221,35 @@ static void retry_later(pf_store *s)
     s->retry_ns = pf_now() + RETRY_NS;
 }
 
+/* Without the mutex. What the medium has damaged is of no use to anyone, and never acknowledged: it goes, and a
+ * keyframe is counted and named in its survey's lost ranges. */
+static void give_up_damaged(pf_store *s, const pf_slot *slot, size_t n)
+{
+    const bool is_frame = slot->item.kind == PF_OBJECT_KEYFRAME;
+    uint8_t value[PF_SURVEY_BYTES];
+    size_t value_n = 0;
+    pf_damage damage = {.is_known = false};
+    pf_log(PF_LOG_ERROR, "%s: it is given up", s->spool.ops->error(s->spool.self));
+    pf_status status =
+        is_frame ? pf_damage_settle(&damage, &s->spool, &slot->item, slot->bytes, s->slot_capacity, n) : PF_OK;
+    pthread_mutex_lock(&s->mutex);
+    if (is_frame && damage.is_known && !damage.is_named &&
+        memcmp(damage.survey_id, s->survey.id, sizeof damage.survey_id) == 0) {
+        pf_survey_lose(&s->survey, damage.index);
+        value_n = pf_survey_pack(&s->survey, value);
+    }
+    s->stats.keyframes_dropped += is_frame && status == PF_OK;
+    if (damage.is_named)
+        s->not_evicted += 2; /* the keyframe, and the end that another has replaced */
+    pthread_mutex_unlock(&s->mutex);
+    if (status == PF_OK && value_n > 0) /* before it goes, lest a power cut leave it unnamed */
+        status = s->spool.ops->set(s->spool.self, PF_SURVEY_KEY, value, value_n);
+    if (status == PF_OK && !damage.is_named)
+        status = s->spool.ops->remove(s->spool.self, slot->item.row);
+    if (status != PF_OK)
+        pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
+}
+
 /* Loads the next object into an empty slot. Enters and leaves with the mutex. */
 static void fill_slot(pf_store *s, pf_slot *slot)
 {
@@ -231,12 +262,10 @@ static void fill_slot(pf_store *s, pf_slot *slot)
     status = s->spool.ops->next(s->spool.self, after, &slot->item);
     if (status == PF_OK) {
         status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
-        if (status == PF_ERR_CHECKSUM) { /* of no use to anyone, and never acknowledged */
-            pf_log(PF_LOG_ERROR, "%s: it is removed", s->spool.ops->error(s->spool.self));
-            (void)s->spool.ops->remove(s->spool.self, slot->item.row);
-        } else if (status == PF_ERR_SPACE) {
+        if (status == PF_ERR_CHECKSUM)
+            give_up_damaged(s, slot, n);
+        else if (status == PF_ERR_SPACE)
             pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
-        }
         if (status != PF_ERR_IO)
             after = slot->item.row;
     }
@@ -307,6 +336,7 @@ static void refresh_spool_stats(pf_store *s)
     pthread_mutex_lock(&s->mutex);
     if (stats.healed != s->stats.spool.healed)
         pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+    stats.evicted -= s->not_evicted;
     s->stats.spool = stats;
     pthread_cond_broadcast(&s->change);
 }
@@ -427,7 +457,6 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
     s->spool = *spool;
     s->survey = *survey;
     s->config = *config;
-    s->has_more = true;
     /* What other surveys left is whole, or its end has told what is lost. */
     s->must_keep = !survey->is_resumed && spool->ops->keep_all(spool->self) != PF_OK;
     if (s->must_keep) /* on a disk that is full: what is there can be sent all the same */
@@ -517,6 +546,8 @@ void pf_store_give(pf_store *s, pf_job *job)
         free_job(s, job);
     } else {
         s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
+        s->has_more =
+            true; /* and not before the first: the end of an interrupted survey may have to name what is lost */
         pthread_cond_signal(&s->work);
     }
     pthread_mutex_unlock(&s->mutex);
