@@ -230,8 +230,8 @@ pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity,
 /* Adds keyframe `index` to those that the survey's end out[0 .. *n) names as lost; *n grows. PF_ERR_SPACE. */
 pf_status pf_msg_append_lost(uint32_t index, uint8_t *out, size_t capacity, size_t *n);
 
-/* Whose a keyframe's message is that is damaged somewhere, from its first bytes alone. PF_ERR_FORMAT: not even those are
- * whole. */
+/* Whose a keyframe's message is that is damaged somewhere, from its first bytes alone. PF_ERR_FORMAT: not even those
+ * are whole. */
 pf_status pf_msg_peek_keyframe(const uint8_t *bytes, size_t n, uint8_t survey_id[16], uint32_t *index);
 /* Of a survey's end that is whole. PF_ERR_FORMAT. */
 pf_status pf_msg_peek_survey_end(const uint8_t *bytes, size_t n, uint8_t survey_id[16]);
