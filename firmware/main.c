@@ -351,7 +351,8 @@ static void note_status(pf_daemon *d, uint64_t *due, bool is_last)
         pf_log(PF_LOG_WARNING, "status file: %s", error);
 }
 
-/* The first signal ends the survey and drains; the second ends at once: what is stored is safe. */
+/* The first signal ends the survey and drains; the second ends at once: what is stored is safe. The kernel leaves a
+ * line as it was set, so the lamp is switched off before; one that hangs gets a second, then the alarm ends all. */
 static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
 {
     struct signalfd_siginfo info;
@@ -359,6 +360,8 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
         return;
     if (*is_terminated) {
         pf_log(PF_LOG_WARNING, "second signal: exit at once");
+        (void)alarm(1);
+        (void)d->gpio.ops->set_lamp(d->gpio.self, 0);
         _exit(FAILED);
     }
     *is_terminated = true;

@@ -9,6 +9,7 @@
 
 #include "clock.h"
 #include "config.h"
+#include "damage.h"
 #include "log.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
@@ -16,6 +17,9 @@
 
 #define HURRY_NS 2000000000u
 #define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
+
+/* What the spool does not do now. */
+typedef enum trouble { TROUBLE_STORING = 1, TROUBLE_READING = 2, TROUBLE_REMOVING = 4 } trouble;
 
 enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
 
@@ -33,8 +37,11 @@ struct pf_store {
     pf_job **queue; /* ring, oldest first */
     uint32_t queue_first, queue_count;
     bool is_blocked;   /* the oldest job waits for room in the spool */
-    bool is_failing;   /* the spool cannot be read, or not removed from, now */
+    bool is_failing;   /* the spool cannot be read now */
     uint64_t retry_ns; /* when to try again at the latest */
+    uint64_t left_row; /* the first object that could not be removed: tried again for all of them; 0 = none */
+    bool is_rewinding; /* it can again: as soon as no slot holds one, all that are left are offered once more */
+    unsigned troubles; /* those that are there */
     bool has_more;     /* the spool may hold an object after `cursor` */
     uint64_t cursor;   /* row of the last object that went into a slot */
     pf_slot *slots;
@@ -42,9 +49,11 @@ struct pf_store {
     bool is_hurried, is_flushing, is_quitting;
     pf_store_stats stats;
     /* The thread's own: */
-    bool was_blocked, was_failing, was_evicting; /* has said so */
-    bool must_keep;                              /* what other surveys left still has ranks: nothing may go for it */
-    char lost_break[PF_BREAK_REASON_MAX];        /* of a keyframe that was lost: the next one that is stored tells it */
+    bool was_blocked, was_evicting;       /* has said so */
+    unsigned told;                        /* troubles that it has told */
+    uint64_t not_evicted;                 /* of what the spool counts as evicted */
+    bool must_keep;                       /* what other surveys left still has ranks: nothing may go for it */
+    char lost_break[PF_BREAK_REASON_MAX]; /* of a keyframe that was lost: the next one that is stored tells it */
 };
 
 /* ---- the thread's work: each is called without the mutex */
@@ -117,9 +126,12 @@ static const char *what(const pf_job *job)
 }
 
 /* With the mutex, right after the call. */
-static void note_trouble(pf_store *s, bool is_there)
+static void note_trouble(pf_store *s, trouble which, bool is_there)
 {
-    (void)snprintf(s->stats.trouble, sizeof s->stats.trouble, "%s", is_there ? s->spool.ops->error(s->spool.self) : "");
+    s->troubles = is_there ? s->troubles | which : s->troubles & ~(unsigned)which;
+    if (is_there || s->troubles == 0)
+        (void)snprintf(s->stats.trouble, sizeof s->stats.trouble, "%s",
+                       is_there ? s->spool.ops->error(s->spool.self) : "");
 }
 
 static void free_job(pf_store *s, pf_job *job)
@@ -163,7 +175,7 @@ static void do_job(pf_store *s)
         pf_log(PF_LOG_WARNING, "%s: keyframes are given up from now on, the least important first",
                made.count > 0 ? "the spool is full" : s->spool.ops->error(s->spool.self));
     if (is_waiting && !s->was_blocked)
-        pf_log(PF_LOG_WARNING, "%s: waiting for the host to make room", s->spool.ops->error(s->spool.self));
+        pf_log(PF_LOG_WARNING, "%s: waiting until there is room", s->spool.ops->error(s->spool.self));
     else if (status != PF_OK && !is_waiting && !is_evicting)
         pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self), what(job));
     s->was_blocked = is_waiting;
@@ -173,7 +185,7 @@ static void do_job(pf_store *s)
     else if (is_keyframe(job) && !is_waiting)
         memcpy(s->lost_break, break_reason, sizeof s->lost_break);
     pthread_mutex_lock(&s->mutex);
-    note_trouble(s, status != PF_OK);
+    note_trouble(s, TROUBLE_STORING, status != PF_OK);
     if (is_waiting) {
         s->is_blocked = !s->is_flushing;
         s->retry_ns = pf_now() + RETRY_NS;
@@ -196,17 +208,46 @@ static void do_job(pf_store *s)
 }
 
 /* Says once, not every second, that the spool fails; without the mutex, after a call that says how. */
-static void note_failure(pf_store *s, bool is_failing)
+static void note_failure(pf_store *s, trouble which, bool is_failing)
 {
-    if (is_failing && !s->was_failing)
+    if (is_failing && (s->told & which) == 0)
         pf_log(PF_LOG_ERROR, "%s: trying again", s->spool.ops->error(s->spool.self));
-    s->was_failing = is_failing;
+    s->told = is_failing ? s->told | which : s->told & ~(unsigned)which;
 }
 
 static void retry_later(pf_store *s)
 {
     s->is_failing = true;
     s->retry_ns = pf_now() + RETRY_NS;
+}
+
+/* Without the mutex. What the medium has damaged is of no use to anyone, and never acknowledged: it goes, and a
+ * keyframe is counted and named in its survey's lost ranges. */
+static void give_up_damaged(pf_store *s, const pf_slot *slot, size_t n)
+{
+    const bool is_frame = slot->item.kind == PF_OBJECT_KEYFRAME;
+    uint8_t value[PF_SURVEY_BYTES];
+    size_t value_n = 0;
+    pf_damage damage = {.is_known = false};
+    pf_log(PF_LOG_ERROR, "%s: it is given up", s->spool.ops->error(s->spool.self));
+    pf_status status =
+        is_frame ? pf_damage_settle(&damage, &s->spool, &slot->item, slot->bytes, s->slot_capacity, n) : PF_OK;
+    pthread_mutex_lock(&s->mutex);
+    if (is_frame && damage.is_known && !damage.is_named &&
+        memcmp(damage.survey_id, s->survey.id, sizeof damage.survey_id) == 0) {
+        pf_survey_lose(&s->survey, damage.index);
+        value_n = pf_survey_pack(&s->survey, value);
+    }
+    s->stats.keyframes_dropped += is_frame && status == PF_OK;
+    if (damage.is_named)
+        s->not_evicted += 2; /* the keyframe, and the end that another has replaced */
+    pthread_mutex_unlock(&s->mutex);
+    if (status == PF_OK && value_n > 0) /* before it goes, lest a power cut leave it unnamed */
+        status = s->spool.ops->set(s->spool.self, PF_SURVEY_KEY, value, value_n);
+    if (status == PF_OK && !damage.is_named)
+        status = s->spool.ops->remove(s->spool.self, slot->item.row);
+    if (status != PF_OK)
+        pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
 }
 
 /* Loads the next object into an empty slot. Enters and leaves with the mutex. */
@@ -221,19 +262,17 @@ static void fill_slot(pf_store *s, pf_slot *slot)
     status = s->spool.ops->next(s->spool.self, after, &slot->item);
     if (status == PF_OK) {
         status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
-        if (status == PF_ERR_CHECKSUM) { /* of no use to anyone, and never acknowledged */
-            pf_log(PF_LOG_ERROR, "%s: it is removed", s->spool.ops->error(s->spool.self));
-            (void)s->spool.ops->remove(s->spool.self, slot->item.row);
-        } else if (status == PF_ERR_SPACE) {
+        if (status == PF_ERR_CHECKSUM)
+            give_up_damaged(s, slot, n);
+        else if (status == PF_ERR_SPACE)
             pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
-        }
         if (status != PF_ERR_IO)
             after = slot->item.row;
     }
-    note_failure(s, status == PF_ERR_IO);
+    note_failure(s, TROUBLE_READING, status == PF_ERR_IO);
     pthread_mutex_lock(&s->mutex);
     if (status == PF_OK || status == PF_ERR_IO)
-        note_trouble(s, status != PF_OK);
+        note_trouble(s, TROUBLE_READING, status != PF_OK);
     if (after != s->cursor || status == PF_ERR_IO)
         s->has_more = true;
     s->cursor = after;
@@ -248,20 +287,44 @@ static void fill_slot(pf_store *s, pf_slot *slot)
     pthread_mutex_lock(&s->mutex);
 }
 
-static void empty_slot(pf_store *s, pf_slot *slot)
+/* Whether it has gone from the spool. Enters and leaves with the mutex. */
+static bool remove_row(pf_store *s, uint64_t row)
 {
-    uint64_t row = slot->item.row;
     bool is_removed;
     pthread_mutex_unlock(&s->mutex);
     is_removed = s->spool.ops->remove(s->spool.self, row) == PF_OK;
-    note_failure(s, !is_removed);
+    note_failure(s, TROUBLE_REMOVING, !is_removed);
     pthread_mutex_lock(&s->mutex);
-    note_trouble(s, !is_removed);
-    if (is_removed) {
-        slot->state = SLOT_EMPTY;
+    note_trouble(s, TROUBLE_REMOVING, !is_removed);
+    if (is_removed)
         s->is_blocked = false;
-    } else {
-        retry_later(s);
+    else
+        s->retry_ns = pf_now() + RETRY_NS;
+    return is_removed;
+}
+
+/* What cannot be removed stays and counts, and keeps nothing behind it from being sent. */
+static void empty_slot(pf_store *s, pf_slot *slot)
+{
+    if (!remove_row(s, slot->item.row) && s->left_row == 0)
+        s->left_row = slot->item.row;
+    slot->state = SLOT_EMPTY;
+}
+
+/* Once the first that was left can be removed, the host is offered the others again: it has them, and says so. */
+static void try_left(pf_store *s)
+{
+    if (s->left_row != 0 && pf_now() >= s->retry_ns && remove_row(s, s->left_row)) {
+        s->left_row = 0;
+        s->is_rewinding = true;
+    }
+    for (uint32_t i = 0; i < s->config.slots; i++)
+        if (s->slots[i].state != SLOT_EMPTY)
+            return;
+    if (s->is_rewinding) {
+        s->cursor = 0;
+        s->has_more = true;
+        s->is_rewinding = false;
     }
 }
 
@@ -273,6 +336,7 @@ static void refresh_spool_stats(pf_store *s)
     pthread_mutex_lock(&s->mutex);
     if (stats.healed != s->stats.spool.healed)
         pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
+    stats.evicted -= s->not_evicted;
     s->stats.spool = stats;
     pthread_cond_broadcast(&s->change);
 }
@@ -285,12 +349,13 @@ static bool do_round(pf_store *s)
         do_job(s);
         is_busy = true;
     }
+    try_left(s);
     for (uint32_t i = 0; i < s->config.slots; i++) {
-        if (s->slots[i].state == SLOT_DONE && !s->is_failing) {
+        if (s->slots[i].state == SLOT_DONE) {
             empty_slot(s, &s->slots[i]);
             is_busy = true;
         }
-        if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_failing && !s->is_quitting) {
+        if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_failing && !s->is_rewinding && !s->is_quitting) {
             fill_slot(s, &s->slots[i]);
             is_busy = true;
         }
@@ -313,7 +378,8 @@ static void *run(void *argument)
         if (s->is_quitting)
             break;
         pf_pulse_rest();
-        if (s->is_blocked || s->is_failing) { /* room may come from elsewhere, too: someone cleans up a full disk */
+        if (s->is_blocked || s->is_failing ||
+            s->left_row != 0) { /* room may come from elsewhere, too: someone cleans up a full disk */
             const struct timespec until = {(time_t)(s->retry_ns / 1000000000u), (long)(s->retry_ns % 1000000000u)};
             (void)pthread_cond_timedwait(&s->work, &s->mutex, &until);
             if (pf_now() >= s->retry_ns)
@@ -391,7 +457,6 @@ bool pf_store_open(pf_store **store, const pf_spool *spool, const pf_survey *sur
     s->spool = *spool;
     s->survey = *survey;
     s->config = *config;
-    s->has_more = true;
     /* What other surveys left is whole, or its end has told what is lost. */
     s->must_keep = !survey->is_resumed && spool->ops->keep_all(spool->self) != PF_OK;
     if (s->must_keep) /* on a disk that is full: what is there can be sent all the same */
@@ -481,6 +546,8 @@ void pf_store_give(pf_store *s, pf_job *job)
         free_job(s, job);
     } else {
         s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
+        s->has_more =
+            true; /* and not before the first: the end of an interrupted survey may have to name what is lost */
         pthread_cond_signal(&s->work);
     }
     pthread_mutex_unlock(&s->mutex);

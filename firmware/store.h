@@ -36,7 +36,8 @@ typedef struct pf_store_config {
 
 typedef struct pf_store_stats {
     pf_spool_stats spool;
-    uint64_t keyframes_dropped;   /* made but not stored; those that made room later are spool.evicted */
+    uint64_t keyframes_dropped;   /* made but not stored, or damaged by the medium later; those that made room later are
+                                     spool.evicted */
     uint64_t refused;             /* objects that the host will never take */
     uint64_t store_ns, stored;    /* time spent on storing keyframes, and how many */
     bool has_failed;              /* the survey's start or end could not be stored */

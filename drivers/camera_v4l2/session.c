@@ -154,18 +154,27 @@ static pf_status v4l2_take(void *self, uint32_t timeout_ms, pf_session_frame *fr
     pf_v4l2_buffer *b = &c->buffer[r.b.index];
     b->is_queued = false;
     b->is_held = true;
-    *frame = (pf_session_frame){
-        .buffer = r.b.index,
-        .sequence = r.b.sequence,
-        .pixels = b->memory,
-        .n = c->type == V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE ? r.planes[0].bytesused : r.b.bytesused,
-        .stamp_ns = stamp_of(&r.b),
-        .is_stamp_first = (r.b.flags & V4L2_BUF_FLAG_TSTAMP_SRC_MASK) == V4L2_BUF_FLAG_TSTAMP_SRC_SOE,
-        .is_damaged = (r.b.flags & V4L2_BUF_FLAG_ERROR) != 0};
+    const bool is_mplane = c->type == V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE;
+    const size_t skip = is_mplane ? r.planes[0].data_offset : 0,
+                 used = is_mplane ? r.planes[0].bytesused : r.b.bytesused;
+    *frame = (pf_session_frame){.buffer = r.b.index,
+                                .sequence = r.b.sequence,
+                                .pixels = b->memory,
+                                .n = used,
+                                .stamp_ns = stamp_of(&r.b),
+                                .is_stamp_first =
+                                    (r.b.flags & V4L2_BUF_FLAG_TSTAMP_SRC_MASK) == V4L2_BUF_FLAG_TSTAMP_SRC_SOE,
+                                .is_damaged = (r.b.flags & V4L2_BUF_FLAG_ERROR) != 0};
     if (frame->n == 0 && c->is_compressed) /* else what was in the buffer before would be taken for it */
         frame->is_damaged = true;
     if (frame->n == 0 || frame->n > b->size) /* drivers of raw formats may leave it 0 */
         frame->n = b->size;
+    if (skip < frame->n) { /* a header, which bytesused counts */
+        frame->pixels += skip;
+        frame->n -= skip;
+    } else {
+        frame->is_damaged = true;
+    }
     return PF_OK;
 }
 
@@ -197,9 +206,10 @@ static void v4l2_drop(void *self, uint8_t *pixels)
 {
     pf_v4l2 *c = self;
     for (uint32_t i = 0; i < PF_CAMERA_HELD_MAX; i++) {
-        if (c->kept[i].memory != pixels)
+        const pf_v4l2_buffer *b = &c->kept[i];
+        if (b->memory == NULL || pixels < b->memory || pixels >= b->memory + b->size)
             continue;
-        c->io.unmap(c->io.self, pixels, c->kept[i].size);
+        c->io.unmap(c->io.self, b->memory, b->size);
         c->kept[i].memory = NULL;
     }
 }

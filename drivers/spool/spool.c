@@ -3,14 +3,17 @@
 #include "pipefish/drivers/spool.h"
 #include "common/failure.h"
 #include "pipefish/drivers/sha256.h"
+#include "spool/readonly.h"
 #include "spool/salvage.h"
 
+#include <errno.h>
 #include <inttypes.h>
 #include <pthread.h>
 #include <sqlite3.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #define APPLICATION_ID 0x50465350 /* "PFSP" */
 #define SCHEMA_VERSION 1
@@ -76,6 +79,7 @@ typedef struct spool {
     uint64_t quota;
     char *path;
     bool is_damaged; /* SQLite has found the file to be, and it is to be replaced */
+    bool is_read_only;
     pf_spool_stats stats;
     pf_failure failure;
 } spool;
@@ -182,7 +186,7 @@ static pf_status create(spool *s)
     return run_text(s, text);
 }
 
-static pf_status open_database(spool *s)
+static pf_status open_for_writing(spool *s)
 {
     bool is_empty = false;
     if (sqlite3_open_v2(s->path, &s->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
@@ -201,16 +205,6 @@ static pf_status open_database(spool *s)
         status = create(s);
     if (status == PF_OK)
         status = run_text(s, ranks);
-    int64_t objects = 0, bytes = 0;
-    if (status == PF_OK)
-        status = ask(s, "SELECT count(*) FROM object", &objects);
-    if (status == PF_OK)
-        status = ask(s, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
-    s->stats.objects = (uint64_t)objects;
-    s->stats.bytes = (uint64_t)bytes;
-    for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
-        if (sqlite3_prepare_v3(s->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &s->statements[i], NULL) != SQLITE_OK)
-            status = fail_sqlite(s, "opening");
     return status;
 }
 
@@ -222,6 +216,46 @@ static void close_database(spool *s)
     }
     (void)sqlite3_close(s->db);
     s->db = NULL;
+}
+
+/* What cannot be written can still be sent. Where there is nothing yet, or nothing that can be read, an empty spool in
+ * memory stands in, so that everybody else need not know. */
+static pf_status open_for_reading(spool *s)
+{
+    bool is_empty = access(s->path, F_OK) != 0;
+    pf_status status = PF_OK;
+    if (!is_empty) {
+        status = pf_spool_open_read_only(s->path, &s->db) == SQLITE_OK ? run_text(s, "PRAGMA locking_mode = EXCLUSIVE")
+                                                                       : fail_sqlite(s, "opening");
+        if (status == PF_OK)
+            status = identify(s, &is_empty);
+    }
+    if (is_empty || s->is_damaged) {
+        s->is_damaged = false;
+        close_database(s);
+        status = sqlite3_open(":memory:", &s->db) == SQLITE_OK ? create(s) : fail_sqlite(s, "opening");
+    }
+    if (status == PF_OK) /* over the file's own: nothing has to go while nothing can come */
+        status = run_text(s, "PRAGMA temp_store = MEMORY; CREATE TEMP TABLE evictable (row INTEGER PRIMARY KEY,"
+                             "importance INTEGER NOT NULL, number INTEGER NOT NULL)");
+    return status;
+}
+
+static pf_status open_database(spool *s)
+{
+    s->is_read_only = pf_spool_is_read_only(s->path);
+    pf_status status = s->is_read_only ? open_for_reading(s) : open_for_writing(s);
+    int64_t objects = 0, bytes = 0;
+    if (status == PF_OK)
+        status = ask(s, "SELECT count(*) FROM object", &objects);
+    if (status == PF_OK)
+        status = ask(s, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
+    s->stats.objects = (uint64_t)objects;
+    s->stats.bytes = (uint64_t)bytes;
+    for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
+        if (sqlite3_prepare_v3(s->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &s->statements[i], NULL) != SQLITE_OK)
+            status = fail_sqlite(s, "opening");
+    return status;
 }
 
 /* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
@@ -251,16 +285,27 @@ static pf_status heal(spool *s)
     return status;
 }
 
-/* Takes the mutex. False, without it: the file could not be opened again after it was found damaged, nor can it now. */
+/* Takes the mutex. False, without it: the file could not be opened again after it was found damaged, nor can it now. A
+ * medium that was read-only is asked whether it still is. */
 static bool enter(spool *s)
 {
     pthread_mutex_lock(&s->mutex);
-    if (s->db != NULL || open_database(s) == PF_OK)
+    if (s->is_read_only && !pf_spool_is_read_only(s->path))
+        close_database(s);
+    if (s->db != NULL || open_database(s) == PF_OK || (s->is_damaged && heal(s) == PF_OK))
         return true;
     close_database(s);
     s->stats.errors++;
     pthread_mutex_unlock(&s->mutex);
     return false;
+}
+
+/* Later it may be written. */
+static pf_status fail_read_only(spool *s)
+{
+    s->stats.errors++;
+    (void)pf_spool_is_read_only(s->path);
+    return pf_fail(&s->failure, PF_ERR_SPACE, "%s: cannot be written: %s", s->path, strerror(errno));
 }
 
 /* ---- calls; each takes the mutex ---- */
@@ -338,6 +383,8 @@ static pf_status try_to_store(spool *s, const object *o, const char *key, const 
     bool stored = false;
     uint64_t freed = 0;
     uint32_t gone = 0;
+    if (s->is_read_only)
+        return fail_read_only(s);
     pf_status status = run(s, SQL_BEGIN) ? PF_OK : fail_call(s, "storing");
     if (status == PF_OK && o != NULL)
         status = evict(s, o, &freed, &gone);
@@ -424,6 +471,8 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
     }
     if (code != SQLITE_ROW && code != SQLITE_DONE)
         status = fail_call(s, "making room");
+    else if (s->is_read_only)
+        status = fail_read_only(s);
     else if (freed < n)
         status = pf_fail(&s->failure, PF_ERR_SPACE, "%s: full, and nothing in it is less important", s->path);
     sqlite3_reset(q);
@@ -436,7 +485,11 @@ static pf_status spool_keep_all(void *self)
     spool *s = self;
     if (!enter(s))
         return PF_ERR_IO;
-    pf_status status = run(s, SQL_KEEP_ALL) ? PF_OK : fail_call(s, "keeping what is there");
+    pf_status status = PF_OK;
+    if (s->is_read_only)
+        status = fail_read_only(s);
+    else if (!run(s, SQL_KEEP_ALL))
+        status = fail_call(s, "keeping what is there");
     pthread_mutex_unlock(&s->mutex);
     return status;
 }
@@ -520,6 +573,11 @@ static pf_status spool_remove(void *self, uint64_t row)
     pf_status status = PF_OK;
     if (!enter(s))
         return PF_ERR_IO;
+    if (s->is_read_only) {
+        (void)fail_read_only(s);
+        pthread_mutex_unlock(&s->mutex);
+        return PF_ERR_IO;
+    }
     sqlite3_stmt *q = s->statements[SQL_SIZE];
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);

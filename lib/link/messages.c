@@ -334,6 +334,17 @@ pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity,
     return PF_OK;
 }
 
+pf_status pf_msg_append_lost(uint32_t index, uint8_t *out, size_t capacity, size_t *n)
+{
+    pb_ostream_t stream = pb_ostream_from_buffer(out + *n, capacity - *n);
+    if (!pb_encode_tag(&stream, PB_WT_VARINT, pipefish_v1_SurveyEnd_lost_first_tag) ||
+        !pb_encode_varint(&stream, index) ||
+        !pb_encode_tag(&stream, PB_WT_VARINT, pipefish_v1_SurveyEnd_lost_count_tag) || !pb_encode_varint(&stream, 1))
+        return PF_ERR_SPACE;
+    *n += stream.bytes_written;
+    return PF_OK;
+}
+
 typedef struct lines_view {
     const char *const *line;
     uint32_t n;
@@ -520,6 +531,40 @@ _Static_assert((int)PF_REQUEST_GET_STATUS == pipefish_v1_Request_get_status_tag 
                    (int)PF_REQUEST_GET_STILL == pipefish_v1_Request_get_still_tag &&
                    (int)PF_REQUEST_PAIR == pipefish_v1_Request_pair_tag,
                "pf_msg_decode_request copies the number");
+
+/* The first field of either message; a field that is 0 is left out. */
+static bool read_survey_id(pb_istream_t *stream, uint8_t survey_id[16])
+{
+    pb_wire_type_t type;
+    uint32_t tag = 0, size = 0;
+    bool is_end = false;
+    return pb_decode_tag(stream, &type, &tag, &is_end) && tag == pipefish_v1_Keyframe_survey_id_tag &&
+           type == PB_WT_STRING && pb_decode_varint32(stream, &size) && size == 16 && pb_read(stream, survey_id, 16);
+}
+
+_Static_assert((int)pipefish_v1_Keyframe_survey_id_tag == (int)pipefish_v1_SurveyEnd_survey_id_tag, "read_survey_id");
+
+pf_status pf_msg_peek_keyframe(const uint8_t *bytes, size_t n, uint8_t survey_id[16], uint32_t *index)
+{
+    pb_istream_t stream = pb_istream_from_buffer(bytes, n);
+    pb_wire_type_t type;
+    uint32_t tag = 0;
+    bool is_end = false;
+    *index = 0;
+    if (!read_survey_id(&stream, survey_id) || !pb_decode_tag(&stream, &type, &tag, &is_end))
+        return PF_ERR_FORMAT;
+    if (tag == pipefish_v1_Keyframe_time_tag && type == PB_WT_STRING)
+        return PF_OK;
+    return tag == pipefish_v1_Keyframe_index_tag && type == PB_WT_VARINT && pb_decode_varint32(&stream, index)
+               ? PF_OK
+               : PF_ERR_FORMAT;
+}
+
+pf_status pf_msg_peek_survey_end(const uint8_t *bytes, size_t n, uint8_t survey_id[16])
+{
+    pb_istream_t stream = pb_istream_from_buffer(bytes, n);
+    return read_survey_id(&stream, survey_id) ? PF_OK : PF_ERR_FORMAT;
+}
 
 pf_status pf_msg_decode_request(const uint8_t *bytes, size_t n, pf_msg_request *request)
 {

@@ -327,14 +327,21 @@ def test_a_shutdown_waits_for_a_host_that_takes_nothing_only_as_long_as_a_signal
     assert spooled(crawler) == {START: 1, KEYFRAME: 20, END: 1}
 
 
-def test_a_second_sigterm_exits_at_once(crawler: Crawler):
-    crawler.start("--set", "camera.loops=0")
-    with Store(crawler.port).client():
-        crawler.terminate()
-        wait_for_log(crawler, "survey ends")
-        assert crawler.process.poll() is None  # nobody takes the objects: it drains
-        crawler.terminate()
-        assert crawler.wait(5) == 1
+def test_a_second_signal_ends_at_once_and_leaves_no_lamp_on(tmp_path: Path, crawler: Crawler):
+    lamp = tmp_path / "lamp"
+    lamp.mkdir()
+    (lamp / "max_brightness").write_text("1")
+    (lamp / "brightness").write_text("0")
+    crawler.start("--set", f"gpio.lamp={lamp}", "--set", "gpio.lamp_level=1", *EVERY_FRAME)
+    wait_for_log(crawler, "survey ends")
+    assert (lamp / "brightness").read_text() == "1"
+    crawler.terminate()
+    wait_for_log(crawler, "signal 15")
+    assert crawler.process.poll() is None  # nobody takes the objects: it drains
+    crawler.terminate()
+    assert crawler.wait(5) == 1
+    assert "exit at once" in crawler.text()
+    assert (lamp / "brightness").read_text() == "0"
 
 
 def test_requests_are_answered(crawler: Crawler):

@@ -1,7 +1,10 @@
 """pipefishd: a full spool, and being killed: nothing acknowledged is lost, nothing comes twice."""
 
+import contextlib
 import os
 import random
+import sqlite3
+import subprocess
 import time
 from pathlib import Path
 
@@ -20,13 +23,14 @@ from crawler import (
     wait_for_log,
     write_recording,
 )
+from pipefish import pipefish_pb2 as pb
 from pipefish.survey import lost_indices
 
 
 def test_a_full_spool_makes_a_fast_replay_wait_and_loses_nothing(crawler: Crawler):
     store = Store(crawler.port)
     crawler.start("--set", "spool.quota_mb=0.3", *EVERY_FRAME)
-    wait_for_log(crawler, "make room")
+    wait_for_log(crawler, "until there is room")
     assert receive_all(crawler, store) == 0
     [end_message] = store.ends
     assert [k.index for k in store.keyframes] == list(range(end_message.keyframes))
@@ -62,6 +66,76 @@ def test_a_spool_with_a_bad_page_is_replaced_and_what_is_whole_is_delivered(craw
     crawler.start("--set", "survey.name=third", *EVERY_FRAME)
     assert receive_all(crawler, store) == 0
     assert len(store.objects) >= before - 3 and len(store.ends) == 2
+
+
+def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path, crawler: Crawler):
+    medium = tmp_path / "medium"
+    medium.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "tmpfs", medium], capture_output=True, text=True)
+    if mounted.returncode != 0:
+        pytest.skip(f"a daemon on a READ-ONLY file system is NOT tested: {mounted.stderr.strip()}")
+    try:
+        on_medium = ("--set", f"spool.path={medium}/spool.db", *EVERY_FRAME)
+        crawler.start("--set", "daemon.drain_s=0", *on_medium)
+        assert crawler.wait() == 0
+        subprocess.run(["mount", "-o", "remount,ro", medium], check=True)
+        store = Store(crawler.port)
+        crawler.start("--set", "survey.name=next", *on_medium)
+        with store.client() as client:
+            serve(crawler, client, lambda: store.ends and crawler.status().get("spool_trouble"))
+            assert "Read-only file system" in crawler.status()["spool_trouble"]
+            before = dict(store.objects)
+            assert crawler.status()["spool"]["objects"] == len(before), "what cannot be removed stays"
+            subprocess.run(["mount", "-o", "remount,rw", medium], check=True)
+            serve(crawler, client, lambda: False)
+        assert crawler.wait() == 0
+    finally:
+        subprocess.run(["umount", "-l", medium], check=True)
+    assert {*before} < {*store.objects} and set(store.arrivals.values()) == {1}
+    first, second = store.ends
+    for end in (first, second):
+        got = {k.index for k in store.keyframes if k.survey_id == end.survey_id}
+        assert got | lost_indices(end) == set(range(end.keyframes))
+    assert lost_indices(second) == set(), "a fast replay waits until it can be stored"
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["of a survey that has ended", "of the survey that goes on", "of an interrupted survey", "in its first bytes"],
+)
+def test_a_keyframe_that_the_medium_damages_is_named_as_lost(crawler: Crawler, place: str):
+    is_interrupted = place in ("of the survey that goes on", "of an interrupted survey")
+    if is_interrupted:
+        crawler.start("--set", "camera.loops=0")
+        wait_for_log(crawler, "begins")
+        time.sleep(0.5)
+        crawler.kill()
+    else:
+        crawler.start("--set", "daemon.drain_s=0", *EVERY_FRAME)
+        assert crawler.wait() == 0
+    with contextlib.closing(sqlite3.connect(crawler.config.parent / "spool.db")) as database:
+        rows = database.execute("SELECT row, bytes FROM object WHERE kind = 2 ORDER BY row").fetchall()
+        damaged = (rows[0], rows[-2])
+        for row, data in damaged:
+            flipped = bytearray(data)
+            flipped[3 if place == "in its first bytes" else len(data) // 2] ^= 1
+            database.execute("UPDATE object SET bytes = ? WHERE row = ?", (bytes(flipped), row))
+        database.commit()
+    lost = {pb.Keyframe.FromString(data).index for _, data in damaged}
+    store = Store(crawler.port)
+    crawler.start(
+        *(() if is_interrupted else EVERY_FRAME),
+        *(("--set", "survey.name=other") if place == "of an interrupted survey" else ()),
+    )
+    assert receive_all(crawler, store) == 0
+    survey_id = pb.Keyframe.FromString(damaged[0][1]).survey_id
+    [end] = [e for e in store.ends if e.survey_id == survey_id]
+    got = {k.index for k in store.keyframes if k.survey_id == survey_id}
+    assert 0 in lost and not got & lost and got | lost == set(range(end.keyframes))
+    assert lost_indices(end) == (set() if place == "in its first bytes" else lost)
+    status = crawler.status()
+    assert (status["keyframes_dropped"], status["spool"]["evicted"]) == (2, 0)
+    assert status["spool"]["objects"] == 0
 
 
 def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):

@@ -591,6 +591,42 @@ static void test_keyframe_bound_holds_for_the_largest_numbers(void)
     TEST_ASSERT_GREATER_THAN_size_t(sizeof out * 9 / 10, n);
 }
 
+/* Proves: of a keyframe that is damaged behind its first bytes it is still known which one it was, of any index; of one
+ * cut there it is not; and a survey's end that is told of it names it, after those that it named. */
+static void test_a_damaged_keyframe_is_known_and_named(void)
+{
+    static const uint32_t indices[] = {0, 1, 300, UINT32_MAX};
+    const uint32_t first[] = {3}, count[] = {2};
+    uint8_t out[512], id[16];
+    size_t n = 0;
+    pf_msg_keyframe k = sample_keyframe(NULL);
+    pf_msg_survey_end e = {.keyframes = 9, .lost_first = first, .lost_count = count, .lost_ranges = 1};
+    k.n_tracks = 0;
+    for (size_t i = 0; i < sizeof indices / sizeof indices[0]; i++) {
+        uint32_t index = 7;
+        k.index = indices[i];
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_keyframe(&k, out, sizeof out, &n));
+        memset(out + 25, 0xFF, n - 25);
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_peek_keyframe(out, n, id, &index));
+        TEST_ASSERT_EQUAL_MEMORY(k.survey_id, id, 16);
+        TEST_ASSERT_EQUAL_UINT32(indices[i], index);
+        TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_msg_peek_keyframe(out, 18, id, &index));
+        TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_msg_peek_keyframe(out, 17, id, &index));
+        out[0] ^= 0x10;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_msg_peek_keyframe(out, n, id, &index));
+    }
+    memcpy(e.survey_id, survey_id, sizeof e.survey_id);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_encode_survey_end(&e, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, pf_msg_append_lost(300, out, n + 4, &n));
+    const size_t before = n;
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_append_lost(300, out, sizeof out, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_msg_peek_survey_end(out, n, id));
+    TEST_ASSERT_EQUAL_MEMORY(survey_id, id, 16);
+    static const uint8_t added[] = {8 << 3, 0xAC, 0x02, 9 << 3, 1};
+    TEST_ASSERT_EQUAL_size_t(before + sizeof added, n);
+    TEST_ASSERT_EQUAL_MEMORY(added, out + before, sizeof added);
+}
+
 static void test_keyframe_refuses_tables_that_are_none(void)
 {
     pf_track tracks[TRACKS];
@@ -681,6 +717,7 @@ int main(void)
     RUN_TEST(test_too_small_a_buffer_is_an_error_at_every_size);
     RUN_TEST(test_keyframe_bound_holds_for_the_largest_numbers);
     RUN_TEST(test_keyframe_refuses_tables_that_are_none);
+    RUN_TEST(test_a_damaged_keyframe_is_known_and_named);
     RUN_TEST(test_requests_are_decoded);
     RUN_TEST(test_truncated_requests_are_errors);
     return UNITY_END();

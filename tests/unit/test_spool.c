@@ -1,7 +1,10 @@
 #include "spool_objects.h"
 
 #include <pthread.h>
+#include <sched.h>
 #include <sqlite3.h>
+#include <sys/mount.h>
+#include <sys/stat.h>
 
 /* Proves: objects come out in the order they went in, under their names, once each, also after reopening; removing and
  * the counters agree. */
@@ -270,6 +273,96 @@ static void test_victims_are_the_least_important_then_the_oldest(void)
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->victims(spool.self, 0, 9, 1, v, &count));
 }
 
+/* Whether `path` is read-only from now on: for root as a file system of its own, else by permissions. */
+static bool set_read_only(const char *folder, bool is_read_only)
+{
+    if (geteuid() == 0)
+        return mount(NULL, folder, NULL, MS_REMOUNT | (is_read_only ? MS_RDONLY : 0u), NULL) == 0;
+    return chmod(folder, is_read_only ? 0555 : 0755) == 0;
+}
+
+static void copy_file(const char *from, const char *to)
+{
+    static uint8_t bytes[4 << 20];
+    FILE *in = fopen(from, "rb"), *out = fopen(to, "wb");
+    TEST_ASSERT_TRUE(in != NULL && out != NULL);
+    size_t n = fread(bytes, 1, sizeof bytes, in);
+    TEST_ASSERT_TRUE(n > 0 && n < sizeof bytes && fwrite(bytes, 1, n, out) == n);
+    (void)fclose(in);
+    (void)fclose(out);
+}
+
+/* Everything that is there can be read, nothing is taken, and nothing is removed. */
+static void check_read_only(uint64_t objects)
+{
+    pf_spool_item item = {0};
+    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
+    uint32_t count = 0;
+    uint64_t found = 0;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(99));
+    TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "cannot be written"));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->set(spool.self, "a", "b", 1));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->keep_all(spool.self));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->victims(spool.self, 0, UINT32_MAX, 1, victims, &count));
+    while (spool.ops->next(spool.self, item.row, &item) == PF_OK) {
+        (void)check_item(&item);
+        TEST_ASSERT_EQUAL_INT(PF_ERR_IO, spool.ops->remove(spool.self, item.row));
+        found++;
+    }
+    TEST_ASSERT_EQUAL_UINT64(objects, found);
+    TEST_ASSERT_EQUAL_UINT64(objects, stats().objects);
+}
+
+/* Proves: on a medium that is read-only already when the spool is opened, every object can be read, those in the log of
+ * a spool that was never closed too; an empty folder is an empty spool; and once it can be written it is, without being
+ * opened again. */
+static void test_read_only_medium(void)
+{
+    static const char *const names[] = {"closed # 50%.db", "cut.db", "none.db"};
+    static const uint64_t objects[] = {3, 4, 0};
+    char folder[512], path[600], inside[64];
+    (void)snprintf(folder, sizeof folder, "%s", temporary_path("medium"));
+    TEST_ASSERT_EQUAL_INT(0, mkdir(folder, 0755));
+    if (geteuid() == 0 && (unshare(CLONE_NEWNS) != 0 || mount(NULL, "/", NULL, MS_REC | MS_PRIVATE, NULL) != 0 ||
+                           mount("tmpfs", folder, "tmpfs", 0, NULL) != 0))
+        TEST_IGNORE_MESSAGE(
+            "nothing may be mounted here, and root may write everywhere: read-only media are NOT tested");
+    open_spool("source.db", 0);
+    for (uint64_t id = 1; id <= 4; id++) {
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+        if (id != 3)
+            continue;
+        close_spool();
+        (void)snprintf(path, sizeof path, "%s/%s", folder, names[0]);
+        copy_file(temporary_path("source.db"), path);
+        open_spool("source.db", 0);
+    }
+    (void)snprintf(path, sizeof path, "%s/%s", folder, names[1]);
+    copy_file(temporary_path("source.db"), path);
+    (void)snprintf(path, sizeof path, "%s/%s-wal", folder, names[1]);
+    copy_file(temporary_path("source.db-wal"), path);
+    close_spool();
+    for (size_t i = 0; i < sizeof names / sizeof names[0]; i++) {
+        (void)snprintf(inside, sizeof inside, "medium/%s", names[i]);
+        TEST_ASSERT_TRUE(set_read_only(folder, true));
+        open_spool(inside, 0);
+        check_read_only(objects[i]);
+        TEST_ASSERT_TRUE(set_read_only(folder, false));
+        pf_spool_item item;
+        if (objects[i] > 0) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
+            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
+        }
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(99));
+        close_spool();
+        open_spool(inside, 0);
+        TEST_ASSERT_EQUAL_UINT64(objects[i] > 0 ? objects[i] : 1, stats().objects);
+        close_spool();
+    }
+    if (geteuid() == 0)
+        TEST_ASSERT_EQUAL_INT(0, umount(folder));
+}
+
 int main(void)
 {
     (void)setenv("TMPDIR", "/dev/shm", 1); /* on a busy disk hundreds of syncs take a minute */
@@ -279,6 +372,7 @@ int main(void)
     RUN_TEST(test_values);
     RUN_TEST(test_quota);
     RUN_TEST(test_threads);
+    RUN_TEST(test_read_only_medium);
     RUN_TEST(test_wrong_files_are_refused_and_untouched);
     RUN_TEST(test_second_opener_is_refused);
     RUN_TEST(test_victims_are_the_least_important_then_the_oldest);

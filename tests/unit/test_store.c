@@ -4,6 +4,7 @@
 #include "temporary.h"
 #include "unity.h"
 
+#include <limits.h>
 #include <poll.h>
 #include <pthread.h>
 #include <string.h>
@@ -296,7 +297,39 @@ static void test_a_failing_disk_is_tried_again(void)
     close_store();
 }
 
-/* Proves: what is stored with a keyframe never lists a keyframe that the next boot will make again as lost. */
+/* Proves: a medium from which nothing can be removed keeps nothing from being sent, and what the host has stays and
+ * counts until it can go: then it is offered once more, and goes. */
+static void test_what_cannot_be_removed_stays_and_keeps_nothing_back(void)
+{
+    open_store(false);
+    fake.fail_removes = INT_MAX;
+    for (uint32_t i = 0; i < 4; i++)
+        give(PF_OBJECT_KEYFRAME, i, "");
+    for (uint64_t row = 1; row <= 4; row++) {
+        pf_slot *slot = wait_for_slot();
+        TEST_ASSERT_EQUAL_UINT64(row, slot->item.row);
+        pf_store_release_slot(store, slot->item.name, false);
+    }
+    (void)poll(NULL, 0, 50);
+    TEST_ASSERT_FALSE(pf_store_is_drained(store));
+    TEST_ASSERT_EQUAL_UINT64(4, stats().spool.objects);
+    TEST_ASSERT_EQUAL_STRING("fake", stats().trouble);
+    TEST_ASSERT_NULL(pf_store_next_slot(store)); /* none twice while it cannot go */
+    (void)pthread_mutex_lock(&fake.mutex);
+    fake.fail_removes = 0;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    for (uint64_t row = 2; row <= 4; row++) {
+        pf_slot *slot = wait_for_slot();
+        TEST_ASSERT_EQUAL_UINT64(row, slot->item.row);
+        pf_store_release_slot(store, slot->item.name, false);
+    }
+    for (int i = 0; i < 3000 && !pf_store_is_drained(store); i++)
+        (void)poll(NULL, 0, 10);
+    TEST_ASSERT_TRUE(pf_store_is_drained(store));
+    TEST_ASSERT_EQUAL_STRING("", stats().trouble);
+    close_store();
+}
+
 /* Proves: on a disk that is full already at the start the daemon begins all the same, so that what is there can be
  * sent; nothing of the surveys before is given up until the disk has taken that they are to be kept. */
 static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
@@ -317,6 +350,7 @@ static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
     close_store();
 }
 
+/* Proves: what is stored with a keyframe never lists a keyframe that the next boot will make again as lost. */
 static void test_losses_of_later_keyframes_are_not_kept(void)
 {
     pf_survey kept;
@@ -459,6 +493,7 @@ int main(void)
     RUN_TEST(test_a_break_outlives_the_keyframe_that_carried_it);
     RUN_TEST(test_a_break_that_waits_for_room_is_told_once);
     RUN_TEST(test_a_failing_disk_is_tried_again);
+    RUN_TEST(test_what_cannot_be_removed_stays_and_keeps_nothing_back);
     RUN_TEST(test_a_disk_that_is_full_at_the_start_gives_nothing_up);
     RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
     RUN_TEST(test_flush_and_quit_count_what_is_lost);

@@ -22,7 +22,8 @@ static struct {
     bool is_plugged, is_open, is_streaming, is_silent, restart_helps, has_error, is_busy;
     fake_format formats[FORMATS];
     uint32_t n_formats, width, height, fourcc, sequence, n_buffers, restarts;
-    bool is_queued[SLOTS], is_done[SLOTS];
+    bool is_queued[SLOTS], is_done[SLOTS], is_mplane;
+    uint32_t header; /* bytes before each picture: multi-planar cameras tell of them */
     uint32_t done[SLOTS], n_done, flags[SLOTS], numbers[SLOTS], damaged_next;
     uint64_t stamps[SLOTS];
     uint8_t memory[MAPS][BYTES]; /* a fresh one for each mapping: what is unmapped is never seen again */
@@ -72,7 +73,9 @@ static void fake_close(void *self, int fd)
 
 static int set_format(struct v4l2_format *f)
 {
-    struct v4l2_pix_format *p = &f->fmt.pix;
+    struct v4l2_pix_format one = f->fmt.pix, *p = k.is_mplane ? &one : &f->fmt.pix;
+    if (k.is_mplane)
+        p->pixelformat = f->fmt.pix_mp.pixelformat;
     bool has = false;
     for (uint32_t i = 0; i < k.n_formats; i++)
         has = has || k.formats[i].fourcc == p->pixelformat;
@@ -82,14 +85,27 @@ static int set_format(struct v4l2_format *f)
     p->field = V4L2_FIELD_NONE;
     p->bytesperline = STRIDE * (p->pixelformat == V4L2_PIX_FMT_YUYV ? 2 : 1);
     p->sizeimage = BYTES;
+    if (k.is_mplane)
+        f->fmt.pix_mp = (struct v4l2_pix_format_mplane){
+            .width = p->width,
+            .height = p->height,
+            .pixelformat = p->pixelformat,
+            .field = p->field,
+            .num_planes = 1,
+            .plane_fmt[0] = {.bytesperline = p->bytesperline, .sizeimage = p->sizeimage}};
     return 0;
 }
 
 static int buffer_call(unsigned long request, struct v4l2_buffer *b)
 {
     if (request == VIDIOC_QUERYBUF) {
-        b->length = BYTES;
-        b->m.offset = b->index;
+        if (k.is_mplane) {
+            b->m.planes[0].length = BYTES;
+            b->m.planes[0].m.mem_offset = b->index;
+        } else {
+            b->length = BYTES;
+            b->m.offset = b->index;
+        }
     } else if (request == VIDIOC_QBUF) {
         TEST_ASSERT_FALSE_MESSAGE(k.is_queued[b->index], "queued twice");
         k.is_queued[b->index] = true;
@@ -100,7 +116,12 @@ static int buffer_call(unsigned long request, struct v4l2_buffer *b)
         b->index = k.done[0];
         memmove(k.done, k.done + 1, --k.n_done * sizeof k.done[0]);
         k.is_queued[b->index] = false;
-        b->bytesused = BYTES;
+        if (k.is_mplane) {
+            b->m.planes[0].bytesused = BYTES;
+            b->m.planes[0].data_offset = k.header;
+        } else {
+            b->bytesused = BYTES;
+        }
         b->sequence = k.numbers[b->index];
         b->flags = k.flags[b->index] | V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
         b->timestamp.tv_sec = (long)(k.stamps[b->index] / 1000000000u);
@@ -139,7 +160,8 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
         return -1;
     switch (request) {
     case VIDIOC_QUERYCAP:
-        ((struct v4l2_capability *)argument)->capabilities = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING;
+        ((struct v4l2_capability *)argument)->capabilities =
+            (k.is_mplane ? V4L2_CAP_VIDEO_CAPTURE_MPLANE : V4L2_CAP_VIDEO_CAPTURE) | V4L2_CAP_STREAMING;
         return 0;
     case VIDIOC_ENUM_FMT:
     case VIDIOC_ENUM_FRAMEINTERVALS:
@@ -222,7 +244,8 @@ static void run_camera(uint64_t until)
                 is_done = is_done || k.done[j] == i;
             if (!k.is_queued[i] || is_done)
                 continue;
-            memset(k.memory[k.base + i], (int)(k.sequence & 0xFF), BYTES);
+            memset(k.memory[k.base + i], 0xEE, k.header);
+            memset(k.memory[k.base + i] + k.header, (int)(k.sequence & 0xFF), BYTES - k.header);
             k.numbers[i] = k.sequence;
             k.stamps[i] = k.next_frame;
             k.flags[i] = k.damaged_next > 0 ? V4L2_BUF_FLAG_ERROR : 0;
@@ -365,6 +388,35 @@ static void test_grey_frames_are_used_where_they_lie_and_stay_whole_while_held(v
         release(&another);
     }
     TEST_ASSERT_TRUE(another.sequence > 20); /* what found no room is a gap */
+}
+
+/* Proves: what a multi-planar camera puts before its picture is not taken for pixels, whether the picture is used where
+ * it lies, outlives the camera there, or is made grey in memory of ours; and a header as long as the buffer is damage.
+ */
+static void test_a_header_before_the_picture_is_skipped(void)
+{
+    for (uint32_t format = 0; format < 2; format++) {
+        setUp();
+        k.is_mplane = true;
+        k.header = 96;
+        k.formats[0].fourcc = format == 0 ? V4L2_PIX_FMT_GREY : V4L2_PIX_FMT_NV12;
+        k.n_formats = 1;
+        start();
+        pf_frame frame = next_within(300), held = next_within(300);
+        check_whole(&frame, (uint8_t)frame.sequence);
+        check_whole(&held, (uint8_t)held.sequence);
+        release(&frame);
+        k.is_plugged = false;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 100, &frame));
+        check_whole(&held, (uint8_t)held.sequence);
+        release(&held);
+        k.is_plugged = true;
+        frame = next_within(5000);
+        release(&frame);
+        k.header = BYTES;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_AGAIN, camera.ops->next(camera.self, 100, &frame));
+        close_camera();
+    }
 }
 
 static void test_the_best_format_that_is_fast_enough_is_chosen(void)
@@ -551,6 +603,7 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_grey_frames_are_used_where_they_lie_and_stay_whole_while_held);
+    RUN_TEST(test_a_header_before_the_picture_is_skipped);
     RUN_TEST(test_the_best_format_that_is_fast_enough_is_chosen);
     RUN_TEST(test_what_the_camera_cannot_do_is_said_with_what_it_can);
     RUN_TEST(test_a_camera_that_is_not_there_yet_is_waited_for);

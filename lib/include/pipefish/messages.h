@@ -227,6 +227,15 @@ typedef struct pf_msg_request {
 /* Marks the keyframe message out[0 .. *n) as the first after a break, for this reason; *n grows. PF_ERR_SPACE. */
 pf_status pf_msg_append_break(const char *reason, uint8_t *out, size_t capacity, size_t *n);
 
+/* Adds keyframe `index` to those that the survey's end out[0 .. *n) names as lost; *n grows. PF_ERR_SPACE. */
+pf_status pf_msg_append_lost(uint32_t index, uint8_t *out, size_t capacity, size_t *n);
+
+/* Whose a keyframe's message is that is damaged somewhere, from its first bytes alone. PF_ERR_FORMAT: not even those
+ * are whole. */
+pf_status pf_msg_peek_keyframe(const uint8_t *bytes, size_t n, uint8_t survey_id[16], uint32_t *index);
+/* Of a survey's end that is whole. PF_ERR_FORMAT. */
+pf_status pf_msg_peek_survey_end(const uint8_t *bytes, size_t n, uint8_t survey_id[16]);
+
 /* PF_ERR_ARGUMENT: n_tracks > 2 PF_TRACKS_MAX (a whole table, lost tracks included) or ids that do not ascend. */
 pf_status pf_msg_encode_keyframe(const pf_msg_keyframe *keyframe, uint8_t *out, size_t capacity, size_t *n);
 pf_status pf_msg_encode_survey_start(const pf_msg_survey_start *start, uint8_t *out, size_t capacity, size_t *n);

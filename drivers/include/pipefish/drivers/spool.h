@@ -38,7 +38,7 @@ typedef struct pf_spool_victim {
 
 typedef struct pf_spool_ops {
     /* Stores durably: on PF_OK the object outlives a power cut. The same name twice is stored once (PF_OK).
-     * PF_ERR_SPACE (quota or disk full: later it may fit), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes, or more than the
+     * PF_ERR_SPACE (quota or disk full, or the medium read-only: later it may fit), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes, or more than the
      * quota: never). */
     pf_status (*put)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n);
 
@@ -46,7 +46,7 @@ typedef struct pf_spool_ops {
     pf_status (*next)(void *self, uint64_t after, pf_spool_item *item);
 
     /* Reads an item's bytes into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone), PF_ERR_IO,
-     * PF_ERR_CHECKSUM (the medium has damaged it: only remove() is left). */
+     * PF_ERR_CHECKSUM (the medium has damaged it: bytes are what it gives). */
     pf_status (*read)(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n);
 
     /* Removes what the host has acknowledged. PF_OK (also if it is gone already), PF_ERR_IO. */
@@ -70,7 +70,8 @@ typedef struct pf_spool_ops {
                           const uint8_t name[32], const void *bytes, size_t n, const pf_spool_rank *rank,
                           const char *key, const void *value, size_t value_n);
 
-    /* Takes the ranks of all objects away: nothing that is stored now has to go any more. PF_OK, PF_ERR_IO. */
+    /* Takes the ranks of all objects away: nothing that is stored now has to go any more. PF_OK, PF_ERR_SPACE,
+     * PF_ERR_IO. */
     pf_status (*keep_all)(void *self);
 
     void (*stats)(void *self, pf_spool_stats *stats);
@@ -85,7 +86,8 @@ typedef struct pf_spool_config {
 
 /* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
  * new one begun with every object that can still be read: under its row, but never to make room for others. Anybody
- * else's file is refused. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
+ * else's file is refused. A medium that is read-only gives what is there, takes and removes nothing, and is asked at each
+ * call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
  * PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
