@@ -4,7 +4,6 @@
 #include <poll.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/random.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -264,7 +263,7 @@ static void service(pf_courier *c, uint64_t now)
     bool is_fresh = false;
     pf_status status = t->ops->service(t->self, &is_fresh);
     if (is_fresh) {
-        pf_session_reset(&c->host, take_event, c, now);
+        pf_session_begin(&c->host, take_event, c, now);
         c->failure[0] = '\0';
         pf_log(PF_LOG_DEBUG, "%s: connected", t->ops->name(t->self));
     }
@@ -292,7 +291,7 @@ static void take_visitors(pf_courier *c, uint64_t now)
         visitor *v = &c->visitors[i];
         if (v->session.transport.ops != NULL || !t->ops->visitor(t->self, &v->session.transport))
             continue;
-        pf_session_reset(&v->session, take_visitor_event, c, now);
+        pf_session_begin(&v->session, take_visitor_event, c, now);
         v->session.has_stream = true;
         v->since_ns = now;
         tell_host(&v->session, "a host looks on");
@@ -510,9 +509,6 @@ static pf_status open_sessions(pf_courier *c)
                          .window = config->link.window,
                          .keepalive_ms = config->link.keepalive_ms,
                          .rto_min_ms = config->link.rto_min_ms};
-    while (lc.nonce == 0)
-        if (getrandom(&lc.nonce, sizeof lc.nonce, 0) != (ssize_t)sizeof lc.nonce)
-            break;
     pf_status status = pf_session_open(&c->host, &lc);
     c->host.transport = d->transport;
     lc.send_slots = 1;
