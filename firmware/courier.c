@@ -386,7 +386,9 @@ static void send_objects(pf_courier *c)
     }
 }
 
-/* Waits until `deadline`, or longer if the line takes nothing, but not past `latest`. */
+/* Waits until the host's link wants something at `deadline`, or longer if its line takes nothing, but not past
+ * `latest`.
+ */
 static void wait_for_work(pf_courier *c, uint64_t deadline, uint64_t latest, bool is_full)
 {
     pf_transport *t = &c->daemon->transport;
@@ -419,7 +421,7 @@ static void *run(void *argument)
     pf_pulse_begin(PF_PULSE_COURIER);
     for (;;) {
         pf_pulse_work();
-        uint64_t now = pf_now(), deadline;
+        uint64_t now = pf_now(), deadline, latest;
         bool is_full;
         if (quit_at == UINT64_MAX && atomic_load(&c->is_quitting)) {
             quit_at = pf_link_is_up(c->host.link) ? now + LINGER_NS : now;
@@ -451,12 +453,11 @@ static void *run(void *argument)
         deadline = pf_link_deadline(c->host.link, now);
         if (!c->host.has_stream) /* the link has its hello ready all the time */
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
-        if (is_watched(c) && c->status_due < deadline)
-            deadline = c->status_due;
-        if (visitors_due < deadline)
-            deadline = visitors_due;
+        latest = quit_at < visitors_due ? quit_at : visitors_due;
+        if (is_watched(c) && c->status_due < latest)
+            latest = c->status_due;
         pf_pulse_rest();
-        wait_for_work(c, deadline, quit_at, is_full);
+        wait_for_work(c, deadline, latest, is_full);
     }
     publish(c, pf_now());
     pf_pulse_rest();
