@@ -4,7 +4,6 @@
 #include <poll.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/random.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -264,7 +263,7 @@ static void service(pf_courier *c, uint64_t now)
     bool is_fresh = false;
     pf_status status = t->ops->service(t->self, &is_fresh);
     if (is_fresh) {
-        pf_session_reset(&c->host, take_event, c, now);
+        pf_session_begin(&c->host, take_event, c, now);
         c->failure[0] = '\0';
         pf_log(PF_LOG_DEBUG, "%s: connected", t->ops->name(t->self));
     }
@@ -292,7 +291,7 @@ static void take_visitors(pf_courier *c, uint64_t now)
         visitor *v = &c->visitors[i];
         if (v->session.transport.ops != NULL || !t->ops->visitor(t->self, &v->session.transport))
             continue;
-        pf_session_reset(&v->session, take_visitor_event, c, now);
+        pf_session_begin(&v->session, take_visitor_event, c, now);
         v->session.has_stream = true;
         v->since_ns = now;
         tell_host(&v->session, "a host looks on");
@@ -387,7 +386,9 @@ static void send_objects(pf_courier *c)
     }
 }
 
-/* Waits until `deadline`, or longer if the line takes nothing, but not past `latest`. */
+/* Waits until the host's link wants something at `deadline`, or longer if its line takes nothing, but not past
+ * `latest`.
+ */
 static void wait_for_work(pf_courier *c, uint64_t deadline, uint64_t latest, bool is_full)
 {
     pf_transport *t = &c->daemon->transport;
@@ -420,7 +421,7 @@ static void *run(void *argument)
     pf_pulse_begin(PF_PULSE_COURIER);
     for (;;) {
         pf_pulse_work();
-        uint64_t now = pf_now(), deadline;
+        uint64_t now = pf_now(), deadline, latest;
         bool is_full;
         if (quit_at == UINT64_MAX && atomic_load(&c->is_quitting)) {
             quit_at = pf_link_is_up(c->host.link) ? now + LINGER_NS : now;
@@ -452,12 +453,11 @@ static void *run(void *argument)
         deadline = pf_link_deadline(c->host.link, now);
         if (!c->host.has_stream) /* the link has its hello ready all the time */
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
-        if (is_watched(c) && c->status_due < deadline)
-            deadline = c->status_due;
-        if (visitors_due < deadline)
-            deadline = visitors_due;
+        latest = quit_at < visitors_due ? quit_at : visitors_due;
+        if (is_watched(c) && c->status_due < latest)
+            latest = c->status_due;
         pf_pulse_rest();
-        wait_for_work(c, deadline, quit_at, is_full);
+        wait_for_work(c, deadline, latest, is_full);
     }
     publish(c, pf_now());
     pf_pulse_rest();
@@ -510,9 +510,6 @@ static pf_status open_sessions(pf_courier *c)
                          .window = config->link.window,
                          .keepalive_ms = config->link.keepalive_ms,
                          .rto_min_ms = config->link.rto_min_ms};
-    while (lc.nonce == 0)
-        if (getrandom(&lc.nonce, sizeof lc.nonce, 0) != (ssize_t)sizeof lc.nonce)
-            break;
     pf_status status = pf_session_open(&c->host, &lc);
     c->host.transport = d->transport;
     lc.send_slots = 1;

@@ -2,19 +2,32 @@
 
 #include <stdlib.h>
 #include <string.h>
+#include <sys/random.h>
 
 #define READ_MAX 65536u /* bytes taken in one round */
 
+/* 0: the system has no random numbers. */
+static uint32_t draw_nonce(void)
+{
+    uint32_t nonce = 0;
+    while (nonce == 0)
+        if (getrandom(&nonce, sizeof nonce, 0) != (ssize_t)sizeof nonce)
+            return 0;
+    return nonce;
+}
+
 pf_status pf_session_open(pf_session *s, const pf_link_config *config)
 {
-    size_t size = pf_link_workspace_size(config);
+    pf_link_config own = *config;
+    own.nonce = draw_nonce();
+    size_t size = pf_link_workspace_size(&own);
     memset(s, 0, sizeof *s);
     if (size == 0)
         return PF_ERR_ARGUMENT;
     s->workspace = aligned_alloc(16, (size + 15) / 16 * 16);
     if (s->workspace == NULL)
         return PF_ERR_SPACE;
-    return pf_link_init(&s->link, config, s->workspace, size);
+    return pf_link_init(&s->link, &own, s->workspace, size);
 }
 
 void pf_session_close(pf_session *s)
@@ -28,6 +41,14 @@ void pf_session_events(pf_session *s, pf_session_take *take, void *context, uint
     pf_link_event event;
     while (pf_link_next_event(s->link, &event))
         take(context, s, &event, now);
+}
+
+void pf_session_begin(pf_session *s, pf_session_take *take, void *context, uint64_t now)
+{
+    pf_session_reset(s, take, context, now);
+    const uint32_t nonce = draw_nonce();
+    if (nonce != 0)
+        pf_link_renew(s->link, nonce, now);
 }
 
 void pf_session_reset(pf_session *s, pf_session_take *take, void *context, uint64_t now)

@@ -17,7 +17,7 @@ typedef struct pf_session {
     size_t out_at, out_n;
 } pf_session;
 
-/* Makes the link. PF_ERR_ARGUMENT: a setting is out of range; PF_ERR_SPACE. */
+/* Makes the link, under a nonce of its own. PF_ERR_ARGUMENT: a setting is out of range; PF_ERR_SPACE. */
 pf_status pf_session_open(pf_session *session, const pf_link_config *config);
 void pf_session_close(pf_session *session); /* also one that was not opened; the transport is the caller's */
 
@@ -26,7 +26,10 @@ typedef void pf_session_take(void *context, pf_session *session, const pf_link_e
 
 void pf_session_events(pf_session *session, pf_session_take *take, void *context, uint64_t now);
 
-/* The stream is over, or another one: half a frame is dropped, objects stay. */
+/* Another stream: half a frame is dropped, objects stay, all else begins anew, for it may be another host's. */
+void pf_session_begin(pf_session *session, pf_session_take *take, void *context, uint64_t now);
+
+/* The stream is over: likewise, but for what the link counts. */
 void pf_session_reset(pf_session *session, pf_session_take *take, void *context, uint64_t now);
 
 /* Reads what is there, some at a time lest output waits for ever. False: the stream broke. */

@@ -87,6 +87,7 @@ typedef struct pf_session {
     uint32_t dead_nonce; /* of the session before: its late hellos are not a restart */
     uint32_t incompatible_nonce;
     uint32_t peer_slots, fragment;
+    uint64_t peer_boot_id;
     uint64_t hello_at; /* last hello sent */
     uint64_t heard_at; /* last valid frame */
     bool pong_due, ping_open;
@@ -317,6 +318,8 @@ bool pf_session_ping(pf_link *link, const uint8_t *frame, size_t size);
 bool pf_session_pong(pf_link *link, const uint8_t *frame, size_t size);
 void pf_session_stale(pf_link *link);
 void pf_session_down(pf_link *link);
+/* All counters begin anew. While down. */
+void pf_session_forget(pf_link *link);
 void pf_session_tick(pf_link *link);
 uint64_t pf_session_deadline(const pf_link *link);
 uint64_t pf_session_due(const pf_link *link);

@@ -127,6 +127,13 @@ void pf_link_reset(pf_link *link, uint64_t now_ns)
     pf_session_down(link);
 }
 
+void pf_link_renew(pf_link *link, uint32_t nonce, uint64_t now_ns)
+{
+    pf_link_reset(link, now_ns);
+    link->config.nonce = nonce;
+    pf_session_forget(link);
+}
+
 pf_link_event *pf_link_push_event(pf_link *link, pf_link_event_type type)
 {
     const uint32_t room = sizeof link->events / sizeof link->events[0];

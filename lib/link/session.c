@@ -25,6 +25,12 @@ void pf_session_down(pf_link *link)
     pf_link_push_event(link, PF_LINK_DOWN);
 }
 
+void pf_session_forget(pf_link *link)
+{
+    link->session.candidate = 0;
+    end_all(link, true);
+}
+
 static void come_up(pf_link *link, const uint8_t *frame)
 {
     pf_session *s = &link->session;
@@ -49,8 +55,10 @@ static void come_up(pf_link *link, const uint8_t *frame)
     event->peer_schema = pf_get32(frame + 32);
     event->peer_nonce = nonce;
     event->peer_boot_id = pf_get64(frame + 16);
-    event->peer_restarted = s->was_up && new_peer;
+    event->peer_restarted =
+        s->was_up && new_peer && (event->peer_boot_id == 0 || event->peer_boot_id != s->peer_boot_id);
     s->was_up = true;
+    s->peer_boot_id = event->peer_boot_id;
 }
 
 bool pf_session_hello(pf_link *link, const uint8_t *frame, size_t size)

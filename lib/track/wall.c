@@ -403,7 +403,7 @@ static pf_point_q16 way_of(const pf_wall *wall, uint32_t k, const int64_t walked
                               pf_clamp_i64(from[2] * 32, (int32_t)1 << 30)};
     if (!project(camera, &start, &b))
         return (pf_point_q16){0, 0};
-    return (pf_point_q16){a.x - b.x, a.y - b.y};
+    return (pf_point_q16){pf_clamp_i64((int64_t)a.x - b.x, INT32_MAX), pf_clamp_i64((int64_t)a.y - b.y, INT32_MAX)};
 }
 
 static uint32_t length_of(pf_point_q16 way)

@@ -1,5 +1,5 @@
 """The packages for arm64, which are made on another machine: that they say what they need. Their daemon is the one that
-the scenarios run; how they install is shown by Debian's own tools on a board, not here."""
+the scenarios run; and that Debian's own tools install and start it on a board."""
 
 from __future__ import annotations
 

@@ -394,6 +394,22 @@ def test_the_same_host_looks_on_while_it_receives(device: Crawler, capsys):
         assert "looks on" in capsys.readouterr().out
 
 
+def test_a_host_that_looked_on_or_left_gets_its_answers_when_it_has_the_device(device: Crawler, tmp_path, monkeypatch):
+    """Whoever was there in between: both ends count their messages alike."""
+    let_in(device, "operator")
+    with receiving(device):
+        other = another_user(tmp_path / "other", monkeypatch)
+        let_in(device, "calibrator", other, "second")
+        client = open_client(device)
+        for _ in range(4):
+            assert client.answer_to(5, get_status=pb.Nothing()).status.looking_on == BUSY
+        client.handlers.may_look_on = False
+        client.run(lambda: not client.up, 5)
+    client.run(lambda: client.up, 8)
+    assert not client.answer_to(5, get_status=pb.Nothing()).status.looking_on
+    client.close()
+
+
 def test_a_viewer_looks_on_and_an_operator_takes_the_line(device: Crawler, tmp_path, monkeypatch):
     let_in(device, "viewer")
     viewer = open_client(device)

@@ -150,10 +150,15 @@ static void test_hello_tells_who_the_peer_is_and_whether_it_restarted(void)
     TEST_ASSERT_EQUAL_UINT32(1, b.counts[PF_LINK_DOWN]);
     TEST_ASSERT_EQUAL_UINT32(2, b.counts[PF_LINK_UP]);
     TEST_ASSERT_FALSE(b.last[PF_LINK_UP].peer_restarted);
-    a.config.nonce = 77;
-    open_end(&a);
+    pf_link_renew(a.link, 76, now);
     talk(2);
     TEST_ASSERT_EQUAL_UINT32(3, b.counts[PF_LINK_UP]);
+    TEST_ASSERT_FALSE(b.last[PF_LINK_UP].peer_restarted); /* the same boot */
+    a.config.nonce = 77;
+    a.config.boot_id++;
+    open_end(&a);
+    talk(2);
+    TEST_ASSERT_EQUAL_UINT32(4, b.counts[PF_LINK_UP]);
     TEST_ASSERT_TRUE(b.last[PF_LINK_UP].peer_restarted);
     TEST_ASSERT_EQUAL_UINT32(1, b.counts[PF_LINK_DOWN]); /* a restart is told by the new UP */
 }
@@ -290,6 +295,50 @@ static void test_control_takes_what_is_not_older(void)
 }
 
 /* The peer's clock runs three hours ahead and the way there takes 4 ms, the way back 2 ms. */
+/* Proves: an end that another peer had meanwhile, and is renewed, is understood by the first again: control both ways,
+ * latest and objects. Without the new nonce the first goes on counting from where it was. */
+static void test_an_end_that_another_peer_had_meanwhile_is_understood(void)
+{
+    static uint8_t bytes[5000];
+    uint8_t name[PF_LINK_NAME_SIZE];
+    open_both();
+    end first = {0};
+    for (uint32_t turn = 0; turn < 3; turn++) { /* b, another, b */
+        memset(b.counts, 0, sizeof b.counts);
+        memset(a.counts, 0, sizeof a.counts);
+        for (uint32_t i = 0; i < (turn == 0 ? 9u : 3u); i++) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_send_control(a.link, "a", 1));
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_send_control(b.link, "b", 1));
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_send_latest(a.link, 0, "l", 1));
+            put_name(name, (uint8_t)(10 * turn + i + 1));
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_link_send_object(a.link, name, 2, bytes, sizeof bytes));
+            for (uint32_t k = 0; k < 20; k++) {
+                talk(2);
+                for (uint32_t slot = 0; slot < b.config.receive_slots; slot++)
+                    if (pf_link_answer_object(b.link, slot, PF_ANSWER_ACCEPT) != PF_OK)
+                        pf_link_answer_object(b.link, slot, PF_ANSWER_STORED);
+            }
+        }
+        TEST_ASSERT_EQUAL_UINT32(turn == 0 ? 9 : 3, a.counts[PF_LINK_CONTROL]);
+        TEST_ASSERT_EQUAL_UINT32(turn == 0 ? 9 : 3, b.counts[PF_LINK_CONTROL]);
+        TEST_ASSERT_EQUAL_UINT32(turn == 0 ? 9 : 3, b.counts[PF_LINK_LATEST]);
+        TEST_ASSERT_EQUAL_UINT32(turn == 0 ? 9 : 3, a.counts[PF_LINK_SENT]);
+        pf_link_reset(b.link, now);
+        const end swap = b;
+        if (turn == 0) {
+            b = (end){.config = swap.config};
+            b.config.nonce++;
+            open_end(&b);
+        } else {
+            b = first;
+        }
+        first = swap;
+        pf_link_renew(a.link, 1000 + turn, now);
+        talk(2);
+    }
+    free(first.link);
+}
+
 static void test_clock_offset_lies_within_its_error(void)
 {
     const uint64_t ahead = UINT64_C(10800) * 1000 * MS;
@@ -514,6 +563,7 @@ int main(void)
     RUN_TEST(test_frames_of_an_earlier_session_are_dropped);
     RUN_TEST(test_hello_is_said_when_sessions_disagree);
     RUN_TEST(test_control_takes_what_is_not_older);
+    RUN_TEST(test_an_end_that_another_peer_had_meanwhile_is_understood);
     RUN_TEST(test_clock_offset_lies_within_its_error);
     RUN_TEST(test_garbage_does_no_harm);
     RUN_TEST(test_overlong_frame_is_skipped_and_the_next_is_read);

@@ -180,6 +180,31 @@ static void test_what_walks_off_alike_is_left_where_it_is(void)
             TEST_ASSERT_TRUE(hypot(settled[i].pos.x - track[i].pos.x, settled[i].pos.y - track[i].pos.y) < 65536);
 }
 
+/* Sees all, as far as can be from where it saw the time before. */
+static bool project_far(const void *turn, const pf_ray_q30 *v, pf_point_q16 *at)
+{
+    int32_t *times = (int32_t *)(uintptr_t)turn;
+    (void)v;
+    *at = (*times)++ % 2 == 0 ? (pf_point_q16){INT32_MAX, INT32_MAX} : (pf_point_q16){INT32_MIN, INT32_MIN};
+    return true;
+}
+
+/* Proves: whatever places a camera gives, the way between two is a number, and no track is moved by more than half of
+ * the farthest. */
+static void test_places_farther_apart_than_numbers_go_do_no_harm(void)
+{
+    uint32_t times[TRACKS];
+    int32_t turn = 0;
+    point[30].nearer = 0.02;
+    drive(times);
+    (void)pf_wall_check(&wall, track, ray, TRACKS, project_far, &turn, PF_WALL_MOST_Q16, astray);
+    for (uint32_t i = 0; i < TRACKS; i++)
+        track[i].pos = (pf_point_q16){0, 0};
+    pf_wall_settle(&wall, track, TRACKS, project_far, &turn);
+    for (uint32_t i = 0; i < TRACKS; i++)
+        TEST_ASSERT_TRUE(track[i].pos.x <= 0 && track[i].pos.x >= -(1 << 30));
+}
+
 /* Proves: fewer than twelve tracks judge nobody; standing still, frames without tracks and a bad size do no harm. */
 static void test_what_tells_nothing_does_no_harm(void)
 {
@@ -208,6 +233,7 @@ int main(void)
     RUN_TEST(test_what_stands_on_the_wall_stays);
     RUN_TEST(test_half_of_what_a_track_walks_alone_is_taken_back);
     RUN_TEST(test_what_walks_off_alike_is_left_where_it_is);
+    RUN_TEST(test_places_farther_apart_than_numbers_go_do_no_harm);
     RUN_TEST(test_what_tells_nothing_does_no_harm);
     return UNITY_END();
 }

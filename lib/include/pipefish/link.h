@@ -107,7 +107,7 @@ typedef struct pf_link_event {
     uint8_t name[PF_LINK_NAME_SIZE];
     uint32_t peer_role, peer_version, peer_schema, peer_nonce;
     uint64_t peer_boot_id;
-    bool peer_restarted; /* PF_LINK_UP: another nonce than at the last PF_LINK_UP */
+    bool peer_restarted; /* PF_LINK_UP: another nonce than at the last PF_LINK_UP, and not the same boot */
 } pf_link_event;
 
 typedef struct pf_link pf_link; /* opaque, in the caller's workspace */
@@ -118,6 +118,11 @@ pf_status pf_link_init(pf_link **link, const pf_link_config *config, void *works
 /* The byte stream broke (cable out, TCP reconnected): drop half a frame and say hello again. Objects stay and resume.
  */
 void pf_link_reset(pf_link *link, uint64_t now_ns);
+
+/* As pf_link_reset, and under another nonce (not 0): for an end that has several links, or several peers in turn. What
+ * one end counted on in its last session with us the other may have forgotten since; under a new nonce both begin anew.
+ */
+void pf_link_renew(pf_link *link, uint32_t nonce, uint64_t now_ns);
 
 /* Consumes bytes; returns how many, fewer than n when an event waits to be taken. Any bytes at all are safe. Once all
  * are consumed a peer that was silent for too long counts as gone; bytes NULL and n 0 do only that, and must be called

@@ -22,7 +22,7 @@ typedef struct pf_transport_stats { /* of a transport that lets in only those it
     uint32_t refused_handshake; /* no certificate, another version, no TLS at all */
     uint32_t refused_late;      /* the handshake took too long */
     uint32_t refused_often;     /* too many at once, or after too many failures */
-    uint32_t refused_busy;      /* another host has the line */
+    uint32_t refused_busy;      /* another host has the line, and PF_VISITORS_MAX look on */
 } pf_transport_stats;
 
 typedef struct pf_transport {
