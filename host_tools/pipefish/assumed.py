@@ -44,5 +44,6 @@ def assumed(camera: Camera) -> Camera:
     rows = by_parameter[inside][:, :, chosen].reshape(-1, len(chosen))
     scale = np.linalg.norm(rows, axis=0)
     _, size, directions = np.linalg.svd(rows / scale, full_matrices=False)
-    spread = (directions.T / size) * (assumed_px(camera) * np.sqrt(len(rows) / len(chosen))) / scale[:, None]
+    # A residual is a distance: along either axis it is less by the root of two.
+    spread = (directions.T / size) * (assumed_px(camera) * np.sqrt(0.5 * len(rows) / len(chosen))) / scale[:, None]
     return dataclasses.replace(camera, covariance=spread @ spread.T, covariance_parameters=ASYMMETRY)

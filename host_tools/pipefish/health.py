@@ -139,17 +139,29 @@ def _own_covariance(camera: Camera, theta_end: float) -> Floats:
     return out
 
 
-def _diameter_slope(camera: Camera, tracks: Tracks) -> Floats:
-    """(23,): how ln of the diameter answers to FREE, for the angles at which the wall was seen. A wall point seen at
-    two angles a and b, a distance s apart, is s / (cot a - cot b) off the axis."""
+def _wall_radius(part: dict[str, Any]) -> float:
+    """How far the points of a segment are off the way of the camera (median)."""
+    centres = -np.einsum("nij,ni->nj", part["poses"][:, :, :3], part["poses"][:, :, 3])
+    ahead = np.gradient(centres, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
+    points = part["points"][:: len(part["points"]) // 1000 + 1]
+    nearest = np.linalg.norm(points[:, None] - centres, axis=2).argmin(axis=1)
+    return float(np.median(np.linalg.norm(np.cross(points - centres[nearest], ahead[nearest]), axis=1)))
+
+
+def _diameter_slope(camera: Camera, tracks: Tracks, radius: float) -> Floats:
+    """(23,): how ln of the diameter answers to FREE, for the angles at which the wall was seen, `radius` off the axis:
+    the nearer it is, the more the pupil's shift does. A wall point seen at two angles a and b, a distance s apart, is
+    s / (cot a - cot b) off the axis."""
     first = np.flatnonzero(np.diff(tracks.track, prepend=-1))
     last = np.append(first[1:], len(tracks.track)) - 1
     rays, ok = camera.unproject(tracks.pixels[np.concatenate([first, last])])
     across = np.hypot(rays[:, 0], rays[:, 1])
     theta = np.arctan2(across, rays[:, 2])
-    _, _, by_point, by_free = camera.project_jacobian(rays)
     with np.errstate(divide="ignore", invalid="ignore"):
-        outward = np.column_stack([rays[:, :2] / across[:, None] * np.cos(theta)[:, None], -np.sin(theta)])
+        away = (radius / across)[:, None]
+        _, _, by_point, by_free = camera.project_jacobian(np.where(np.isfinite(away), away, 1.0) * rays)
+        outward = away * np.column_stack([rays[:, :2] / across[:, None] * np.cos(theta)[:, None], -np.sin(theta)])
         rise = np.einsum("nij,nj->ni", by_point, outward)
         by_free = by_free[:, :, [PARAMETERS.index(name) for name in FREE]]
         slope = -np.einsum("ni,nip->np", rise, by_free) / (rise**2).sum(axis=1)[:, None]
@@ -257,7 +269,8 @@ def check_profile(
             "would show a drift",
         )
     seen = _together(found, prior)
-    slope, evidence = _diameter_slope(camera, tracks), "bends and turns of the drive"
+    slope = _diameter_slope(camera, tracks, _wall_radius(found.drift[0]))
+    evidence = "bends and turns of the drive"
     if diameter is not None and found.unit == "metre":
         seen, evidence = _with_diameter(found, diameter, diameter_sigma, seen, slope)
     return _judge(seen, camera, end, slope, budget, evidence)

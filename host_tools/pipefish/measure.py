@@ -39,7 +39,7 @@ TRACK_WALK_PX = 0.3
 # of a window of 21 px is 37; 70 to 90 were found, of a tracker that corrects for it 25. For the rest vision's word
 # counts less: scatter of the diameter in concrete and brick with 0.3 px 0.10 and 0.88 %, with 0.5 px 0.07 and
 # 0.09 %, with 0.8 px 0.06 and 0.10 %.
-TRACK_SAG_PX2 = 50.0
+TRACK_SAG_PX2 = 100.0
 TRACK_FLOOR_PX = 0.5
 # A check of the profile asks for drifts beside the lens's own ripples, not for a scale that holds along the pipe: of
 # these sigmas it takes so much, 0.3 px and 0.18 px a radian. By their errors alone tracks of drawn brick and concrete

@@ -470,7 +470,7 @@ def fitted_camera(scene: Scene) -> Any:
     seen, ok = scene.project(0, (points - pose[:, 3]) @ pose[:, :3])
     found, within = camera.project(points)
     off = (seen - found)[ok & within]
-    return dataclasses.replace(camera, rms_px=float(np.sqrt(np.mean(off**2))))
+    return dataclasses.replace(camera, rms_px=float(np.sqrt(np.mean((off**2).sum(axis=1)))))
 
 
 def scene_key(name: str) -> dict[str, Any]:

@@ -303,7 +303,8 @@ def reconstruct(
     threads    None: all cores; the result is the same for any number
     still      px: frames in which tracks moved less (median) are not used
     sag_sigma  px^2, above 0: tracks have a common sag that is not known, as those of a tracker with a window have in a
-               tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md)
+               tube: it follows the mean motion over the window, not its middle's (docs/reconstruction.md). Half of it
+               for what differs around the picture
     hold_camera   the camera stays as it is, and its covariance is propagated as it is: no tracks sharpen it
     drift      names of the camera's parameters, their covariance, as wide as they may have changed since it was
                calibrated, and a factor on the noise of the tracks: the adjustment is then made once more with them

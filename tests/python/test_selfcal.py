@@ -276,6 +276,21 @@ def test_the_check_asks_for_no_second_reconstruction(monkeypatch):
     assert wider.alpha_sigma > 2 * alone.alpha_sigma and wider.verdict == "cannot tell"
 
 
+@pytest.mark.parametrize("radius", [0.075, 0.3])
+def test_the_nearer_a_wall_the_more_a_pupil_shift_changes_its_diameter(radius):
+    """Against the diameter that a central profile measures through a lens whose pupil moves."""
+    shift, angles, phi = 1e-4, np.radians([40, 80]), np.linspace(0, 6, 20)[:, None]
+    ahead = radius / np.tan(angles)
+    points = np.stack(np.broadcast_arrays(radius * np.cos(phi), radius * np.sin(phi), ahead), -1).reshape(-1, 3)
+    pixels = fisheye(100, pupil_e1=shift).project(points)[0]
+    rays = fisheye(100).unproject(pixels)[0].reshape(20, 2, 3)
+    cot = rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
+    measured = (ahead[0] - ahead[1]) / (cot[:, 0] - cot[:, 1])
+    tracks = pf.Tracks(np.tile([0, 1], 20), np.repeat(np.arange(20), 2), pixels)
+    slope = health._diameter_slope(fisheye(100), tracks, radius)[health.FREE.index("pupil_e1")]
+    assert slope == pytest.approx(-np.log(np.mean(measured) / radius) / shift, rel=0.01)
+
+
 def test_chi2_tail_against_tables():
     for value, degrees, tail in ((3.841, 1, 0.05), (5.991, 2, 0.05), (7.815, 3, 0.05), (13.277, 4, 0.01)):
         assert _chi2_tail(value, degrees) == pytest.approx(tail, rel=2e-3)

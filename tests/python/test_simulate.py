@@ -207,9 +207,9 @@ def test_lens_is_outside_the_model_family_but_close_to_it(tmp_path: Path) -> Non
     # A wave of 0.1 px that grows to the rim has an rms of 0.1 / sqrt(10) px; a polynomial follows little of it.
     alone = fitted_camera(Scene.load("tiny", {"lens.asymmetry": []})).rms_px
     assert 0.015 < alone < 0.035
-    # Of the harmonic h, over the picture and an axis: (radial^2 + tangential^2) / 4 / (h + 2).
+    # Of the harmonic h, over the picture: (radial^2 + tangential^2) / 2 / (h + 2).
     lens = Scene.load("tiny").spec["lens"]["asymmetry"]
-    waves = [(h["radial_px"] ** 2 + h["tangential_px"] ** 2) / 4 / (h["harmonic"] + 2) for h in lens]
+    waves = [(h["radial_px"] ** 2 + h["tangential_px"] ** 2) / 2 / (h["harmonic"] + 2) for h in lens]
     assert profile["rms_px"] == pytest.approx(math.sqrt(alone**2 + sum(waves)), rel=0.05)
     lens = Scene.load("demo").lens()
     theta, pupil = np.array(lens["theta"]), np.array(lens["pupil_m"])

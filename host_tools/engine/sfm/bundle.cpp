@@ -235,6 +235,9 @@ private:
     bool measures_pupil() const { return options_.odometry && original_.pupil_e1 != 0.0; }
     double yardstick() const { return measures_pupil() ? 1.0 + state_.wheel : 1.0; }
 
+    // One over the sigmas of the sag's parts.
+    Vector3d sag_root() const { return Vector3d(1.0, 2.0, 2.0) / options_.sag_sigma; }
+
     bool rolls() const { return !moment_.empty(); }
     double share_at(size_t k) const { return rolls() ? state_.late * moment_[k].share : 0.0; }
 
@@ -414,7 +417,7 @@ private:
             }
         }
         if (sag_at_ >= 0) {
-            sum += (state_.sag / options_.sag_sigma).squaredNorm();
+            sum += sag_root().cwiseProduct(state_.sag).squaredNorm();
         }
         if (late_at_ >= 0) {
             sum += std::pow((state_.late - 1.0) / options_.late_sigma, 2);
@@ -454,8 +457,8 @@ private:
         }
         if (sag_at_ >= 0) {
             RowsX j = RowsX::Zero(3, border_);
-            j.middleCols<3>(sag_at_) = Matrix3d::Identity() / options_.sag_sigma;
-            const Vector3d r = state_.sag / options_.sag_sigma;
+            j.middleCols<3>(sag_at_) = sag_root().asDiagonal();
+            const Vector3d r = sag_root().cwiseProduct(state_.sag);
             sink.add(3, r.data(), plain, nullptr, {}, {}, j.data());
         }
         if (late_at_ >= 0) {

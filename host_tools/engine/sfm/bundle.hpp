@@ -60,7 +60,8 @@ struct BundleOptions {
     const Odometry *odometry = nullptr;
     const Gravity *gravity = nullptr;
     const CameraPrior *camera_prior = nullptr;
-    double sag_sigma = 0.0;  // px^2, of each part of the tracks' common sag (tracks.hpp), about 0; 0: there is none
+    double sag_sigma = 0.0;  // px^2, of the tracks' common sag all around alike (tracks.hpp), about 0, and half of
+                             // it of its other parts; 0: there is none
     double late_sigma = 0.0; // of the line time as a share of the stated one, about 1; 0: it is as stated
     const std::vector<int> *only =
         nullptr; // places of the observations to use, as BundleReport::used; null: by the gate
