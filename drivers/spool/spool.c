@@ -80,6 +80,7 @@ typedef struct spool {
     char *path;
     bool is_damaged; /* SQLite has found the file to be, and it is to be replaced */
     bool is_read_only;
+    int64_t highest; /* row given or shown to anybody */
     pf_spool_stats stats;
     pf_failure failure;
 } spool;
@@ -258,6 +259,18 @@ static pf_status open_database(spool *s)
     return status;
 }
 
+/* The row of an object that could not be saved may be held by somebody, who will remove it: it is given to no other. */
+static pf_status go_on_after(spool *s)
+{
+    char text[256];
+    (void)snprintf(text, sizeof text,
+                   "INSERT INTO sqlite_sequence (name, seq) SELECT 'object', 0 WHERE NOT EXISTS "
+                   "(SELECT 1 FROM sqlite_sequence WHERE name = 'object'); "
+                   "UPDATE sqlite_sequence SET seq = max(seq, %" PRId64 ") WHERE name = 'object'",
+                   s->highest);
+    return sqlite3_exec(s->db, text, NULL, NULL, NULL) == SQLITE_OK ? PF_OK : fail_sqlite(s, "opening");
+}
+
 /* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
  * some need not know. A file that cannot be set aside stays in use; without a new one every call tries again (enter).
  */
@@ -276,10 +289,12 @@ static pf_status heal(spool *s)
         return status;
     }
     s->stats.objects = pf_spool_salvage(s->db, aside);
+    status = go_on_after(s);
     (void)pf_fail(&s->failure, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", s->path,
                   s->stats.objects, aside);
     int64_t bytes = 0;
-    status = ask(s, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
+    if (status == PF_OK)
+        status = ask(s, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
     s->stats.bytes = (uint64_t)bytes;
     s->stats.healed++;
     return status;
@@ -363,7 +378,8 @@ static pf_status insert(spool *s, const object *o, uint64_t freed, bool *stored)
     if (!run(s, SQL_PUT))
         return fail_call(s, "storing");
     *stored = true;
-    return o->rank == NULL ? PF_OK : set_rank(s, sqlite3_last_insert_rowid(s->db), o->rank);
+    s->highest = sqlite3_last_insert_rowid(s->db);
+    return o->rank == NULL ? PF_OK : set_rank(s, s->highest, o->rank);
 }
 
 static pf_status set_value(spool *s, const char *key, const void *bytes, size_t n)
@@ -517,6 +533,7 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
     int code = sqlite3_step(q);
     if (code == SQLITE_ROW && sqlite3_column_bytes(q, 2) == 32) {
         item->row = (uint64_t)sqlite3_column_int64(q, 0);
+        s->highest = (int64_t)item->row > s->highest ? (int64_t)item->row : s->highest;
         item->kind = (uint32_t)sqlite3_column_int64(q, 1);
         memcpy(item->name, sqlite3_column_blob(q, 2), 32);
         item->size = (uint32_t)sqlite3_column_int64(q, 3);

@@ -337,6 +337,30 @@ static void test_damage_found_in_use_is_healed(void)
     TEST_ASSERT_TRUE(count_whole() >= 4);
 }
 
+/* Proves: the row of an object that was lost with its page, which a courier may still hold, is given to no other: its
+ * acknowledgement would remove that. */
+static void test_rows_of_lost_objects_are_not_given_again(void)
+{
+    enum { COUNT = 80 }; /* more than SQLite keeps in memory */
+    pf_spool_item item = {0};
+    struct stat file;
+    open_spool("rows.db", 0);
+    for (uint64_t id = 1; id <= COUNT; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    close_spool();
+    open_spool("rows.db", 0);
+    sift(); /* somebody holds them */
+    TEST_ASSERT_EQUAL_INT(0, stat(temporary_path("rows.db"), &file));
+    for (long at = 4096; at + 4096 <= file.st_size; at += 4096)
+        damage(temporary_path("rows.db"), at, 4096);
+    for (int i = 0; i < 3 && stats().healed == 0; i++)
+        (void)spool.ops->next(spool.self, 0, &item);
+    TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
+    TEST_ASSERT_EQUAL_INT(PF_OK, put(COUNT + 1));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
+    TEST_ASSERT_TRUE(item.row > COUNT);
+}
+
 /* ---- a medium that refuses: SQLite's own way to put other system calls in place */
 
 static int refuse_with;  /* errno of every write; 0 = none fails */
@@ -573,6 +597,7 @@ int main(int argc, char **argv)
     RUN_TEST(test_damaged_spool_never_gives_wrong_bytes);
     RUN_TEST(test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved);
     RUN_TEST(test_damage_found_in_use_is_healed);
+    RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_full_medium);
     RUN_TEST(test_killed_at_every_write_nothing_acknowledged_is_lost);
     RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);

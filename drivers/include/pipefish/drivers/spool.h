@@ -38,8 +38,8 @@ typedef struct pf_spool_victim {
 
 typedef struct pf_spool_ops {
     /* Stores durably: on PF_OK the object outlives a power cut. The same name twice is stored once (PF_OK).
-     * PF_ERR_SPACE (quota or disk full, or the medium read-only: later it may fit), PF_ERR_IO, PF_ERR_ARGUMENT (no bytes, or more than the
-     * quota: never). */
+     * PF_ERR_SPACE (quota or disk full, or the medium read-only: later it may fit), PF_ERR_IO, PF_ERR_ARGUMENT (no
+     * bytes, or more than the quota: never). */
     pf_status (*put)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n);
 
     /* The first item with row > after, oldest first. PF_OK, PF_ERR_END (no more), PF_ERR_IO. */
@@ -86,8 +86,8 @@ typedef struct pf_spool_config {
 
 /* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
  * new one begun with every object that can still be read: under its row, but never to make room for others. Anybody
- * else's file is refused. A medium that is read-only gives what is there, takes and removes nothing, and is asked at each
- * call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
+ * else's file is refused. A medium that is read-only gives what is there, takes and removes nothing, and is asked at
+ * each call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
  * PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
