@@ -200,7 +200,9 @@ def self_calibrate(
 def _status(found: dict[str, Any]) -> str:
     states = [p["status"] for p in found["pairs"]]
     if not found["found"]:
-        return "standing" if "standing" in states else "no_matches"
+        if "standing" in states:
+            return "standing"
+        return "low_coverage" if 0 < found["area"] < AREA_LEAST else "no_matches"
     if found["area"] < AREA_LEAST:
         return "low_coverage"
     # Ahead in a straight pipe one radius maps to another, as before a wall: that the camera never tilted comes first.

@@ -52,6 +52,14 @@ def test_poses_are_those_of_the_pairs():
     assert found.pairs[0].pose[:, 3] @ true[:, 3] / np.linalg.norm(true[:, 3]) > 0.999
 
 
+@pytest.mark.parametrize(("seed", "kind"), [(10_174, "fisheye"), (10_191, "mirror")])
+def test_a_patch_too_small_for_any_motion_to_be_found_is_told_as_such(seed: int, kind: str):
+    """Wrong matches lie all over the second picture: the first one's span is what the right ones can have at most."""
+    setup = make_setup(seed, kind, "low_coverage")
+    found = self_calibrate(setup.pairs, (setup.lens.width, setup.lens.height))
+    assert found.status == "low_coverage" and "10 % are needed" in found.reason
+
+
 @pytest.mark.parametrize("case", DEGENERATE)
 def test_what_cannot_be_seen_is_refused_with_its_reason(case):
     for seed, kind in enumerate(("perspective", "fisheye")):

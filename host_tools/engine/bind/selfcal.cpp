@@ -62,6 +62,22 @@ Eigen::Matrix<double, 7, 7> profile_covariance(const selfcal::Result &found)
     return slope * found.covariance * slope.transpose();
 }
 
+// Pixels: what the matches of a pair span in the picture in which they span less, the largest of all pairs. Those that
+// are right span no more, wherever the wrong ones lie in the other picture.
+double span_of(const std::vector<selfcal::Pair> &pairs)
+{
+    double most = 0.0;
+    for (const selfcal::Pair &pair : pairs) {
+        std::vector<Eigen::Vector2d> one, two;
+        for (size_t i = 0; i < pair.size(); i++) {
+            one.push_back(pair.one(i));
+            two.push_back(pair.two(i));
+        }
+        most = one.empty() ? most : std::max(most, std::min(selfcal::hull_area(one), selfcal::hull_area(two)));
+    }
+    return most;
+}
+
 nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixels> &second, uint32_t width,
                         uint32_t height, double c_u, double c_v, double centre_sigma, double bend, double alpha_limit,
                         double alone_limit, double sigma_least, uint64_t seed, int threads)
@@ -98,6 +114,7 @@ nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixe
     out["agreeing"] = found.agreeing;
     out["runner_up"] = found.runner_up;
     if (!found.found) {
+        out["area"] = span_of(pairs) / (static_cast<double>(width) * height);
         return out;
     }
     const pf_camera &c = found.camera;

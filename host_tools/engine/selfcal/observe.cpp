@@ -45,7 +45,8 @@ double quantile(std::vector<double> values, double share)
     return values[place];
 }
 
-// Area of the convex hull (Andrew's chain) of the points, the twentieth farthest from the median left out.
+} // namespace
+
 double hull_area(std::vector<Eigen::Vector2d> points)
 {
     std::vector<double> x, y, far;
@@ -86,6 +87,9 @@ double hull_area(std::vector<Eigen::Vector2d> points)
     }
     return 0.5 * std::abs(twice);
 }
+
+namespace
+{
 
 std::vector<Eigen::Vector2d> disc(const Eigen::Vector2d &centre, double radius)
 {

@@ -20,6 +20,9 @@ struct Observability {
     double needed = 0.0;        // radians: the least tilt among 5, 10, .. 45 degrees that would do; 0: none would
 };
 
+// Area of the convex hull (Andrew's chain) of the points, the twentieth farthest from the median left out.
+double hull_area(std::vector<Eigen::Vector2d> points);
+
 // The covered field and all that follows from the covariance. `limit`: what alpha_sigma may be.
 // `alone_limit`: what alpha_alone may be. `needed` is looked for where one of them is beyond.
 Observability observe(const Adjustment &at, const LensMatrix &covariance, double limit, double alone_limit);
