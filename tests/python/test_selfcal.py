@@ -221,9 +221,9 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
 
 @pytest.mark.parametrize("case", ["bend", "radius"])
 def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
-    assert health_of(1, case, "", density=300.0, length=3.0)["verdict"] == "profile still valid"
+    assert health_of(1, case, "", density=300.0, length=5.0)["verdict"] == "profile still valid"
     for change, name, size in (("scale", "angle scale", -1.0), ("centre", "centre u", -3.0)):
-        found = health_of(1, case, change, density=300.0, length=3.0)
+        found = health_of(1, case, change, density=300.0, length=5.0)
         assert found["verdict"] == "drifted, recalibrate"
         value, sigma = found["changes"][name]
         assert abs(value - size) < 4 * sigma
@@ -232,7 +232,7 @@ def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
 @pytest.mark.parametrize("change", ["", "alpha"])
 def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius(change):
     """Turns that noise feigns would leave sigma(alpha) at a few per cent: they count for nothing."""
-    found = health_of(3, "straight", change, density=300.0, length=3.0)
+    found = health_of(3, "straight", change, density=300.0, length=5.0)
     assert found["verdict"] == "cannot tell"
     assert found["alpha_sigma"] == math.inf
 
