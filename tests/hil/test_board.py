@@ -296,19 +296,21 @@ def plug_usb_camera(board, port: int) -> None:
     board.run(f"printf '{script}' > /run/attach; chmod +x /run/attach; nc 10.0.2.2 {port} -e /run/attach")
 
 
-def see_vimc(survey, daemon: str, name: str) -> None:
-    """The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours."""
+def see_vimc(survey, daemon: str, name: str, least: int, tracks: int) -> None:
+    """The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours. `least` frames
+    come, and more than `tracks` tracks."""
     board = survey.board
     vimc = "camera.driver=libcamera camera.device=vimc camera.width=318 camera.height=240"
     extra = f"spool.path=/run/{name}.db daemon.status_file=/run/status.json status.interval_ms=100 daemon.drain_s=0"
     flags = " ".join(f"--set {setting}" for setting in f"{vimc} {extra}".split())
     process = board.spawn(f": > /run/vimc.ini; exec {daemon} --config /run/vimc.ini {flags}", f"{name}.log")
-    survey.wait_until(frames(10), f"frames of vimc through {name}")
+    survey.wait_until(frames(least), f"frames of vimc through {name}")
     status = board.status()
-    assert status["tracks_live"] > 20 and status["camera"]["bad_stamps"] == 0, status
+    assert status["tracks_live"] > tracks and status["camera"]["bad_stamps"] == 0, status
     assert name.replace("-", " v") in (board.share / f"{name}.log").read_text(), "another libcamera than it should be"
-    board.run(f"kill {process}; rm /run/status.json")
+    board.run(f"kill {process}")
     board.wait(process)
+    board.run("rm /run/status.json")  # now: at its end a daemon writes it once more
 
 
 def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
@@ -318,9 +320,11 @@ def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
     board = survey.board
     board.run("/lib/systemd/systemd-udevd --daemon 2>/dev/null; modprobe vimc; modprobe vhci-hcd; modprobe uvcvideo")
     board.run("modprobe vhci-node; udevadm trigger -s media -s video4linux; udevadm settle")
-    see_vimc(survey, "/mnt/pipefishd", "libcamera-0.0.3")
+    see_vimc(survey, "/mnt/pipefishd", "libcamera-0.0.3", 10, 20)
     if board.bring_newer_libcamera():
-        see_vimc(survey, "sh /mnt/newer/run", "libcamera-0.3")
+        # It has the kernel draw 1920 x 1080 and scale that: seconds a frame here, so that the stream counts as stalled
+        # and is started anew after each.
+        see_vimc(survey, "sh /mnt/newer/run", "libcamera-0.3", 1, 0)
     # A USB camera, plugged in after the daemon has started, unplugged, and silent for longer than a stream may be.
     pixels = [survey.recording.frames[name] for name in survey.recording.order]
     usb_camera = UsbCamera(pixels, 320, 240, 30)
@@ -332,7 +336,7 @@ def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
         plug_usb_camera(board, usb_camera.port)
         survey.wait_until(frames(8), "8 frames")
         board.run(f"echo 0 > {VHCI}/detach")
-        survey.wait_for("no camera")
+        survey.wait_for("has gone")  # not the one that was not there yet
         plug_usb_camera(board, usb_camera.port)
         survey.wait_for("the camera is there")
         usb_camera.wait(120)
