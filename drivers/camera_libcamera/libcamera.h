@@ -8,7 +8,7 @@
 extern "C" {
 #endif
 
-/* PF_OK, PF_ERR_IO; PF_ERR_UNSUPPORTED where this was built without it. */
+/* PF_OK, PF_ERR_SPACE; PF_ERR_UNSUPPORTED where this was built without it. */
 pf_status pf_session_libcamera(pf_session_io *io, pf_failure *failure);
 
 #ifdef __cplusplus

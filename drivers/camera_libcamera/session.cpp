@@ -8,6 +8,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <ctime>
 #include <deque>
@@ -79,7 +80,6 @@ struct Kept {
 class Session
 {
 public:
-    bool begin(pf_failure *failure);
     pf_status open(const pf_session_wish &wish, pf_session_info &info, pf_failure *failure);
     pf_status start(pf_failure *failure);
     void stop();
@@ -91,7 +91,9 @@ public:
     void close();
 
 private:
+    pf_status begin(pf_failure *failure);
     std::shared_ptr<Camera> find(const std::string &device);
+    pf_status acquire(const std::string &device, pf_failure *failure);
     pf_status configure(const pf_session_wish &wish, pf_session_info &info, pf_failure *failure);
     pf_status mapBuffers(pf_failure *failure);
     void describeControls(const pf_session_wish &wish, pf_session_info &info);
@@ -103,9 +105,11 @@ private:
         return camera_->controls().find(control.id()) != camera_->controls().end();
     }
 
-    CameraManager manager_;
+    /* Only while a camera is open: a manager keeps what it learnt of a device that has gone, and follows a dangling
+     * pointer when the next of the same number announces its video node before its media node (seen in 0.0.3). */
+    std::unique_ptr<CameraManager> manager_;
     std::shared_ptr<Camera> camera_;
-    bool isAcquired_ = false, isRunning_ = false, hasTime_ = false, hasGain_ = false;
+    bool isRunning_ = false, hasTime_ = false, hasGain_ = false;
     std::string id_;
     std::unique_ptr<CameraConfiguration> configuration_;
     Stream *stream_ = nullptr;
@@ -120,21 +124,42 @@ private:
     bool isGone_ = false;
 };
 
-bool Session::begin(pf_failure *failure)
+pf_status Session::begin(pf_failure *failure)
 {
-    int error = manager_.start();
+    manager_ = std::make_unique<CameraManager>();
+    int error = manager_->start();
     if (error != 0)
-        (void)pf_fail(failure, PF_ERR_IO, "libcamera %s: does not start: %s", CameraManager::version().c_str(),
-                      std::strerror(-error));
-    return error == 0;
+        return pf_fail(failure, PF_ERR_IO, "libcamera %s: does not start: %s", CameraManager::version().c_str(),
+                       std::strerror(-error));
+    /* Once is enough of what it says of itself: without a camera it is started four times a second. */
+    if (std::getenv("LIBCAMERA_LOG_LEVELS") == nullptr)
+        (void)logSetLevel("Camera", "WARN");
+    return PF_OK;
 }
 
 std::shared_ptr<Camera> Session::find(const std::string &device)
 {
-    for (const std::shared_ptr<Camera> &camera : manager_.cameras())
+    for (const std::shared_ptr<Camera> &camera : manager_->cameras())
         if (camera->id().find(device) != std::string::npos)
             return camera;
     return nullptr;
+}
+
+pf_status Session::acquire(const std::string &device, pf_failure *failure)
+{
+    std::shared_ptr<Camera> camera = find(device);
+    if (!camera)
+        return pf_fail(failure, PF_ERR_AGAIN, "libcamera: no camera%s%s", device.empty() ? "" : " ", device.c_str());
+    id_ = camera->id();
+    int error = camera->acquire();
+    if (error != 0)
+        return pf_fail(failure, error == -ENODEV ? PF_ERR_AGAIN : PF_ERR_IO, "%s: %s", id_.c_str(),
+                       std::strerror(-error));
+    camera_ = std::move(camera);
+    isGone_ = false;
+    camera_->requestCompleted.connect(this, &Session::onCompleted);
+    camera_->disconnected.connect(this, &Session::onDisconnected);
+    return PF_OK;
 }
 
 pf_status Session::configure(const pf_session_wish &wish, pf_session_info &info, pf_failure *failure)
@@ -244,22 +269,13 @@ void Session::describeControls(const pf_session_wish &wish, pf_session_info &inf
 
 pf_status Session::open(const pf_session_wish &wish, pf_session_info &info, pf_failure *failure)
 {
-    camera_ = find(wish.device);
-    if (!camera_)
-        return pf_fail(failure, PF_ERR_AGAIN, "libcamera: no camera%s%s", wish.device[0] ? " " : "", wish.device);
-    id_ = camera_->id();
-    int error = camera_->acquire();
-    if (error != 0) {
-        camera_.reset();
-        return pf_fail(failure, error == -ENODEV ? PF_ERR_AGAIN : PF_ERR_IO, "%s: %s", id_.c_str(),
-                       std::strerror(-error));
+    pf_status status = begin(failure);
+    if (status == PF_OK)
+        status = acquire(wish.device, failure);
+    if (status == PF_OK) {
+        (void)std::snprintf(info.id, sizeof info.id, "%s", id_.c_str());
+        status = configure(wish, info, failure);
     }
-    isAcquired_ = true;
-    isGone_ = false;
-    camera_->requestCompleted.connect(this, &Session::onCompleted);
-    camera_->disconnected.connect(this, &Session::onDisconnected);
-    (void)std::snprintf(info.id, sizeof info.id, "%s", id_.c_str());
-    pf_status status = configure(wish, info, failure);
     if (status == PF_OK)
         status = mapBuffers(failure);
     if (status != PF_OK) {
@@ -423,7 +439,7 @@ void Session::drop(uint8_t *pixels)
 void Session::close()
 {
     stop();
-    if (isAcquired_) {
+    if (camera_) {
         camera_->requestCompleted.disconnect(this);
         camera_->disconnected.disconnect(this);
     }
@@ -434,10 +450,10 @@ void Session::close()
     filled_.clear();
     allocator_.reset();
     configuration_.reset();
-    if (isAcquired_)
+    if (camera_)
         (void)camera_->release();
-    isAcquired_ = false;
     camera_.reset();
+    manager_.reset();
 }
 
 /* ---- as pf_session_io */
@@ -474,10 +490,6 @@ pf_status pf_session_libcamera(pf_session_io *io, pf_failure *failure)
     auto *session = new (std::nothrow) Session;
     if (session == nullptr)
         return pf_fail(failure, PF_ERR_SPACE, "libcamera: no memory");
-    if (!session->begin(failure)) {
-        delete session;
-        return PF_ERR_IO;
-    }
     *io = TEMPLATE;
     io->self = session;
     return PF_OK;

@@ -184,7 +184,8 @@ class Crawl:
         start, timeout = time.monotonic(), timeout * self.patience
         while not condition(self.board.status()):
             if time.monotonic() - start > timeout:
-                raise AssertionError(f"not seen: {what}: {self.board.status()}\n{self.board.logs()}")
+                ended = "" if self.board.is_running(self.daemon) else " (the daemon has ended)"
+                raise AssertionError(f"not seen: {what}{ended}: {self.board.status()}\n{self.board.logs()}")
             time.sleep(0.1)
         return time.monotonic() - start
 

@@ -296,6 +296,12 @@ def plug_usb_camera(board, port: int) -> None:
     board.run(f"printf '{script}' > /run/attach; chmod +x /run/attach; nc 10.0.2.2 {port} -e /run/attach")
 
 
+def announce_late(board, subsystem: str) -> None:
+    """udev holds back what it announces of new devices of a subsystem: `media` or `video4linux`."""
+    rule = f'ACTION=="add", SUBSYSTEM=="{subsystem}", PROGRAM="/bin/sleep 0.5"'
+    board.run(f"mkdir -p /run/udev/rules.d; echo '{rule}' > /run/udev/rules.d/99-late.rules; udevadm control --reload")
+
+
 def see_vimc(survey, daemon: str, name: str, least: int, tracks: int) -> None:
     """The kernel's virtual camera, whose pipeline libcamera puts together: a test pattern in colours. `least` frames
     come, and more than `tracks` tracks."""
@@ -304,9 +310,9 @@ def see_vimc(survey, daemon: str, name: str, least: int, tracks: int) -> None:
     extra = f"spool.path=/run/{name}.db daemon.status_file=/run/status.json status.interval_ms=100 daemon.drain_s=0"
     flags = " ".join(f"--set {setting}" for setting in f"{vimc} {extra}".split())
     process = board.spawn(f": > /run/vimc.ini; exec {daemon} --config /run/vimc.ini {flags}", f"{name}.log")
-    survey.wait_until(frames(least), f"frames of vimc through {name}")
-    status = board.status()
-    assert status["tracks_live"] > tracks and status["camera"]["bad_stamps"] == 0, status
+    has_come = frames(least)
+    survey.wait_until(lambda s: has_come(s) and s["tracks_live"] > tracks, f"tracks of vimc through {name}")
+    assert board.status()["camera"]["bad_stamps"] == 0
     assert name.replace("-", " v") in (board.share / f"{name}.log").read_text(), "another libcamera than it should be"
     board.run(f"kill {process}")
     board.wait(process)
@@ -332,21 +338,26 @@ def test_cameras_of_libcamera_are_unplugged_and_stall(crawl, note):
         survey.start_receiver(usb(survey))
         survey.start_daemon()
         survey.wait_for("begins")
-        usb_camera.show(0, 15, RATE)
+        usb_camera.play(RATE)
+        # Its two nodes are announced in this order and then in the other: that is the case libcamera itself falls over.
+        announce_late(board, "video4linux")
         plug_usb_camera(board, usb_camera.port)
         survey.wait_until(frames(8), "8 frames")
         board.run(f"echo 0 > {VHCI}/detach")
         survey.wait_for("has gone")  # not the one that was not there yet
+        before = board.status()["frames"]
+        announce_late(board, "media")
         plug_usb_camera(board, usb_camera.port)
-        survey.wait_for("the camera is there")
-        usb_camera.wait(120)
-        survey.wait_until(lambda s: s["camera"]["restarts"] >= 1, "a restart of the silent stream")
+        survey.wait_until(frames(before + 4), "frames after it was plugged in again")
+        usb_camera.hush()
+        before = board.status()["camera"]["restarts"]
+        survey.wait_until(lambda s: s["camera"]["restarts"] > before, "a restart of the silent stream")
         before = board.status()["frames"]
         start = time.monotonic()
-        usb_camera.show(15, 25, RATE)
-        survey.wait_until(frames(before + 1), "frames again")
+        usb_camera.play(RATE)
+        survey.wait_until(frames(before + 4), "frames again")
         recovery = time.monotonic() - start
-        usb_camera.wait(120)
+        usb_camera.hush()
         result = end(survey, note, "libcamera: unplugged, stalled", recovery)
     finally:
         usb_camera.close()

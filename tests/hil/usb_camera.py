@@ -28,7 +28,7 @@ def descriptor(kind: int, *fields: bytes) -> bytes:
 
 
 class UsbCamera:
-    """Serves one board at a time on a port of this machine; frames are given with show()."""
+    """Serves one board at a time on a port of this machine; its frames are seen while it plays."""
 
     def __init__(self, frames: list[bytes], width: int, height: int, rate: int) -> None:
         self.frames, self.width, self.height = frames, width, height
@@ -36,27 +36,26 @@ class UsbCamera:
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = self._server.getsockname()[1]
         self._changed = threading.Condition()
-        self._due: deque[tuple[float, int]] = deque()  # moment, number of the frame
+        self._period: float | None = None  # seconds from one frame to the next, None: no more
+        self._next = 0  # frame
         self._transfers: deque[tuple[int, int]] = deque()  # that wait for pixels: sequence number, length
         self._stream = 0  # of which start of the stream a frame is part
         self._line: socket.socket | None = None
         self._sending = threading.Lock()
         self._over = False
-        self.shown = 0
         for work in (self._serve, self._feed):
             threading.Thread(target=work, daemon=True).start()
 
-    def show(self, first: int, count: int, rate: float) -> None:
-        """Begins to show frames; they wait for a stream if there is none."""
-        now = time.monotonic()
+    def play(self, rate: float) -> None:
+        """Shows the frames from now on, one after the other and over and over, `rate` a second, to whoever streams."""
         with self._changed:
-            self._due.extend((now + i / rate, first + i) for i in range(count))
+            self._period = 1 / rate
             self._changed.notify_all()
 
-    def wait(self, timeout: float) -> None:
-        """Until everything has been shown."""
+    def hush(self) -> None:
+        """Plugged in, but shows nothing more."""
         with self._changed:
-            assert self._changed.wait_for(lambda: not self._due, timeout), f"{len(self._due)} frames were not fetched"
+            self._period = None
 
     def close(self) -> None:
         with self._changed:
@@ -198,16 +197,17 @@ class UsbCamera:
             return None if self._over or self._stream != stream else self._transfers.popleft()
 
     def _feed(self) -> None:
-        toggle = 0
+        toggle, due = 0, 0.0
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._over or (self._due and self._transfers))
+                self._changed.wait_for(lambda: self._over or (self._period is not None and self._transfers))
                 if self._over:
                     return
-                moment, frame = self._due[0]
-                stream = self._stream
-            time.sleep(max(0.0, moment - time.monotonic()))
-            pixels, at = self.frames[frame], 0
+                period, stream = self._period, self._stream
+            now = time.monotonic()
+            due = max(due + period, now)
+            time.sleep(due - now)
+            pixels, at = self.frames[self._next % len(self.frames)], 0
             while at < len(pixels) and (transfer := self._transfer(stream)):
                 number, length = transfer
                 part = pixels[at : at + min(length, PAYLOAD) - 2]
@@ -216,10 +216,5 @@ class UsbCamera:
                 with contextlib.suppress(OSError):
                     self._reply(number, 0, bytes([2, flags]) + part)
             toggle ^= 1
-            if at == 0:  # nothing of it has left: it is for the next stream
-                continue
-            with self._changed:
-                if self._due and self._due[0][1] == frame:
-                    self._due.popleft()
-                self.shown += 1
-                self._changed.notify_all()
+            if at > 0:  # else it is for the next stream
+                self._next += 1
