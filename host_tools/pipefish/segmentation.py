@@ -37,6 +37,7 @@ class Layer:
                    against it, as where there is no texture
     ambiguous1     share of its pixels whose place in picture 2 is another layer's
     groups         of group_matches it was made from
+    claimed        how many matches of no group it took; each fourth was asked
     """
 
     flow1: Floats32
@@ -60,6 +61,7 @@ class Layer:
     ambiguous1: float
     ambiguous2: float
     groups: list[int]
+    claimed: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ def document(s: Segmentation) -> dict[str, Any]:
     """For JSON: status, layers, energies."""
     names = ("area", "sigma", "zncc", "folds", "low_evidence", "ambiguous")
     layers = [
-        {"label": k, "groups": layer.groups}
+        {"label": k, "groups": layer.groups, "claimed": layer.claimed}
         | {f"{name}{p}": round(_side(layer, name, p), 5) for name in names for p in (1, 2)}
         for k, layer in enumerate(s.layers, 1)
     ]

@@ -159,6 +159,16 @@ def make_pair(
     return Pair((images[0], images[1]), (labels[0], labels[1]), flow.reshape(*shape, 2), light.reshape(shape))
 
 
+def make_wave(seed: int, period: float, height: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Two pictures (120,160,3) of one surface, rippled in picture 1 by waves of `period` and `height` pixels along both
+    axes; and where each of its pixels is in picture 2, (120,160,2)."""
+    y, x = (v.ravel() for v in np.mgrid[:120, :160].astype(float))
+    to = np.stack([x + height * np.sin(2 * np.pi * y / period), y + height * np.sin(2 * np.pi * x / period)], axis=1)
+    texture, noise = _colour(seed, 256), np.random.default_rng(seed)
+    pictures = [_at(texture, *(20 + at).T).reshape(120, 160, 3) for at in (to, np.stack([x, y], axis=1))]
+    return [np.clip(p + noise.normal(0, 0.005, p.shape), 0, 1) for p in pictures], to.reshape(120, 160, 2)
+
+
 def paired(found: np.ndarray, truth: np.ndarray) -> dict[int, int]:
     """For each label of the truth the found one that covers most of it; 0 if none."""
     out = {}
@@ -247,6 +257,24 @@ def round_trips(s: Segmentation) -> np.ndarray:
         distance = np.hypot(*(back - np.stack([x, y], axis=1)).T)
         out.append(np.where(np.isnan(distance), np.inf, distance))
     return np.concatenate(out)
+
+
+def smallest_piece(labels: np.ndarray) -> int:
+    """Pixels of the smallest piece of one label, its corners touching."""
+    left = np.pad(labels.astype(int), 1, constant_values=-1)
+    least = labels.size
+    while (left >= 0).any():
+        start = np.unravel_index(int((left >= 0).argmax()), left.shape)
+        label, front, size = left[start], [start], 1
+        left[start] = -1
+        while front:
+            y, x = front.pop()
+            for q in ((y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
+                if left[q] == label:
+                    left[q], size = -1, size + 1
+                    front.append(q)
+        least = min(least, size)
+    return least
 
 
 def points_in_layers(s: Segmentation, rows: np.ndarray) -> dict:
