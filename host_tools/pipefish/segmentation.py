@@ -71,7 +71,8 @@ class Segmentation:
     labels1, labels2  (H,W) uint8: 0 is the background, what only one picture shows; k is layers[k - 1]
     layers            largest first
     status            "ok", or "no common motion": nothing that both pictures show was found
-    trace             (step, energy in nats, layers) after each step; the energy never rises
+    trace             (step, energy in nats, layers) after each step; the energy never rises. At the steps "grid
+                      halved" and "matches count less" it is defined anew, lower, and nothing else changes
     """
 
     labels1: NDArray[np.uint8]
@@ -128,6 +129,12 @@ def segment_motion(
         m = match_quasi_dense(image1, image2, threads=threads)
     if (m.shape1, m.shape2) != (one.shape[1:], two.shape[1:]):
         raise ArgumentError(f"m: of pictures {m.shape1} and {m.shape2}, not {one.shape[1:]} and {two.shape[1:]}")
+    for xy, image in ((m.xy1, one), (m.xy2, two)):
+        height, width = image.shape[1:]
+        if not ((xy >= -0.5) & (xy <= np.array([width - 0.5, height - 0.5]))).all():  # nor NaN
+            raise ArgumentError(f"m: matches outside of pictures of {width}x{height} pixels")
+    if not (np.isfinite(m.affine).all() and np.isfinite(m.zncc).all()):
+        raise ArgumentError("m: affine maps or correlations that are no finite numbers")
     groups = group_matches(m, least=LEAST)
     options = _engine.SegmentOptions()
     options.layers, options.rounds, options.light, options.threads = layers, rounds, light, threads

@@ -280,21 +280,22 @@ def smallest_piece(labels: np.ndarray) -> int:
 def points_in_layers(s: Segmentation, rows: np.ndarray) -> dict:
     """How labelled pairs of points (x1 y1 1 x2 y2 1 label, 0 is an outlier) lie in layers.
 
-    A pair is in a layer when both its points have its label. recall: share of a motion's pairs in its best layer;
-    purity: share of that motion among the right pairs there; outliers: share of wrong pairs that are in a layer and
-    less than 10 pixels from where it has them; same_layer: without the 10 pixels."""
+    A pair, right or wrong, is in a layer when both its points have its label and the layer's motion carries the one to
+    less than 10 pixels from the other. recall: share of a motion's pairs in its best layer; purity: share of that
+    motion among all pairs there, wrong ones too; outliers: share of wrong pairs that are in a layer; same_layer: share
+    of wrong pairs both of whose points have a layer's label, whatever its motion."""
     one, two, truth = rows[:, :2], rows[:, 3:5], rows[:, -1].astype(int)
     label = _nearest(one, s.labels1).astype(int)
     label[label != _nearest(two, s.labels2)] = 0
-    near = np.zeros(len(rows), bool)
+    wrong = truth == 0
+    same_layer = (label[wrong] > 0).mean()
     for k, layer in enumerate(s.layers, 1):
-        near |= (label == k) & (np.hypot(*(_nearest(one, layer.flow1) - two).T) < 10)
+        label[(label == k) & ~(np.hypot(*(_nearest(one, layer.flow1) - two).T) < 10)] = 0
     motions = []
     for k in range(1, truth.max() + 1):
         counts = np.bincount(label[truth == k], minlength=len(s.layers) + 1)
         counts[0] = 0
         best = int(counts.argmax())
-        right = ((label == best) & (truth > 0)).sum()
-        motions.append({"recall": counts[best] / (truth == k).sum(), "purity": counts[best] / max(right, 1)})
-    wrong = truth == 0
-    return {"motions": motions, "outliers": near[wrong].mean(), "same_layer": (label[wrong] > 0).mean()}
+        own = {"recall": counts[best] / (truth == k).sum(), "purity": counts[best] / max((label == best).sum(), 1)}
+        motions.append(own | {"layer": best if counts[best] else 0})
+    return {"motions": motions, "outliers": (label[wrong] > 0).mean(), "same_layer": same_layer}

@@ -29,7 +29,7 @@ struct Found {
 
 struct Step {
     std::string name;
-    double energy; // nats; never above the one before
+    double energy; // nats; never above the one before, but two steps define it anew, lower
     int layers;
 };
 
