@@ -197,9 +197,10 @@ def real(seed: int) -> Row:
     """A pair of photographs with labelled points."""
     name = REAL[seed]
     images = [np.asarray(Image.open(DATA / name / f"{name}{k}.png").convert("RGB")) for k in (1, 2)]
-    start, cpu = time.perf_counter(), time.process_time()
+    start, cpu, main = time.perf_counter(), time.process_time(), time.thread_time()
     s = pf.segment_motion(*images, threads=2)
     row = {"pair": name, "wall_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
+    row["main_s"] = time.thread_time() - main  # of the thread that also does what only one can: two cores need as much
     found = points_in_layers(s, np.loadtxt(DATA / name / f"{name}.txt"))
     picture(name, images, s)
     row |= {"layers": len(s.layers), "back": float((round_trips(s) <= 1).mean()), "rise": rises(s)}
@@ -221,7 +222,7 @@ def check_real(_: int) -> Iterator[Row]:
         yield at_most(f"segment.{r['pair']}_outliers_by_labels_alone", r["same_layer"], least)
         yield at_least(f"segment.{r['pair']}_overlap_with_outline", min(r["overlap"]), 0.7)
         yield at_least(f"segment.{r['pair']}_round_trip_1px", r["back"], 0.95)
-        yield at_most(f"segment.{r['pair']}_cpu_s_of_two_cores", r["cpu_s"] / 2, 30)
+        yield at_most(f"segment.{r['pair']}_s_on_two_cores", max(r["main_s"], r["cpu_s"] / 2), 30)
 
 
 PICTURES: list[Path] = []

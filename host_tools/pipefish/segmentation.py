@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -117,24 +118,22 @@ def segment_motion(
     one, two = planes(image1, "image1"), planes(image2, "image2")
     if len(one) != len(two):
         raise ArgumentError("image1 and image2: one is grey, the other has colour")
-    for name, value, low, high in (
-        ("layers", layers, 1, 40),
-        ("rounds", rounds, 1, 20),
-        ("light", light, 1e-3, 1e9),
-        ("threads", threads, 1, 1024),
+    for name, value, kind, low, high in (
+        ("layers", layers, Integral, 1, 40),
+        ("rounds", rounds, Integral, 1, 20),
+        ("light", light, Real, 1e-3, 1e9),
+        ("threads", threads, Integral, 1, 1024),
     ):
-        if not low <= value <= high:
-            raise ArgumentError(f"{name}: {value} is not within {low:g} to {high:g}")
+        if not isinstance(value, kind) or not low <= value <= high:
+            number = "a whole number" if kind is Integral else "a number"
+            raise ArgumentError(f"{name}: {value!r} is not {number} within {low:g} to {high:g}")
     if m is None:
         m = match_quasi_dense(image1, image2, threads=threads)
     if (m.shape1, m.shape2) != (one.shape[1:], two.shape[1:]):
         raise ArgumentError(f"m: of pictures {m.shape1} and {m.shape2}, not {one.shape[1:]} and {two.shape[1:]}")
-    for xy, image in ((m.xy1, one), (m.xy2, two)):
-        height, width = image.shape[1:]
-        if not ((xy >= -0.5) & (xy <= np.array([width - 0.5, height - 0.5]))).all():  # nor NaN
-            raise ArgumentError(f"m: matches outside of pictures of {width}x{height} pixels")
-    if not (np.isfinite(m.affine).all() and np.isfinite(m.zncc).all()):
-        raise ArgumentError("m: affine maps or correlations that are no finite numbers")
+    for xy, (height, width) in ((m.xy1, m.shape1), (m.xy2, m.shape2)):
+        if ((xy < -0.5) | (xy > np.array([width - 0.5, height - 0.5]))).any():
+            raise ArgumentError(f"m: matches that are not within {width}x{height} pixels")
     groups = group_matches(m, least=LEAST)
     options = _engine.SegmentOptions()
     options.layers, options.rounds, options.light, options.threads = layers, rounds, light, threads

@@ -251,10 +251,12 @@ def test_the_command_writes_labels_fields_and_pictures(tmp_path: Path, capsys: p
     with np.load(out / "layer_1_flow.npz") as flow, np.load(out / "layer_1_light.npz") as light:
         assert np.isfinite(flow["flow1"][labels == 1]).mean() > 0.99
         assert flow["flow2"].shape == (180, 240, 2) and light["gain1"].shape == (180, 240, 3)
-    assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 2 * 186)
+    cut = np.asarray(Image.open(out / "layer_1_warped1.png"))
+    assert ((cut[..., 3] > 0) == (labels == 1)).all() and np.ptp(cut[labels == 1]) > 50
+    assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 16 + 2 * 186)
 
 
-def test_the_command_takes_grey_with_colour_and_names_a_picture_that_is_too_large(
+def test_the_command_takes_grey_with_colour_and_names_what_it_cannot_take(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     Image.fromarray(np.zeros((40, 50, 3), np.uint8)).save(tmp_path / "colour.png")
@@ -263,6 +265,10 @@ def test_the_command_takes_grey_with_colour_and_names_a_picture_that_is_too_larg
     out = ["-o", str(tmp_path / "out"), "--json"]
     assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "deep.png"), *out]) == 0
     assert json.loads(capsys.readouterr().out)["status"] == "no common motion"
+    assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "deep.png"), *out[:2]]) == 0
+    assert "too little texture" in capsys.readouterr().out
+    assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "deep.png"), "-o", "/proc/none"]) == 1
+    assert "--output: /proc/none" in capsys.readouterr().err
     assert main(["segment", str(tmp_path / "colour.png"), str(tmp_path / "large.png"), *out]) == 1
     assert "large.png: 2000x1001" in capsys.readouterr().err
 
@@ -276,8 +282,11 @@ def test_bad_arguments_are_named():
         (lambda: pf.segment_motion(image, np.zeros((64, 65)), m), "m:"),
         (lambda: pf.segment_motion(image, image, replace(m, xy1=m.xy1 - 1e4)), "m: matches"),
         (lambda: pf.segment_motion(image, image, replace(m, xy2=m.xy2 + 1e4)), "m: matches"),
-        (lambda: pf.segment_motion(image, image, replace(m, xy2=m.xy2 * np.nan)), "m: matches"),
+        (lambda: pf.segment_motion(image, image, replace(m, xy2=m.xy2 * np.nan)), "m: places"),
         (lambda: pf.segment_motion(image, image, layers=0), "layers"),
+        (lambda: pf.segment_motion(image, image, layers="a"), "layers"),
+        (lambda: pf.segment_motion(image, image, rounds=2.5), "rounds"),
+        (lambda: pf.segment_motion(image, image, replace(m, zncc=m.zncc * np.nan)), "m: places, affine maps or correl"),
         (lambda: pf.segment_motion(image, image, threads=0), "threads"),
         (lambda: pf.segment_motion(image, image, light=0), "light"),
         (lambda: pf.segment_motion(image - 1, image), "image1"),
