@@ -55,7 +55,7 @@ std::vector<bool> ours(const Function &f)
 
 std::vector<bool> opencv(const Function &f)
 {
-    cv::detail::GCGraph<double> graph(static_cast<int>(f.zero.size()), static_cast<int>(2 * f.pairs.size()));
+    cv::detail::GCGraph<double> graph(static_cast<unsigned>(f.zero.size()), static_cast<unsigned>(2 * f.pairs.size()));
     for (size_t i = 0; i < f.zero.size(); i++)
         graph.addTermWeights(graph.addVtx(), static_cast<double>(f.one[i]), static_cast<double>(f.zero[i]));
     for (const Pair &p : f.pairs)
