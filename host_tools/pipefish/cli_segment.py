@@ -56,7 +56,7 @@ def run_segment(args: argparse.Namespace) -> Result:
         share = 100 * layer.area1 / s.labels1.size, 100 * layer.area2 / s.labels2.size
         text = f"{share[0]:.1f} and {share[1]:.1f} % of the pictures, correlation {layer.zncc1:.2f}"
         if (unsure := max(layer.low_evidence1, layer.low_evidence2)) > 0.3:
-            text += f"; {100 * unsure:.0f} % of it, without texture, is a guess by its surroundings"
+            text += f"; {100 * unsure:.0f} % of it has little texture and follows its surroundings"
         if max(layer.ambiguous1, layer.ambiguous2) > 0.1:
             text += ", ambiguous: another layer claims the same"
         rows.append((f"layer {k}", text))
