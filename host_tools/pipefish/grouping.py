@@ -90,6 +90,8 @@ def group_matches(
     least        vertices of a group: 60 are about 1500 pixels
 
     Raises ArgumentError."""
+    if not all(np.isfinite(a).all() for a in (m.xy1, m.xy2, m.affine, m.zncc)):
+        raise ArgumentError("m: places, affine maps or correlations that are no finite numbers")
     options = group_options(cell, agree_px, agree_share, least)
     label, triangles, of = _engine.group_matches(m.xy1, m.xy2, m.affine, m.zncc, options)
     return Groups(m, int(of.max(initial=-1)) + 1, label, triangles, of)

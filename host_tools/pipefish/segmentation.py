@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ class Layer:
                    against it, as where there is no texture
     ambiguous1     share of its pixels whose place in picture 2 is another layer's
     groups         of group_matches it was made from
+    claimed        how many matches of no group it took; each fourth was asked
     """
 
     flow1: Floats32
@@ -60,6 +62,7 @@ class Layer:
     ambiguous1: float
     ambiguous2: float
     groups: list[int]
+    claimed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +72,8 @@ class Segmentation:
     labels1, labels2  (H,W) uint8: 0 is the background, what only one picture shows; k is layers[k - 1]
     layers            largest first
     status            "ok", or "no common motion": nothing that both pictures show was found
-    trace             (step, energy in nats, layers) after each step; the energy never rises
+    trace             (step, energy in nats, layers) after each step; the energy never rises. At the steps "grid
+                      halved" and "matches count less" it is defined anew, lower, and nothing else changes
     """
 
     labels1: NDArray[np.uint8]
@@ -114,18 +118,22 @@ def segment_motion(
     one, two = planes(image1, "image1"), planes(image2, "image2")
     if len(one) != len(two):
         raise ArgumentError("image1 and image2: one is grey, the other has colour")
-    for name, value, low, high in (
-        ("layers", layers, 1, 40),
-        ("rounds", rounds, 1, 20),
-        ("light", light, 1e-3, 1e9),
-        ("threads", threads, 1, 1024),
+    for name, value, kind, low, high in (
+        ("layers", layers, Integral, 1, 40),
+        ("rounds", rounds, Integral, 1, 20),
+        ("light", light, Real, 1e-3, 1e9),
+        ("threads", threads, Integral, 1, 1024),
     ):
-        if not low <= value <= high:
-            raise ArgumentError(f"{name}: {value} is not within {low:g} to {high:g}")
+        if not isinstance(value, kind) or not low <= value <= high:
+            number = "a whole number" if kind is Integral else "a number"
+            raise ArgumentError(f"{name}: {value!r} is not {number} within {low:g} to {high:g}")
     if m is None:
         m = match_quasi_dense(image1, image2, threads=threads)
     if (m.shape1, m.shape2) != (one.shape[1:], two.shape[1:]):
         raise ArgumentError(f"m: of pictures {m.shape1} and {m.shape2}, not {one.shape[1:]} and {two.shape[1:]}")
+    for xy, (height, width) in ((m.xy1, m.shape1), (m.xy2, m.shape2)):
+        if ((xy < -0.5) | (xy > np.array([width - 0.5, height - 0.5]))).any():
+            raise ArgumentError(f"m: matches that are not within {width}x{height} pixels")
     groups = group_matches(m, least=LEAST)
     options = _engine.SegmentOptions()
     options.layers, options.rounds, options.light, options.threads = layers, rounds, light, threads

@@ -20,6 +20,7 @@ COLOURS = np.array(
     np.uint8,
 )
 MESH = 16  # pixels between the lines of a mesh
+HEADING = 16  # pixels
 LINE = (20, 20, 20)
 Bytes = NDArray[np.uint8]
 
@@ -60,12 +61,40 @@ def draw_cut(image: Floats32, labels: Bytes) -> Bytes:
     out = _bytes(image)
     out[labels == 0] = 255
     edge = np.zeros(labels.shape, bool)
-    for axis in (0, 1):
-        for step in (-1, 1):
-            edge |= np.roll(labels, step, axis) != labels
+    for step in (1, 2):  # two pixels, inside the layer
+        for axis, way in ((0, step), (0, -step), (1, step), (1, -step)):
+            edge |= np.roll(labels, way, axis) != labels
     edge &= labels > 0
     out[edge] = colour_of(labels)[edge]
     return out
+
+
+def _number(picture: Bytes, labels: Bytes) -> Bytes:
+    """The picture with the number of each layer on it, in its colour: on its pixel nearest to the middle of them."""
+    from PIL import Image, ImageDraw
+
+    drawn = Image.fromarray(picture)
+    draw = ImageDraw.Draw(drawn)
+    for k in range(1, int(labels.max(initial=0)) + 1):
+        at = np.argwhere(labels == k)
+        if len(at):
+            y, x = map(int, at[np.abs(at - np.median(at, axis=0)).sum(axis=1).argmin()])
+            ink = tuple(map(int, colour_of(np.array(k))))
+            box = draw.textbbox((x, y), str(k), anchor="mm")
+            draw.rectangle((box[0] - 3, box[1] - 3, box[2] + 3, box[3] + 3), fill=(255, 255, 255), outline=ink)
+            draw.text((x, y), str(k), fill=(0, 0, 0), anchor="mm")
+    return np.asarray(drawn)
+
+
+def _heading(widths: list[int]) -> Bytes:
+    """(HEADING, sum of widths, 3): what the columns show."""
+    from PIL import Image, ImageDraw
+
+    drawn = Image.new("RGB", (sum(widths), HEADING), (255, 255, 255))
+    texts = ("picture", "layers, with their numbers", "the other picture's mesh, and its light: grey as it looks here")
+    for k, text in enumerate(texts):
+        ImageDraw.Draw(drawn).text((sum(widths[:k]) + 3, 2), text, fill=(0, 0, 0))
+    return np.asarray(drawn)
 
 
 def draw_fields(s: Segmentation, picture: int) -> Bytes:
@@ -103,22 +132,23 @@ def _draw_mesh(draw: Any, flow: Floats32, there: NDArray[np.bool_], here: NDArra
 
 
 def draw_overview(one: Floats32, two: Floats32, s: Segmentation) -> Bytes:
-    """(H,W,3): a row for each picture, the picture, its layers cut out, and their fields."""
+    """(H,W,3): a heading, and a row for each picture: the picture, its layers cut out, and their fields."""
     rows = []
     for picture, planes, labels in ((1, one, s.labels1), (2, two, s.labels2)):
-        parts = [_bytes(_rows(planes)), draw_cut(_rows(planes), labels), draw_fields(s, picture)]
+        parts = [_bytes(_rows(planes)), _number(draw_cut(_rows(planes), labels), labels), draw_fields(s, picture)]
         gap = np.full((labels.shape[0], 6, 3), 255, np.uint8)
         rows.append(np.concatenate([parts[0], gap, parts[1], gap, parts[2]], axis=1))
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(r, ((0, 6), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
-    return np.concatenate(padded)
+    column = width // 3
+    return np.concatenate([_heading([column, column, width - 2 * column]), *padded])
 
 
 def document(s: Segmentation) -> dict[str, Any]:
     """For JSON: status, layers, energies."""
     names = ("area", "sigma", "zncc", "folds", "low_evidence", "ambiguous")
     layers = [
-        {"label": k, "groups": layer.groups}
+        {"label": k, "groups": layer.groups, "claimed": layer.claimed}
         | {f"{name}{p}": round(_side(layer, name, p), 5) for name in names for p in (1, 2)}
         for k, layer in enumerate(s.layers, 1)
     ]
@@ -135,8 +165,8 @@ def _arrays(**arrays: NDArray[Any]) -> bytes:
 def write_segmentation(folder: str | os.PathLike[str], one: Floats32, two: Floats32, s: Segmentation) -> list[str]:
     """Writes a segmentation of pictures (C,H,W): labels1.png, labels2.png, segmentation.png (all at a glance),
     layers.json, and of each layer k: layer_k_flow.npz (flow1, flow2), layer_k_light.npz (gain and offset of both),
-    layer_k_warped1.png (picture 2 brought into picture 1, relit) and layer_k_residual1.png (the difference, four times,
-    around grey), the same of picture 2. Returns the names. Raises OSError."""
+    layer_k_warped1.png (picture 2 brought into picture 1, relit; transparent elsewhere) and layer_k_residual1.png (the
+    difference, four times, around grey), the same of picture 2. Returns the names. Raises OSError."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     contents = {
@@ -152,7 +182,8 @@ def write_segmentation(folder: str | os.PathLike[str], one: Floats32, two: Float
         for p, planes, labels in ((1, one, s.labels1), (2, two, s.labels2)):
             warped = np.where((labels == k)[..., None], _side(layer, "warped", p), np.nan)
             residual = np.where(np.isnan(warped), 0.5, 0.5 + 4 * (_rows(planes) - warped)).astype(np.float32)
-            contents[f"layer_{k}_warped{p}.png"] = png(_bytes(warped))
+            alpha = np.where(labels == k, 255, 0).astype(np.uint8)
+            contents[f"layer_{k}_warped{p}.png"] = png(np.dstack([_bytes(warped), alpha]))
             contents[f"layer_{k}_residual{p}.png"] = png(_bytes(residual))
     for name, data in contents.items():
         write_atomically(folder / name, data)

@@ -59,11 +59,18 @@ def bench_recon() -> list[dict]:
     return figures + (run_program(ceres) if ceres.exists() else [])
 
 
+def bench_segment() -> list[dict]:
+    """segment.cut_wrong, segment.cut_s: the least cut beside OpenCV's."""
+    program = ROOT / "build" / "peers" / "tests" / "bench" / "bench_cut"
+    return run_program(program) if program.exists() else []
+
+
 PYTHON_ROOMS = {
     "calib": room_calib.measure,
     "camera": bench_camera,
     "match": room_match.measure,
     "recon": bench_recon,
+    "segment": bench_segment,
     "sim": bench_sim,
     "track": room_track.measure,
 }

@@ -159,6 +159,16 @@ def make_pair(
     return Pair((images[0], images[1]), (labels[0], labels[1]), flow.reshape(*shape, 2), light.reshape(shape))
 
 
+def make_wave(seed: int, period: float, height: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Two pictures (120,160,3) of one surface, rippled in picture 1 by waves of `period` and `height` pixels along both
+    axes; and where each of its pixels is in picture 2, (120,160,2)."""
+    y, x = (v.ravel() for v in np.mgrid[:120, :160].astype(float))
+    to = np.stack([x + height * np.sin(2 * np.pi * y / period), y + height * np.sin(2 * np.pi * x / period)], axis=1)
+    texture, noise = _colour(seed, 256), np.random.default_rng(seed)
+    pictures = [_at(texture, *(20 + at).T).reshape(120, 160, 3) for at in (to, np.stack([x, y], axis=1))]
+    return [np.clip(p + noise.normal(0, 0.005, p.shape), 0, 1) for p in pictures], to.reshape(120, 160, 2)
+
+
 def paired(found: np.ndarray, truth: np.ndarray) -> dict[int, int]:
     """For each label of the truth the found one that covers most of it; 0 if none."""
     out = {}
@@ -249,24 +259,43 @@ def round_trips(s: Segmentation) -> np.ndarray:
     return np.concatenate(out)
 
 
+def smallest_piece(labels: np.ndarray) -> int:
+    """Pixels of the smallest piece of one label, its corners touching."""
+    left = np.pad(labels.astype(int), 1, constant_values=-1)
+    least = labels.size
+    while (left >= 0).any():
+        start = np.unravel_index(int((left >= 0).argmax()), left.shape)
+        label, front, size = left[start], [start], 1
+        left[start] = -1
+        while front:
+            y, x = front.pop()
+            for q in ((y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
+                if left[q] == label:
+                    left[q], size = -1, size + 1
+                    front.append(q)
+        least = min(least, size)
+    return least
+
+
 def points_in_layers(s: Segmentation, rows: np.ndarray) -> dict:
     """How labelled pairs of points (x1 y1 1 x2 y2 1 label, 0 is an outlier) lie in layers.
 
-    A pair is in a layer when both its points have its label. recall: share of a motion's pairs in its best layer;
-    purity: share of that motion among the right pairs there; outliers: share of wrong pairs that are in a layer and
-    less than 10 pixels from where it has them; same_layer: without the 10 pixels."""
+    A pair, right or wrong, is in a layer when both its points have its label and the layer's motion carries the one to
+    less than 10 pixels from the other. recall: share of a motion's pairs in its best layer; purity: share of that
+    motion among all pairs there, wrong ones too; outliers: share of wrong pairs that are in a layer; same_layer: share
+    of wrong pairs both of whose points have a layer's label, whatever its motion."""
     one, two, truth = rows[:, :2], rows[:, 3:5], rows[:, -1].astype(int)
     label = _nearest(one, s.labels1).astype(int)
     label[label != _nearest(two, s.labels2)] = 0
-    near = np.zeros(len(rows), bool)
+    wrong = truth == 0
+    same_layer = (label[wrong] > 0).mean()
     for k, layer in enumerate(s.layers, 1):
-        near |= (label == k) & (np.hypot(*(_nearest(one, layer.flow1) - two).T) < 10)
+        label[(label == k) & ~(np.hypot(*(_nearest(one, layer.flow1) - two).T) < 10)] = 0
     motions = []
     for k in range(1, truth.max() + 1):
         counts = np.bincount(label[truth == k], minlength=len(s.layers) + 1)
         counts[0] = 0
         best = int(counts.argmax())
-        right = ((label == best) & (truth > 0)).sum()
-        motions.append({"recall": counts[best] / (truth == k).sum(), "purity": counts[best] / max(right, 1)})
-    wrong = truth == 0
-    return {"motions": motions, "outliers": near[wrong].mean(), "same_layer": (label[wrong] > 0).mean()}
+        own = {"recall": counts[best] / (truth == k).sum(), "purity": counts[best] / max((label == best).sum(), 1)}
+        motions.append(own | {"layer": best if counts[best] else 0})
+    return {"motions": motions, "outliers": (label[wrong] > 0).mean(), "same_layer": same_layer}

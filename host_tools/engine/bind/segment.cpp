@@ -7,6 +7,7 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -42,6 +43,23 @@ nb::tuple expand_one(const Table &cost, const Table &ends, const Line &weight, c
     else
         expand(problem, 100, labels);
     return nb::make_tuple(to_numpy<uint8_t>(labels.data(), {labels.size()}), problem.energy(labels));
+}
+
+Array<double> halved(const std::array<int, 4> &box, double spacing, const Rows2 &d, const Rows2 &at)
+{
+    Warp warp{Lattice({box[0], box[1], box[2], box[3]}, spacing), {}};
+    const size_t points = warp.lattice.points();
+    if (d.shape(0) < points)
+        throw std::invalid_argument("d: the grid has " + std::to_string(points) + " points");
+    warp.d = Eigen::Map<const Eigen::VectorXd>(d.data(), static_cast<Eigen::Index>(2 * points));
+    const Warp half = finer(warp);
+    std::vector<double> out;
+    for (const Warp &w : {warp, half})
+        for (size_t k = 0; k < at.shape(0); k++) {
+            const Vector2d to = w.to(at(k, 0), at(k, 1));
+            out.insert(out.end(), {to.x(), to.y()});
+        }
+    return to_numpy<double>(out.data(), {2, at.shape(0), 2});
 }
 
 using Planes = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
@@ -82,6 +100,7 @@ nb::dict to_python(const Found &f)
 {
     nb::dict d;
     d["groups"] = f.groups;
+    d["claimed"] = f.claimed;
     const size_t channels = f.gain[0].size();
     for (size_t s = 0; s < 2; s++) {
         const auto put = [&](const char *name, const auto &value) {
@@ -175,6 +194,11 @@ void bind_segment(nb::module_ &m)
           nb::arg("lonely"), nb::arg("alpha"), nb::arg("labels"),
           "Costs (labels,N), edges (E,2) with weights (E,), partners (labels,N), cost of being alone, label to expand "
           "(-1: all, until none gains), labels (N,) -> labels (N,), their energy. For tests.");
+    m.def(
+        "segment_halved", &halved, nb::arg("box"), nb::arg("spacing"), nb::arg("d"), nb::arg("at"),
+        "Box (x, y, width, height), pixels between the points of its grid, displacements (M,2) of these (of which as "
+        "many as there are points), places (N,2) -> (2,N,2): the places moved, by that field and by the one on a grid "
+        "of half the spacing. For tests.");
     m.def("silhouette", &silhouette_of, nb::arg("planes"), nb::arg("expected"), nb::arg("seen"), nb::arg("others"),
           "Planes (C,H,W) of a scene, masks (H,W) of 0 and 255: where an object is expected, was matched, and where "
           "others were -> mask (H,W) of what is seen of it.");

@@ -13,6 +13,8 @@ Lattice::Lattice(const cv::Rect &rectangle, double h)
     : box(rectangle), spacing(h), nx(static_cast<int>((rectangle.width - 1) / h) + 4),
       ny(static_cast<int>((rectangle.height - 1) / h) + 4)
 {
+    if (rectangle.empty())
+        throw std::invalid_argument("a field over no pixels: no match is within the picture");
 }
 
 Vector2d Lattice::place(size_t point) const

@@ -1,6 +1,8 @@
 // What is reported of a state: layers of some size, largest first, with their fields over whole pictures.
 #include "segment/state.hpp"
 
+#include <opencv2/imgproc.hpp>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -13,6 +15,21 @@ namespace
 {
 
 constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
+constexpr int kSpeck = 50; // pixels: a smaller piece of a label is what surrounds it
+
+// The label that most pixels beside a piece have.
+int surroundings(const LabelImage &labels, const cv::Mat_<int> &pieces, int piece, const cv::Rect &box)
+{
+    int votes[256] = {};
+    for (int y = box.y; y < box.br().y; y++)
+        for (int x = box.x; x < box.br().x; x++)
+            for (const cv::Point step : {cv::Point(1, 0), cv::Point(-1, 0), cv::Point(0, 1), cv::Point(0, -1)}) {
+                const cv::Point at = cv::Point(x, y) + step;
+                if (pieces(y, x) == piece && at.inside({{0, 0}, labels.size()}) && pieces(at) != piece)
+                    votes[labels(at)]++;
+            }
+    return static_cast<int>(std::max_element(std::begin(votes), std::end(votes)) - std::begin(votes));
+}
 
 // Fields of a side over the whole picture.
 void spread(const Side &side, const Evidence &seen, size_t s, Found &out)
@@ -71,12 +88,44 @@ void measure(const Side &side, const Evidence &seen, int k, const LabelImage &he
 
 } // namespace
 
+LabelImage State::without_specks(size_t s) const
+{
+    LabelImage out = labels_[s].clone();
+    for (int label = 0; label <= static_cast<int>(layers_.size()); label++) {
+        cv::Mat_<int> pieces, stats;
+        cv::Mat centres;
+        const int count = cv::connectedComponentsWithStats(labels_[s] == label, pieces, stats, centres);
+        for (int piece = 1; piece < count; piece++) {
+            const cv::Rect box(stats(piece, cv::CC_STAT_LEFT), stats(piece, cv::CC_STAT_TOP),
+                               stats(piece, cv::CC_STAT_WIDTH), stats(piece, cv::CC_STAT_HEIGHT));
+            if (stats(piece, cv::CC_STAT_AREA) >= kSpeck)
+                continue;
+            const int heir = surroundings(labels_[s], pieces, piece, box);
+            for (int y = box.y; y < box.br().y; y++)
+                for (int x = box.x; x < box.br().x; x++)
+                    if (pieces(y, x) == piece)
+                        out(y, x) = static_cast<uint8_t>(possible(heir, s, {x, y}) ? heir : 0);
+        }
+    }
+    return out;
+}
+
+bool State::possible(int label, size_t s, cv::Point at) const
+{
+    if (label == 0)
+        return true;
+    const Layer &layer = layers_[static_cast<size_t>(label) - 1];
+    const cv::Rect &box = layer.side[s].box();
+    return box.contains(at) && layer.seen[s].cost(at - box.tl()) < Problem::kNever;
+}
+
 Result State::result() const
 {
     Result out;
+    const LabelImage labels[2] = {without_specks(0), without_specks(1)};
     std::vector<int> area(layers_.size() * 2, 0);
     for (size_t s = 0; s < 2; s++)
-        for (const uint8_t label : labels_[s])
+        for (const uint8_t label : labels[s])
             if (label > 0)
                 area[2 * (label - size_t{1}) + s]++;
     std::vector<size_t> order(layers_.size());
@@ -88,7 +137,7 @@ Result State::result() const
     for (size_t k = 0; k < order.size(); k++)
         label[order[k] + 1] = static_cast<uint8_t>(k + 1);
     for (size_t s = 0; s < 2; s++) {
-        out.labels[s] = labels_[s].clone();
+        out.labels[s] = labels[s].clone();
         for (uint8_t &l : out.labels[s])
             l = label[l];
     }
@@ -96,6 +145,8 @@ Result State::result() const
         const Layer &layer = layers_[order[k]];
         Found found;
         found.groups = layer.groups;
+        found.claimed = static_cast<int>(
+            std::count_if(layer.side[0].ties.begin(), layer.side[0].ties.end(), [](const Tie &t) { return t.free; }));
         for (size_t s = 0; s < 2; s++) {
             spread(layer.side[s], layer.seen[s], s, found);
             measure(layer.side[s], layer.seen[s], static_cast<int>(k) + 1, out.labels[s], out.labels[1 - s], s, found);

@@ -30,7 +30,7 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
     check(planes);
     State state(planes, matches, groups, options);
     std::vector<Step> trace;
-    const double steps = 3.0 + 4 * options.rounds;
+    const double steps = 5.0 + 4 * options.rounds;
     const auto note = [&](const char *name) {
         trace.push_back({name, state.energy(), static_cast<int>(state.layers())});
         progress(static_cast<double>(trace.size()) / steps);
@@ -40,7 +40,8 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
     note("fields");
     state.merge();
     note("merge");
-    state.finer();
+    state.finer(); // the same fields; their stiffness is measured on the new grid from here on
+    note("grid halved");
     for (int k = 0; k < 3; k++) {
         state.claim();
         state.refine(2);
@@ -48,8 +49,10 @@ Result segment(const std::vector<Image> (&planes)[2], const std::vector<match::M
     note("claim");
     for (int round = 0; round < options.rounds && state.layers() > 0; round++) {
         const double before = trace.back().energy;
-        if (round == 1)
-            state.trust_pictures();
+        if (round == 1) {
+            state.trust_pictures(); // the energy alone changes here, too
+            note("matches count less");
+        }
         state.relabel(round == 0 ? 2 : 3);
         note("labels");
         state.remove();

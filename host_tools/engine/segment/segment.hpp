@@ -16,6 +16,7 @@ namespace pipefish::segment
 struct Found {
     int area[2] = {0, 0};
     std::vector<int> groups;               // it was made from
+    int claimed = 0;                       // matches of no group, of each fourth that was asked, that it took
     cv::Mat_<cv::Vec2f> flow[2];           // place in the other picture
     std::vector<Image> gain[2], offset[2]; // a channel: colour here = gain * colour there + offset
     Image warped[2][3];                    // the other picture's planes brought here, relit
@@ -28,7 +29,7 @@ struct Found {
 
 struct Step {
     std::string name;
-    double energy; // nats; never above the one before
+    double energy; // nats; never above the one before, but two steps define it anew, lower
     int layers;
 };
 

@@ -190,10 +190,8 @@ bool State::within_reach(const Layer &a, const Layer &b) const
     return true;
 }
 
-bool State::try_merge(size_t a, size_t b)
+std::optional<Layer> State::merged(size_t a, size_t b) const
 {
-    if (!within_reach(layers_[a], layers_[b]))
-        return false;
     const Given of_a = given(static_cast<int>(a) + 1), of_b = given(static_cast<int>(b) + 1);
     LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
     for (LabelImage &l : labels)
@@ -207,20 +205,42 @@ bool State::try_merge(size_t a, size_t b)
         shape += shape_energy(both.side[s], options_, ties_) - shape_energy(layers_[a].side[s], options_, ties_) -
                  shape_energy(layers_[b].side[s], options_, ties_);
     if (shape > 0)
-        return false;
+        return {};
     const double before = layer_energy(layers_[a], of_a, options_) + layer_energy(layers_[b], of_b, options_) + saved;
     const Given by{labels, of_a.k, ties_};
     refine_one(both, by, 1);
     refine_one(both, by, 4);
     if (layer_energy(both, by, options_) > before)
-        return false;
+        return {};
     both.groups = layers_[a].groups;
     both.groups.insert(both.groups.end(), layers_[b].groups.begin(), layers_[b].groups.end());
-    layers_[a] = std::move(both);
-    for (size_t s = 0; s < 2; s++)
-        labels_[s] = labels[s];
-    erase(b);
-    return true;
+    return both;
+}
+
+bool State::try_merge(size_t a)
+{
+    std::vector<size_t> near;
+    for (size_t b = a + 1; b < layers_.size(); b++)
+        if (within_reach(layers_[a], layers_[b]))
+            near.push_back(b);
+    for (size_t first = 0; first < near.size();) { // as many at once as there are threads; the first that is cheaper
+        const size_t count = std::min(near.size() - first, static_cast<size_t>(options_.threads));
+        std::vector<std::optional<Layer>> both(count);
+        pipefish::parallel_for(static_cast<int>(count), options_.threads, [&](int k) {
+            both[static_cast<size_t>(k)] = merged(a, near[first + static_cast<size_t>(k)]);
+        });
+        for (size_t k = 0; k < count; k++)
+            if (both[k]) {
+                const size_t b = near[first + k];
+                for (LabelImage &l : labels_)
+                    replace(l, static_cast<int>(b) + 1, static_cast<int>(a) + 1);
+                layers_[a] = std::move(*both[k]);
+                erase(b);
+                return true;
+            }
+        first += count;
+    }
+    return false;
 }
 
 void State::erase(size_t layer)
@@ -233,9 +253,9 @@ void State::erase(size_t layer)
 
 void State::merge()
 {
-    for (size_t a = 0; a < layers_.size(); a++)
-        for (size_t b = a + 1; b < layers_.size();)
-            b = try_merge(a, b) ? a + 1 : b + 1;
+    for (size_t a = 0; a < layers_.size();)
+        if (!try_merge(a))
+            a++;
 }
 
 // Gives the pixels of a layer to another where that can be, else to the background, if that is cheaper.

@@ -4,6 +4,8 @@
 #include "segment/fit.hpp"
 #include "segment/segment.hpp"
 
+#include <optional>
+
 namespace pipefish::segment
 {
 
@@ -33,8 +35,11 @@ private:
     double cut(const LabelImage (&labels)[2]) const;      // what all boundaries cost, nats
     double unclaimed(const std::vector<Tie> &ties) const; // what those that are free cost where no layer has them
     bool try_remove(int label, int heir);
-    bool try_merge(size_t a, size_t b);
-    void erase(size_t layer); // its labels have gone
+    std::optional<Layer> merged(size_t a, size_t b) const;  // refined, if that is cheaper than both
+    bool try_merge(size_t a);                               // with the first later one with which it is cheaper
+    void erase(size_t layer);                               // its labels have gone
+    LabelImage without_specks(size_t s) const;              // pieces of few pixels are what surrounds them
+    bool possible(int label, size_t s, cv::Point at) const; // whether a pixel may have it
 
     Options options_;
     Picture pictures_[2];
