@@ -469,7 +469,7 @@ static int open_and_run(pf_daemon *d, int signals)
 {
     const pf_config *c = &d->config;
     char error[1024] = "";
-    pf_spool_config spool = {c->spool.path, (uint64_t)(c->spool.quota_mb * 1e6)};
+    pf_spool_config spool = {.path = c->spool.path, .quota = (uint64_t)(c->spool.quota_mb * 1e6)};
     pf_survey survey, before;
     uint8_t setup[32];
     int code = FAILED;

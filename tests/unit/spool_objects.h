@@ -26,7 +26,7 @@ void tearDown(void)
 
 static inline void open_spool(const char *name, uint64_t quota)
 {
-    pf_spool_config config = {temporary_path(name), quota};
+    pf_spool_config config = {.path = temporary_path(name), .quota = quota};
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_spool_open(&spool, &config, error, sizeof error), error);
 }
 

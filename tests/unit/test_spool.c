@@ -148,7 +148,7 @@ static void test_threads(void)
 
 static void refused(const char *path, pf_status expected, const char *word)
 {
-    pf_spool_config config = {path, 0};
+    pf_spool_config config = {.path = path};
     error[0] = '\0';
     TEST_ASSERT_EQUAL_INT_MESSAGE(expected, pf_spool_open(&spool, &config, error, sizeof error), error);
     TEST_ASSERT_NULL(spool.self);
@@ -198,7 +198,7 @@ static void test_second_opener_is_refused(void)
 {
     pf_spool second = {NULL, NULL};
     open_spool("shared.db", 0);
-    pf_spool_config config = {temporary_path("shared.db"), 0};
+    pf_spool_config config = {.path = temporary_path("shared.db")};
     pf_status status = pf_spool_open(&second, &config, error, sizeof error);
     if (second.self != NULL)
         second.ops->close(second.self);
