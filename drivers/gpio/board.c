@@ -38,6 +38,7 @@ typedef struct board {
     bool is_over, is_stopped, lamp_is_broken;
     pf_indication indication;
     uint32_t ticks;
+    uint64_t round_ns;
     button button[BUTTONS];
     pf_wheel wheel;
     pf_failure failure;
@@ -184,6 +185,7 @@ static void *watch(void *argument)
 {
     board *b = argument;
     uint64_t tick = now_ns();
+    (void)pthread_setname_np(pthread_self(), "GPIO");
     pthread_mutex_lock(&b->mutex);
     while (!b->is_over) {
         struct pollfd fd[2 + BUTTONS] = {{b->wake, POLLIN, 0}, {pf_wheel_fd(&b->wheel), POLLIN, 0}};
@@ -195,6 +197,7 @@ static void *watch(void *argument)
         (void)poll(fd, 2 + BUTTONS, (int)TICK_MS);
         uint64_t now = now_ns();
         pthread_mutex_lock(&b->mutex);
+        b->round_ns = now;
         if (fd[2].revents != 0)
             stop_if_pressed(b);
         for (uint32_t i = 1; i < BUTTONS; i++)
@@ -273,6 +276,7 @@ static void board_state(void *self, pf_gpio_state *state)
                              .missed = b->wheel.decoder.missed,
                              .repeated = b->wheel.decoder.repeated,
                              .illegal = b->wheel.decoder.illegal,
+                             .round_ns = b->round_ns,
                              .is_broken = b->wheel.is_broken || b->lamp_is_broken};
     for (uint32_t i = 0; i < BUTTONS; i++)
         state->is_broken = state->is_broken || b->button[i].is_broken;
@@ -319,6 +323,7 @@ static pf_status open_parts(board *b, const pf_gpio_config *c)
     b->is_stopped = b->button[0].is_pressed;
     if (has_light(&b->lamp) && !b->is_stopped && set_light(&b->lamp, c->lamp_level) != PF_OK)
         return pf_fail(f, PF_ERR_IO, "gpio.lamp: %s: cannot be set", c->lamp);
+    b->round_ns = now_ns();
     b->wake = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     if (b->wake < 0 || pthread_create(&b->thread, NULL, watch, b) != 0)
         return pf_fail(f, PF_ERR_SPACE, "gpio: cannot start its thread");
