@@ -560,10 +560,16 @@ def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawle
         block = hashlib.shake_256(b"garbage").digest(1 << 20)
         with contextlib.suppress(OSError):
             s.sendall(block)
+            s.sendall(b"x" * (1 << 20) + b"\0")  # one frame of a megabyte
     client = open_client(device)
     client.run(lambda: client.up, 5)
+    client.answer_to(5, get_status=pb.Nothing())
     client.close()
     assert device.process.poll() is None
+    end = time.monotonic() + 5
+    while device.status()["link"]["crc_errors"] < 1000:  # a zero in 256 bytes ends a frame
+        assert time.monotonic() < end, device.status()["link"]
+        time.sleep(0.05)
 
 
 def test_pairings_at_the_same_time_are_all_kept(device: Crawler):
