@@ -65,7 +65,7 @@ void pf_slots_fill(pf_store *s, pf_slot *slot)
     pthread_mutex_unlock(&s->mutex);
     status = s->spool.ops->next(s->spool.self, after, &slot->item);
     if (status == PF_OK) {
-        status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
+        status = s->spool.ops->read(s->spool.self, &slot->item, slot->bytes, s->slot_capacity, &n);
         if (status == PF_ERR_CHECKSUM)
             give_up_damaged(s, slot, n);
         else if (status == PF_ERR_SPACE)

@@ -34,7 +34,7 @@ static const char *const sql[SQL_STATEMENTS] = {
     [SQL_HAS] = "SELECT 1 FROM object WHERE name = ?1",
     [SQL_PUT] = "INSERT INTO object (kind, name, bytes) VALUES (?1, ?2, ?3)",
     [SQL_NEXT] = "SELECT row, kind, name, length(bytes) FROM object WHERE row > ?1 ORDER BY row LIMIT 1",
-    [SQL_READ] = "SELECT name, bytes FROM object WHERE row = ?1",
+    [SQL_READ] = "SELECT bytes FROM object WHERE row = ?1",
     [SQL_SIZE] = "SELECT length(bytes) FROM object WHERE row = ?1",
     [SQL_REMOVE] = "DELETE FROM object WHERE row = ?1",
     [SQL_GET] = "SELECT bytes FROM value WHERE key = ?1",

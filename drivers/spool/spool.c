@@ -225,7 +225,11 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
     sqlite3_stmt *q = d->statements[SQL_NEXT];
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     int code = sqlite3_step(q);
-    if (code == SQLITE_ROW && sqlite3_column_bytes(q, 2) == 32) {
+    if (code == SQLITE_ROW && sqlite3_column_int64(q, 0) <= (int64_t)after) { /* SQLite believes its pages' order */
+        d->is_damaged = true;
+        d->stats.errors++;
+        status = pf_fail(&d->failure, PF_ERR_IO, "%s: listing: its rows are out of order", d->path);
+    } else if (code == SQLITE_ROW && sqlite3_column_bytes(q, 2) == 32) {
         item->row = (uint64_t)sqlite3_column_int64(q, 0);
         d->highest = (int64_t)item->row > d->highest ? (int64_t)item->row : d->highest;
         item->kind = (uint32_t)sqlite3_column_int64(q, 1);
@@ -241,7 +245,7 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
     return status;
 }
 
-static pf_status spool_read(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n)
+static pf_status spool_read(void *self, const pf_spool_item *item, void *bytes, size_t capacity, size_t *n)
 {
     pf_spool_database *d = self;
     uint8_t hash[32];
@@ -249,24 +253,23 @@ static pf_status spool_read(void *self, uint64_t row, void *bytes, size_t capaci
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
     sqlite3_stmt *q = d->statements[SQL_READ];
-    (void)sqlite3_bind_int64(q, 1, (int64_t)row);
+    (void)sqlite3_bind_int64(q, 1, (int64_t)item->row);
     int code = sqlite3_step(q);
-    const void *name = code == SQLITE_ROW ? sqlite3_column_blob(q, 0) : NULL;
-    const void *blob = code == SQLITE_ROW ? sqlite3_column_blob(q, 1) : NULL;
+    const void *blob = code == SQLITE_ROW ? sqlite3_column_blob(q, 0) : NULL;
     if (code == SQLITE_DONE) {
         status = PF_ERR_END;
-    } else if (name == NULL || blob == NULL) {
+    } else if (blob == NULL) {
         status = pf_spool_fail(d, "reading");
-    } else if ((size_t)sqlite3_column_bytes(q, 1) > capacity) {
-        status = pf_fail(&d->failure, PF_ERR_SPACE, "%s: row %" PRIu64 " has %d bytes, the buffer %zu", d->path, row,
-                         sqlite3_column_bytes(q, 1), capacity);
+    } else if ((size_t)sqlite3_column_bytes(q, 0) > capacity) {
+        status = pf_fail(&d->failure, PF_ERR_SPACE, "%s: row %" PRIu64 " has %d bytes, the buffer %zu", d->path,
+                         item->row, sqlite3_column_bytes(q, 0), capacity);
     } else {
-        *n = (size_t)sqlite3_column_bytes(q, 1);
+        *n = (size_t)sqlite3_column_bytes(q, 0);
         memcpy(bytes, blob, *n);
-        if (pf_sha256(bytes, *n, hash) != PF_OK || memcmp(hash, name, sizeof hash) != 0) {
+        if (pf_sha256(bytes, *n, hash) != PF_OK || memcmp(hash, item->name, sizeof hash) != 0) {
             d->stats.errors++;
             status = pf_fail(&d->failure, PF_ERR_CHECKSUM, "%s: row %" PRIu64 ": its bytes do not have its SHA-256",
-                             d->path, row);
+                             d->path, item->row);
         }
     }
     sqlite3_reset(q);

@@ -66,7 +66,7 @@ static inline uint64_t check_item(const pf_spool_item *item)
 {
     uint64_t id;
     size_t n = 0;
-    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, item->row, read_bytes, sizeof read_bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, item, read_bytes, sizeof read_bytes, &n));
     TEST_ASSERT_EQUAL_size_t(item->size, n);
     memcpy(&id, read_bytes, sizeof id);
     TEST_ASSERT_EQUAL_size_t(make_object(id), n);

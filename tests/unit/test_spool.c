@@ -38,12 +38,13 @@ static void test_first_in_first_out(void)
     TEST_ASSERT_EQUAL_UINT64(10, stats().objects);
     TEST_ASSERT_EQUAL_UINT64(10, stats().acknowledged);
     size_t n;
-    TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->read(spool.self, row, read_bytes, sizeof read_bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_END,
+                          spool.ops->read(spool.self, &(pf_spool_item){.row = row}, read_bytes, sizeof read_bytes, &n));
     TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, UINT64_MAX, &item));
     /* A row is never used again, though the last one was removed. */
     TEST_ASSERT_EQUAL_INT(PF_OK, put(100));
     TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, row, &item));
-    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->read(spool.self, item.row, read_bytes, item.size - 1, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->read(spool.self, &item, read_bytes, item.size - 1, &n));
     TEST_ASSERT_TRUE(spool.ops->error(spool.self)[0] != '\0');
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, spool.ops->put(spool.self, 2, object_name, object_bytes, 0));
 }

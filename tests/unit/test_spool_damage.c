@@ -44,7 +44,7 @@ static void sift(void)
             return;
         if (status != PF_OK)
             continue;
-        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
+        status = spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &n);
         if (status == PF_ERR_CHECKSUM)
             TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
         if (status != PF_ERR_IO)
@@ -199,7 +199,7 @@ static uint64_t list_ids(bool *is_there)
     size_t size;
     memset(is_there, 0, MANY + 2);
     for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
-        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &size));
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &size));
         memcpy(&id, read_bytes, sizeof id);
         TEST_ASSERT_TRUE(id <= MANY + 1 && !is_there[id]);
         is_there[id] = true;
@@ -237,7 +237,7 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
     hook("open", (sqlite3_syscall_ptr)open_or_not);
     refuses_opening = true;
     for (uint64_t row = 1; row <= COUNT; row++)
-        (void)spool.ops->read(spool.self, row, read_bytes, sizeof read_bytes, &n);
+        (void)spool.ops->read(spool.self, &(pf_spool_item){.row = row}, read_bytes, sizeof read_bytes, &n);
     for (int i = 0; i < 3; i++) {
         TEST_ASSERT_EQUAL_INT(PF_ERR_IO, spool.ops->next(spool.self, 0, &item));
         TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "reopen.db"));

@@ -165,7 +165,7 @@ static void drain_damaged(const char *path)
     uint64_t row = 0;
     size_t n;
     for (int i = 0; i < 100 && spool.ops->next(spool.self, row, &item) == PF_OK; i++) {
-        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
+        status = spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &n);
         if (status == PF_OK)
             (void)check_item(&item);
         else
@@ -262,7 +262,7 @@ static int look_at_cut(const char *path, uint64_t stored, uint64_t removed)
     if (pf_spool_open(&spool, &config, error, sizeof error) != PF_OK)
         return 1;
     for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row) {
-        if (spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n) != PF_OK)
+        if (spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &n) != PF_OK)
             return 2;
         memcpy(&id, read_bytes, sizeof id);
         if (last != 0 && id != last + 1)

@@ -103,7 +103,7 @@ static pf_status next(void *self, uint64_t after, pf_spool_item *item)
     return status;
 }
 
-static pf_status read_object(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n)
+static pf_status read_object(void *self, const pf_spool_item *item, void *bytes, size_t capacity, size_t *n)
 {
     pf_status status = PF_OK;
     (void)self;
@@ -112,8 +112,8 @@ static pf_status read_object(void *self, uint64_t row, void *bytes, size_t capac
     if (fails(&fake.fail_reads)) {
         status = PF_ERR_IO;
     } else {
-        *n = fake.object[row - 1].item.size;
-        memcpy(bytes, fake.object[row - 1].bytes, *n);
+        *n = fake.object[item->row - 1].item.size;
+        memcpy(bytes, fake.object[item->row - 1].bytes, *n);
     }
     (void)pthread_mutex_unlock(&fake.mutex);
     return status;
@@ -469,7 +469,7 @@ static uint32_t list_spool(const pf_spool *real, uint8_t *indices)
     while (real->ops->next(real->self, item.row, &item) == PF_OK) {
         uint8_t bytes[BYTES_MAX];
         size_t n;
-        TEST_ASSERT_EQUAL_INT(PF_OK, real->ops->read(real->self, item.row, bytes, sizeof bytes, &n));
+        TEST_ASSERT_EQUAL_INT(PF_OK, real->ops->read(real->self, &item, bytes, sizeof bytes, &n));
         indices[count++] = bytes[1];
     }
     return count;

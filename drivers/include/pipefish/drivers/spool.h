@@ -45,9 +45,9 @@ typedef struct pf_spool_ops {
     /* The first item with row > after, oldest first. PF_OK, PF_ERR_END (no more), PF_ERR_IO. */
     pf_status (*next)(void *self, uint64_t after, pf_spool_item *item);
 
-    /* Reads an item's bytes into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone), PF_ERR_IO,
-     * PF_ERR_CHECKSUM (the medium has damaged it: bytes are what it gives). */
-    pf_status (*read)(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n);
+    /* Reads the bytes of an item, as next() gave it, into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone),
+     * PF_ERR_IO, PF_ERR_CHECKSUM (the medium has damaged it, or its place: bytes are what it gives). */
+    pf_status (*read)(void *self, const pf_spool_item *item, void *bytes, size_t capacity, size_t *n);
 
     /* Removes what the host has acknowledged. PF_OK (also if it is gone already), PF_ERR_IO. */
     pf_status (*remove)(void *self, uint64_t row);
