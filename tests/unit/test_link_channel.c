@@ -353,7 +353,8 @@ static double goodput(uint32_t baud, uint32_t loss_ppm)
         const uint64_t before = stats(1)->fragments_received - stats(1)->fragments_duplicate, start = w.now;
         world_pass(&w, whole * 7 / 10);
         const uint64_t came = stats(1)->fragments_received - stats(1)->fragments_duplicate - before;
-        share += (double)came * PF_LINK_FRAGMENT_MAX / ((double)baud / 10 * (double)(w.now - start) / 1e9) / 10;
+        const uint32_t asked = w.apps[0].config.max_fragment, fragment = asked != 0 ? asked : PF_LINK_FRAGMENT_MAX;
+        share += (double)came * fragment / ((double)baud / 10 * (double)(w.now - start) / 1e9) / 10;
         TEST_ASSERT_FALSE(world_done(&w));
     }
     return share;
