@@ -27,6 +27,7 @@
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
 #define TICK_MS        50
 #define OVERRIDES_MAX  128
+#define ALONE_NS       UINT64_C(10000000000) /* without a host, after a signal; hosts pause 5 s at most between tries */
 #define SILENCES       4 /* keepalives without an answer after which a host counts as gone, as the link has it */
 
 enum { DONE = 0, FAILED = 1, USAGE = 2 };
@@ -371,11 +372,20 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
     pf_daemon_stop(d, PF_STOP_TERMINATED);
 }
 
+static bool has_host(pf_daemon *d)
+{
+    pthread_mutex_lock(&d->counters.mutex);
+    bool is_up = d->counters.link_up;
+    pthread_mutex_unlock(&d->counters.mutex);
+    return is_up;
+}
+
 /* Returns when it is time to exit. */
 static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
     const uint64_t up_ns = pf_now();
+    uint64_t host_ns = up_ns; /* when a host was there last */
     bool is_terminated = false, must_exit = false;
     pf_gpio_state gpio = {0};
     for (;;) {
@@ -392,6 +402,8 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard
         note_gpio(d, &gpio);
         if (d->keeper != NULL)
             pf_keeper_work(d->keeper);
+        if (!is_terminated || has_host(d))
+            host_ns = pf_now();
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
             continue;
         must_exit = is_terminated || atomic_load(&d->stop) == PF_STOP_SHUTDOWN;
@@ -401,7 +413,8 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard
         is_drained = pf_pipeline_is_done(pipeline) && pf_store_is_drained(d->store);
         if (is_drained)
             atomic_store(&d->state, PF_STATE_IDLE);
-        if ((must_exit || d->config.daemon.exit_when_done) && (is_drained || pf_now() >= drain_end))
+        if ((must_exit || d->config.daemon.exit_when_done) &&
+            (is_drained || pf_now() >= drain_end || pf_now() - host_ns >= ALONE_NS))
             return;
     }
 }
