@@ -179,7 +179,7 @@ static const setting settings[] = {
     {"status", "preview_quality", INTEGER, AT(status.preview_quality), "", "50", 1, 100, NULL, "JPEG, of previews"},
 
     {"daemon", "drain_s", INTEGER, AT(daemon.drain_s), "s", "60", 0, 1000000, NULL,
-     "how long to go on sending after the survey ended; what is left stays in the spool"},
+     "how long to go on sending after the survey ended (after SIGTERM 10 s at most without a host); the rest stays"},
     {"daemon", "exit_when_done", SWITCH, AT(daemon.exit_when_done), "", "true", 0, 0, NULL,
      "false = after the survey the daemon goes on serving the host until SIGTERM"},
     {"daemon", "status_file", TEXT, AT(daemon.status_file), "", "", 0, 0, NULL,

@@ -15,7 +15,7 @@ static pf_status find_end(const pf_damage *damage, const pf_spool *spool, pf_spo
         uint8_t id[16];
         if (end->kind != PF_OBJECT_SURVEY_END)
             continue;
-        status = spool->ops->read(spool->self, end->row, bytes, capacity, n);
+        status = spool->ops->read(spool->self, end, bytes, capacity, n);
         if (status == PF_ERR_IO)
             return status;
         if (status == PF_OK && pf_msg_peek_survey_end(bytes, *n, id) == PF_OK &&

@@ -7,15 +7,21 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
+#include <sys/prctl.h>
 #include <sys/socket.h>
 #include <sys/un.h>
+#include <time.h>
 #include <unistd.h>
 
+#include "clock.h"
 #include "config.h"
 #include "log.h"
 #include "pulse.h"
 
-#define SECOND UINT64_C(1000000000)
+#define SECOND    UINT64_C(1000000000)
+#define TICK_NS   50000000
+#define EXTEND_NS (5 * SECOND) /* between requests for more time to start in, of EXTEND_S each */
+#define EXTEND_S  30
 
 static void tell_manager(pf_guard *g, const char *text)
 {
@@ -71,46 +77,85 @@ static bool open_device(pf_guard *g, const char *path, uint32_t hang_s, char *er
     return true;
 }
 
+/* Feeds what is due, while nobody hangs. */
+static void feed(pf_guard *g, uint64_t now)
+{
+    if (g->manager >= 0 && !atomic_load(&g->is_ready) && now >= g->manager_due) {
+        char text[64];
+        (void)snprintf(text, sizeof text, "EXTEND_TIMEOUT_USEC=%d000000", EXTEND_S);
+        tell_manager(g, text);
+        g->manager_due = now + EXTEND_NS;
+    } else if (g->manager_ns != 0 && atomic_load(&g->is_ready) && now >= g->manager_due) {
+        tell_manager(g, "WATCHDOG=1");
+        g->manager_due = now + g->manager_ns;
+    }
+    if (g->device >= 0 && now >= g->device_due) {
+        if (write(g->device, "", 1) != 1)
+            pf_log(PF_LOG_ERROR, "watchdog: %s", strerror(errno));
+        g->device_due = now + g->device_ns;
+    }
+}
+
+static void look(pf_guard *g, uint64_t now)
+{
+    const char *hung = pf_pulse_hung(now, g->hang_ns);
+    if (hung != g->hung) {
+        char text[64];
+        if (hung != NULL)
+            pf_log(PF_LOG_ERROR, "the %s thread hangs: the watchdogs are not fed", hung);
+        else
+            pf_log(PF_LOG_WARNING, "the %s thread goes on", g->hung);
+        (void)snprintf(text, sizeof text, "STATUS=%s%s", hung != NULL ? "hangs: " : "well", hung != NULL ? hung : "");
+        tell_manager(g, text);
+        g->hung = hung;
+        atomic_store(&g->is_hung, hung != NULL);
+    }
+    if (hung == NULL)
+        feed(g, now);
+}
+
+static void *watch(void *argument)
+{
+    pf_guard *g = argument;
+    const struct timespec tick = {0, TICK_NS};
+    (void)prctl(PR_SET_NAME, "watchdogs");
+    bool was_ready = false;
+    while (!atomic_load(&g->is_over)) {
+        bool is_ready = atomic_load(&g->is_ready);
+        if (is_ready && !was_ready)
+            g->manager_due = 0;
+        was_ready = is_ready;
+        look(g, pf_now());
+        (void)nanosleep(&tick, NULL);
+    }
+    return NULL;
+}
+
 bool pf_guard_open(pf_guard *guard, const char *device, uint32_t hang_s, char *error, size_t n)
 {
     *guard = (pf_guard){.manager = -1, .device = -1, .hang_ns = hang_s * SECOND / 2};
     open_manager(guard);
-    return open_device(guard, device, hang_s, error, n);
+    if (!open_device(guard, device, hang_s, error, n))
+        return false;
+    guard->is_running = pthread_create(&guard->thread, NULL, watch, guard) == 0;
+    if (!guard->is_running)
+        (void)snprintf(error, n, "cannot start the thread of the watchdogs");
+    return guard->is_running;
 }
 
 void pf_guard_ready(pf_guard *guard)
 {
     tell_manager(guard, "READY=1");
-}
-
-void pf_guard_feed(pf_guard *guard, uint64_t now_ns)
-{
-    const char *hung = pf_pulse_hung(now_ns, guard->hang_ns);
-    if (hung != guard->hung) {
-        char text[64];
-        if (hung != NULL)
-            pf_log(PF_LOG_ERROR, "the %s thread hangs: the watchdogs are not fed", hung);
-        else
-            pf_log(PF_LOG_WARNING, "the %s thread goes on", guard->hung);
-        (void)snprintf(text, sizeof text, "STATUS=%s%s", hung != NULL ? "hangs: " : "well", hung != NULL ? hung : "");
-        tell_manager(guard, text);
-        guard->hung = hung;
-    }
-    if (hung != NULL)
-        return;
-    if (guard->manager_ns != 0 && now_ns >= guard->manager_due) {
-        tell_manager(guard, "WATCHDOG=1");
-        guard->manager_due = now_ns + guard->manager_ns;
-    }
-    if (guard->device >= 0 && now_ns >= guard->device_due) {
-        if (write(guard->device, "", 1) != 1)
-            pf_log(PF_LOG_ERROR, "watchdog: %s", strerror(errno));
-        guard->device_due = now_ns + guard->device_ns;
-    }
+    atomic_store(&guard->is_ready, true);
 }
 
 void pf_guard_close(pf_guard *guard)
 {
+    if (guard->is_running) {
+        atomic_store(&guard->is_over, true);
+        (void)pthread_join(guard->thread, NULL);
+        guard->is_running = false;
+    }
     tell_manager(guard, "STOPPING=1");
     if (guard->manager >= 0)
         (void)close(guard->manager);
@@ -119,5 +164,5 @@ void pf_guard_close(pf_guard *guard)
             pf_log(PF_LOG_ERROR, "watchdog: %s", strerror(errno));
         (void)close(guard->device);
     }
-    *guard = (pf_guard){.manager = -1, .device = -1};
+    guard->manager = guard->device = -1;
 }

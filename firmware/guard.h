@@ -3,12 +3,18 @@
 #ifndef PIPEFISHD_GUARD_H
 #define PIPEFISHD_GUARD_H
 
+#include <pthread.h>
+#include <stdatomic.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
 typedef struct pf_guard {
-    int manager; /* socket; -1 = none */
+    pthread_t thread;
+    bool is_running;
+    _Atomic bool is_ready, is_over;
+    _Atomic bool is_hung; /* a thread hangs: nothing is fed */
+    int manager;          /* socket; -1 = none */
     uint64_t manager_ns, manager_due;
     int device; /* -1 = none */
     uint64_t device_ns, device_due;
@@ -16,17 +22,15 @@ typedef struct pf_guard {
     const char *hung; /* the thread that was last seen hanging */
 } pf_guard;
 
-/* `device`: "/dev/watchdog", or "" for none, barks after `hang_s`; a thread hangs after half of it. False: error[n]
- * says why. */
+/* Starts a thread that feeds them, from before the daemon's devices are opened: what hangs there is the main thread.
+ * Until pf_guard_ready the service manager is told to go on waiting. `device`: "/dev/watchdog", or "" for none, barks
+ * after `hang_s`; a thread hangs after half of it. False: error[n] says why. */
 bool pf_guard_open(pf_guard *guard, const char *device, uint32_t hang_s, char *error, size_t n);
 
 /* The daemon is up. */
 void pf_guard_ready(pf_guard *guard);
 
-/* Feeds what is due. To be called a few times a second, from the thread that starts and ends all the others. */
-void pf_guard_feed(pf_guard *guard, uint64_t now_ns);
-
-/* The daemon ends of itself: the device must not bark. */
+/* The daemon ends of itself: the device must not bark. A second time nothing happens. */
 void pf_guard_close(pf_guard *guard);
 
 #endif

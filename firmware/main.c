@@ -19,6 +19,7 @@
 #include "pipefish/camera_fixed.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
+#include "pulse.h"
 #include "recall.h"
 #include "tracking.h"
 #include "utf8.h"
@@ -26,6 +27,7 @@
 #define DEFAULT_CONFIG "/etc/pipefish/pipefishd.ini"
 #define TICK_MS        50
 #define OVERRIDES_MAX  128
+#define ALONE_NS       UINT64_C(10000000000) /* without a host, after a signal; hosts pause 5 s at most between tries */
 #define SILENCES       4 /* keepalives without an answer after which a host counts as gone, as the link has it */
 
 enum { DONE = 0, FAILED = 1, USAGE = 2 };
@@ -257,6 +259,7 @@ static void note_gpio(pf_daemon *d, pf_gpio_state *before)
 {
     pf_gpio_state now;
     d->gpio.ops->state(d->gpio.self, &now);
+    pf_pulse_note(PF_PULSE_GPIO, now.round_ns);
     if (now.is_stopped && !before->is_stopped)
         pf_log(PF_LOG_WARNING, "emergency stop: the lamp is off until the daemon starts anew");
     for (uint32_t bit = PF_LIMIT_FRONT; bit <= PF_LIMIT_REAR; bit <<= 1)
@@ -369,10 +372,20 @@ static void take_signal(pf_daemon *d, int signals, bool *is_terminated)
     pf_daemon_stop(d, PF_STOP_TERMINATED);
 }
 
+static bool has_host(pf_daemon *d)
+{
+    pthread_mutex_lock(&d->counters.mutex);
+    bool is_up = d->counters.link_up;
+    pthread_mutex_unlock(&d->counters.mutex);
+    return is_up;
+}
+
 /* Returns when it is time to exit. */
-static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int signals)
+static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
+    const uint64_t up_ns = pf_now();
+    uint64_t host_ns = up_ns; /* when a host was there last */
     bool is_terminated = false, must_exit = false;
     pf_gpio_state gpio = {0};
     for (;;) {
@@ -380,13 +393,17 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int 
         bool is_drained, had_to_exit = must_exit;
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
-        pf_guard_feed(guard, pf_now());
+        pf_pulse_work();
+        if (pf_now() - up_ns > PF_RECALL_UP_NS)
+            pf_recall_up(d->recall, !atomic_load(&guard->is_hung));
         if (pf_now() - d->started_ns > PF_RECALL_GOOD_NS)
             pf_recall_good(d->recall, &d->config);
         note_status(d, &status_due, false);
         note_gpio(d, &gpio);
         if (d->keeper != NULL)
             pf_keeper_work(d->keeper);
+        if (!is_terminated || has_host(d))
+            host_ns = pf_now();
         if (atomic_load(&d->state) == PF_STATE_SURVEYING && !is_terminated)
             continue;
         must_exit = is_terminated || atomic_load(&d->stop) == PF_STOP_SHUTDOWN;
@@ -396,12 +413,13 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, pf_guard *guard, int 
         is_drained = pf_pipeline_is_done(pipeline) && pf_store_is_drained(d->store);
         if (is_drained)
             atomic_store(&d->state, PF_STATE_IDLE);
-        if ((must_exit || d->config.daemon.exit_when_done) && (is_drained || pf_now() >= drain_end))
+        if ((must_exit || d->config.daemon.exit_when_done) &&
+            (is_drained || pf_now() >= drain_end || pf_now() - host_ns >= ALONE_NS))
             return;
     }
 }
 
-static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *before, int signals)
+static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *before, pf_guard *guard, int signals)
 {
     const pf_config *c = &d->config;
     const pf_camera_info *camera = d->camera.ops->info(d->camera.self);
@@ -416,7 +434,6 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;
     bool is_good = false;
-    pf_guard guard = {.manager = -1, .device = -1};
 
     if (c->spool.quota_mb > 0 && (double)store.capacity > c->spool.quota_mb * 1e6) {
         pf_log(PF_LOG_ERROR, "spool.quota_mb = %g: an object of this camera may have %.2f MB", c->spool.quota_mb,
@@ -429,8 +446,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     }
     if (!pf_still_open(&d->still, camera->width, camera->height))
         (void)snprintf(error, sizeof error, "no memory for a still");
-    else if (pf_guard_open(&guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) &&
-             pf_courier_open(&courier, d, error, sizeof error) &&
+    else if (pf_courier_open(&courier, d, error, sizeof error) &&
              pf_pipeline_open(&pipeline, d, courier, survey, before, error, sizeof error)) {
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
@@ -438,12 +454,13 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         is_good = pf_pipeline_start(pipeline, error, sizeof error);
     }
     if (is_good) {
-        pf_guard_ready(&guard);
-        supervise(d, pipeline, &guard, signals);
+        pf_guard_ready(guard);
+        supervise(d, pipeline, guard, signals);
     } else {
         pf_log(PF_LOG_ERROR, "%s", error);
     }
-    pf_guard_close(&guard); /* what follows has its own limits, and the service manager's for stopping */
+    pf_pulse_note(PF_PULSE_GPIO, 0);
+    pf_guard_close(guard); /* what follows has its own limits, and the service manager's for stopping */
     /* The time to drain limits only the sending: every keyframe that was made, and the survey's end, are stored first.
      * The store ends last, for what the host acknowledges while the courier lingers must be removed. */
     pf_store_flush(d->store);
@@ -465,29 +482,37 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     return is_good ? DONE : FAILED;
 }
 
-static int open_and_run(pf_daemon *d, int signals)
+/* Each step may take as long as a thread may work on one thing. */
+static int open_and_run(pf_daemon *d, pf_guard *guard, int signals)
 {
     const pf_config *c = &d->config;
     char error[1024] = "";
-    pf_spool_config spool = {c->spool.path, (uint64_t)(c->spool.quota_mb * 1e6)};
+    pf_spool_config spool = {
+        .path = c->spool.path, .quota = (uint64_t)(c->spool.quota_mb * 1e6), .alive = pf_pulse_work};
     pf_survey survey, before;
     uint8_t setup[32];
     int code = FAILED;
 
+    pf_pulse_begin(PF_PULSE_MAIN);
     d->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    if (d->wake_fd < 0 || !open_random(d, error, sizeof error) || !open_camera(d, error, sizeof error)) {
+    if (d->wake_fd < 0 || !open_random(d, error, sizeof error) ||
+        !pf_guard_open(guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) ||
+        !open_camera(d, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
+    pf_pulse_work();
     settle_profile(d);
     if (!hash_setup(d, setup))
         (void)snprintf(error, sizeof error, "the setup cannot be hashed");
     else if (open_gpio(d, error, sizeof error)) {
+        pf_pulse_work();
         if (open_transport(d, error, sizeof error)) {
+            pf_pulse_work();
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
                 if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {
                     memcpy(d->survey_id, survey.id, sizeof d->survey_id);
-                    code = run_survey(d, &survey, &before, signals);
+                    code = run_survey(d, &survey, &before, guard, signals);
                     error[0] = '\0';
                 }
                 d->spool.ops->close(d->spool.self);
@@ -508,6 +533,7 @@ int main(int argc, char **argv)
 {
     static pf_daemon d; /* 100 kB of settings and counters: not for the stack */
     static pf_recall recall;
+    static pf_guard guard = {.manager = -1, .device = -1};
     options o = {.config = DEFAULT_CONFIG};
     char error[1536] = "";
     sigset_t set;
@@ -549,7 +575,8 @@ int main(int argc, char **argv)
         pf_log(PF_LOG_ERROR, "signals: %s", strerror(errno));
         return FAILED;
     }
-    code = open_and_run(&d, signals);
+    code = open_and_run(&d, &guard, signals);
+    pf_guard_close(&guard); /* where it failed to open something */
     if (d.keeper != NULL)
         pf_keeper_close(d.keeper);
     (void)close(signals);

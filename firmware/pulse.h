@@ -10,11 +10,17 @@ typedef enum pf_pulse {
     PF_PULSE_TRACKING,
     PF_PULSE_STORE,
     PF_PULSE_COURIER,
+    PF_PULSE_GPIO,
+    PF_PULSE_MAIN,
     PF_PULSES,
 } pf_pulse;
 
-/* The calling thread is this one from now on, and works. */
+/* The calling thread is this one from now on, and works. The system shows it by that name (top -H), but for main, whose
+ * name is the process's. */
 void pf_pulse_begin(pf_pulse pulse);
+
+/* For a thread that knows nothing of pulses: when it began what it does now; 0 = it is not there. */
+void pf_pulse_note(pf_pulse pulse, uint64_t since_ns);
 
 /* The calling thread begins another piece of work; rests. A thread that never began is not watched. */
 void pf_pulse_work(void);

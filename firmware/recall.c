@@ -28,8 +28,8 @@ static void keep(const pf_recall *r, const char *name, const char *text, size_t 
 
 static void keep_starts(const pf_recall *r)
 {
-    char text[96];
-    int n = snprintf(text, sizeof text, "%u %s\n", r->starts, r->hash);
+    char text[160];
+    int n = snprintf(text, sizeof text, "%u %s %s%s\n", r->starts, r->hash, r->boot, r->is_up ? " up" : "");
     keep(r, "starts", text, (size_t)n);
 }
 
@@ -49,10 +49,31 @@ static bool hash_file(const char *file, char hash[65])
     return ok;
 }
 
+/* Another for each start of the kernel. */
+static void read_boot(char boot[40])
+{
+    FILE *in = fopen("/proc/sys/kernel/random/boot_id", "re");
+    if (in == NULL || fscanf(in, "%36s", boot) != 1)
+        (void)strcpy(boot, "-");
+    if (in != NULL)
+        (void)fclose(in);
+}
+
+/* Starts in a row that failed, before this one. */
+static unsigned failed_before(const pf_recall *r, FILE *in)
+{
+    char hash[65] = "", boot[40] = "", state[8] = "";
+    unsigned starts = 0;
+    int fields = fscanf(in, "%9u %64s %36s %7s", &starts, hash, boot, state);
+    if (fields < 2 || strcmp(hash, r->hash) != 0) /* other settings have their own tries */
+        return 0;
+    bool was_cut = fields == 4 && strcmp(state, "up") == 0 && strcmp(boot, r->boot) != 0;
+    return was_cut && starts > 0 ? starts - 1 : starts;
+}
+
 void pf_recall_begin(pf_recall *recall, const char *folder, const char *file)
 {
-    char path[PATH_BYTES], hash[65] = "";
-    unsigned starts = 0;
+    char path[PATH_BYTES];
     memset(recall, 0, sizeof *recall);
     if (folder == NULL || folder[0] == '\0' || strlen(folder) >= sizeof recall->folder ||
         !hash_file(file, recall->hash))
@@ -63,11 +84,11 @@ void pf_recall_begin(pf_recall *recall, const char *folder, const char *file)
         recall->folder[0] = '\0';
         return;
     }
+    read_boot(recall->boot);
     path_of(recall, "starts", path);
     FILE *in = fopen(path, "rbe");
     if (in != NULL) {
-        bool is_same = fscanf(in, "%9u %64s", &starts, hash) == 2 && strcmp(hash, recall->hash) == 0;
-        recall->starts = is_same ? starts : 0; /* other settings have their own tries */
+        recall->starts = failed_before(recall, in);
         (void)fclose(in);
     }
     path_of(recall, "good.ini", path);
@@ -83,6 +104,14 @@ bool pf_recall_is_due(const pf_recall *recall, char *path, size_t n)
         return false;
     (void)snprintf(path, n, "%s/good.ini", recall->folder);
     return true;
+}
+
+void pf_recall_up(pf_recall *recall, bool is_well)
+{
+    if (recall->folder[0] == '\0' || recall->is_done || recall->is_up == is_well)
+        return;
+    recall->is_up = is_well;
+    keep_starts(recall);
 }
 
 void pf_recall_good(pf_recall *recall, const pf_config *config)

@@ -36,11 +36,36 @@ void pf_session_close(pf_session *s)
     s->workspace = NULL;
 }
 
+/* Whether the host that came up had the link before another, and has to come up once more. */
+static bool must_renew(pf_session *s, pf_link_event *up, uint64_t now)
+{
+    bool is_back = false;
+    up->peer_restarted = up->peer_restarted || s->has_restarted;
+    s->has_restarted = false;
+    if (s->peers[0] == up->peer_nonce)
+        return false;
+    for (uint32_t i = 1; i < PF_SESSION_PEERS; i++)
+        is_back = is_back || s->peers[i] == up->peer_nonce;
+    memmove(s->peers + 1, s->peers, sizeof s->peers - sizeof s->peers[0]);
+    s->peers[0] = up->peer_nonce;
+    const uint32_t nonce = is_back ? draw_nonce() : 0;
+    if (nonce == 0)
+        return false;
+    memset(s->peers + 1, 0, sizeof s->peers - sizeof s->peers[0]);
+    s->has_restarted = up->peer_restarted;
+    pf_link_renew(s->link, nonce, now);
+    return true;
+}
+
 void pf_session_events(pf_session *s, pf_session_take *take, void *context, uint64_t now)
 {
     pf_link_event event;
-    while (pf_link_next_event(s->link, &event))
-        take(context, s, &event, now);
+    while (pf_link_next_event(s->link, &event)) {
+        if (event.type == PF_LINK_UP && must_renew(s, &event, now))
+            (void)pf_link_next_event(s->link, &event); /* its end: nobody has heard of it */
+        else
+            take(context, s, &event, now);
+    }
 }
 
 void pf_session_begin(pf_session *s, pf_session_take *take, void *context, uint64_t now)
@@ -49,6 +74,8 @@ void pf_session_begin(pf_session *s, pf_session_take *take, void *context, uint6
     const uint32_t nonce = draw_nonce();
     if (nonce != 0)
         pf_link_renew(s->link, nonce, now);
+    memset(s->peers, 0, sizeof s->peers);
+    s->has_restarted = false;
 }
 
 void pf_session_reset(pf_session *s, pf_session_take *take, void *context, uint64_t now)

@@ -1,110 +1,19 @@
-#include "store.h"
+#include "store_inside.h"
 
-#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
-#include <unistd.h>
 
 #include "clock.h"
 #include "config.h"
-#include "damage.h"
 #include "log.h"
-#include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
 #include "pulse.h"
 
 #define HURRY_NS 2000000000u
-#define RETRY_NS UINT64_C(1000000000) /* between tries of what failed */
 
-/* What the spool does not do now. */
-typedef enum trouble { TROUBLE_STORING = 1, TROUBLE_READING = 2, TROUBLE_REMOVING = 4 } trouble;
-
-enum { SLOT_EMPTY = 0, SLOT_READY, SLOT_SENDING, SLOT_DONE };
-
-struct pf_store {
-    pf_spool spool;
-    pf_store_config config;
-    pthread_t thread;
-    pthread_mutex_t mutex; /* guards all below; never held during a call of the spool */
-    pthread_cond_t work;   /* something for the thread */
-    pthread_cond_t change; /* something for those who wait on it */
-    pf_survey survey;
-    pf_job *jobs;      /* the memory of all jobs */
-    pf_job **free_job; /* stack */
-    uint32_t free_count;
-    pf_job **queue; /* ring, oldest first */
-    uint32_t queue_first, queue_count;
-    bool is_blocked;   /* the oldest job waits for room in the spool */
-    bool is_failing;   /* the spool cannot be read now */
-    uint64_t retry_ns; /* when to try again at the latest */
-    uint64_t left_row; /* the first object that could not be removed: tried again for all of them; 0 = none */
-    bool is_rewinding; /* it can again: as soon as no slot holds one, all that are left are offered once more */
-    unsigned troubles; /* those that are there */
-    bool has_more;     /* the spool may hold an object after `cursor` */
-    uint64_t cursor;   /* row of the last object that went into a slot */
-    pf_slot *slots;
-    size_t slot_capacity;
-    bool is_hurried, is_flushing, is_quitting;
-    pf_store_stats stats;
-    /* The thread's own: */
-    bool was_blocked, was_evicting;       /* has said so */
-    unsigned told;                        /* troubles that it has told */
-    uint64_t not_evicted;                 /* of what the spool counts as evicted */
-    bool must_keep;                       /* what other surveys left still has ranks: nothing may go for it */
-    char lost_break[PF_BREAK_REASON_MAX]; /* of a keyframe that was lost: the next one that is stored tells it */
-};
-
-/* ---- the thread's work: each is called without the mutex */
-
-/* Stores a job, and takes the victims out. */
-static pf_status store_object(pf_store *s, const pf_job *job, const pf_survey *survey, const char *break_reason,
-                              const pf_spool_victim *victims, uint32_t count)
-{
-    const pf_spool_rank rank = {pf_survey_importance(job->index), job->index};
-    bool may_go = job->kind == PF_OBJECT_KEYFRAME && !job->is_event && break_reason[0] == '\0';
-    size_t n = job->n; /* the bytes behind are free: a job that waits is stored again */
-    uint8_t name[32], value[PF_SURVEY_BYTES];
-    size_t value_n = 0; /* of the survey's end: the value is deleted */
-    if (break_reason[0] != '\0' && pf_msg_append_break(break_reason, job->bytes, s->config.capacity, &n) != PF_OK)
-        return PF_ERR_ARGUMENT;
-    if (pf_sha256(job->bytes, n, name) != PF_OK)
-        return PF_ERR_IO;
-    if (job->kind != PF_OBJECT_SURVEY_END)
-        value_n = pf_survey_pack(survey, value);
-    return s->spool.ops->exchange(s->spool.self, victims, count, job->kind, name, job->bytes, n, may_go ? &rank : NULL,
-                                  PF_SURVEY_KEY, value, value_n);
-}
-
-typedef struct sacrifice {
-    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
-    uint32_t count;
-} sacrifice;
-
-/* A full spool makes room for a keyframe by giving up less important ones that no slot holds; the survey that is stored
- * with it remembers them. */
-static pf_status store_instead(pf_store *s, const pf_job *job, pf_survey *survey, const char *break_reason,
-                               uint64_t cursor, sacrifice *made)
-{
-    if (s->must_keep && s->spool.ops->keep_all(s->spool.self) != PF_OK)
-        return PF_ERR_SPACE;
-    s->must_keep = false;
-    uint32_t importance = job->is_event ? UINT32_MAX : pf_survey_importance(job->index);
-    pf_status status = s->spool.ops->victims(s->spool.self, cursor, importance, job->n, made->victims, &made->count);
-    for (uint32_t i = 0; status == PF_OK && i < made->count; i++)
-        pf_survey_lose(survey, made->victims[i].number);
-    if (status == PF_OK)
-        status = store_object(s, job, survey, break_reason, made->victims, made->count);
-    if (status != PF_OK)
-        made->count = 0;
-    return status;
-}
-
-static bool is_keyframe(const pf_job *job)
-{
-    return job->kind == PF_OBJECT_KEYFRAME;
-}
+/* ---- counting */
 
 static void lose(pf_store *s, uint32_t index)
 {
@@ -112,230 +21,43 @@ static void lose(pf_store *s, uint32_t index)
     pf_survey_lose(&s->survey, index);
 }
 
-static void lose_job(pf_store *s, const pf_job *job)
+void pf_store_lose_job(pf_store *s, const pf_job *job)
 {
-    if (is_keyframe(job))
+    if (job->kind == PF_OBJECT_KEYFRAME)
         lose(s, job->index);
     else
         s->stats.has_failed = true;
 }
 
-static const char *what(const pf_job *job)
+const char *pf_job_what(const pf_job *job)
 {
-    return is_keyframe(job) ? "a keyframe" : "the survey's start or end";
+    return job->kind == PF_OBJECT_KEYFRAME ? "a keyframe" : "the survey's start or end";
 }
 
-/* With the mutex, right after the call. */
-static void note_trouble(pf_store *s, trouble which, bool is_there)
+void pf_store_note_trouble(pf_store *s, pf_trouble which, const char *why)
 {
-    s->troubles = is_there ? s->troubles | which : s->troubles & ~(unsigned)which;
-    if (is_there || s->troubles == 0)
-        (void)snprintf(s->stats.trouble, sizeof s->stats.trouble, "%s",
-                       is_there ? s->spool.ops->error(s->spool.self) : "");
+    s->troubles = why != NULL ? s->troubles | which : s->troubles & ~(unsigned)which;
+    if (why != NULL || s->troubles == 0)
+        (void)snprintf(s->stats.trouble, sizeof s->stats.trouble, "%s", why != NULL ? why : "");
 }
 
-static void free_job(pf_store *s, pf_job *job)
+void pf_store_free_job(pf_store *s, pf_job *job)
 {
     s->free_job[s->free_count++] = job;
     pthread_cond_broadcast(&s->change);
 }
 
-static void pop_job(pf_store *s)
-{
-    pf_job *job = s->queue[s->queue_first];
-    s->queue_first = (s->queue_first + 1) % s->config.jobs;
-    s->queue_count--;
-    free_job(s, job);
-}
-
-/* Stores the oldest job. Enters and leaves with the mutex. */
-static void do_job(pf_store *s)
-{
-    const pf_job *job = s->queue[s->queue_first];
-    pf_survey survey = s->survey;
-    uint64_t start = pf_now();
-    bool may_wait = !s->is_flushing && (s->config.is_patient || !is_keyframe(job));
-    bool is_waiting;
-    char break_reason[PF_BREAK_REASON_MAX] = "";
-    uint64_t cursor = s->cursor;
-    sacrifice made = {.count = 0};
-    pf_status status;
-
-    if (is_keyframe(job))
-        survey.next_index = job->index + 1;
-    pthread_mutex_unlock(&s->mutex);
-    if (is_keyframe(job))
-        memcpy(break_reason, job->break_reason[0] ? job->break_reason : s->lost_break, sizeof break_reason);
-    status = store_object(s, job, &survey, break_reason, NULL, 0);
-    if (status == PF_ERR_SPACE && is_keyframe(job) && !s->config.is_patient)
-        status = store_instead(s, job, &survey, break_reason, cursor, &made);
-    is_waiting = status == PF_ERR_SPACE && may_wait;
-    bool is_evicting = is_keyframe(job) && (made.count > 0 || (status == PF_ERR_SPACE && !is_waiting));
-    if (is_evicting && !s->was_evicting)
-        pf_log(PF_LOG_WARNING, "%s: keyframes are given up from now on, the least important first",
-               made.count > 0 ? "the spool is full" : s->spool.ops->error(s->spool.self));
-    if (is_waiting && !s->was_blocked)
-        pf_log(PF_LOG_WARNING, "%s: waiting until there is room", s->spool.ops->error(s->spool.self));
-    else if (status != PF_OK && !is_waiting && !is_evicting)
-        pf_log(PF_LOG_ERROR, "%s: %s is lost", s->spool.ops->error(s->spool.self), what(job));
-    s->was_blocked = is_waiting;
-    s->was_evicting = is_evicting;
-    if (is_keyframe(job) && status == PF_OK)
-        s->lost_break[0] = '\0';
-    else if (is_keyframe(job) && !is_waiting)
-        memcpy(s->lost_break, break_reason, sizeof s->lost_break);
-    pthread_mutex_lock(&s->mutex);
-    note_trouble(s, TROUBLE_STORING, status != PF_OK);
-    if (is_waiting) {
-        s->is_blocked = !s->is_flushing;
-        s->retry_ns = pf_now() + RETRY_NS;
-        return;
-    }
-    if (status == PF_OK) {
-        s->has_more = true;
-        s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
-        if (is_keyframe(job)) {
-            for (uint32_t i = 0; i < made.count; i++)
-                pf_survey_lose(&s->survey, made.victims[i].number);
-            s->survey.next_index = job->index + 1;
-            s->stats.store_ns += pf_now() - start;
-            s->stats.stored++;
-        }
-    } else {
-        lose_job(s, job);
-    }
-    pop_job(s);
-}
-
-/* Says once, not every second, that the spool fails; without the mutex, after a call that says how. */
-static void note_failure(pf_store *s, trouble which, bool is_failing)
-{
-    if (is_failing && (s->told & which) == 0)
-        pf_log(PF_LOG_ERROR, "%s: trying again", s->spool.ops->error(s->spool.self));
-    s->told = is_failing ? s->told | which : s->told & ~(unsigned)which;
-}
-
-static void retry_later(pf_store *s)
-{
-    s->is_failing = true;
-    s->retry_ns = pf_now() + RETRY_NS;
-}
-
-/* Without the mutex. What the medium has damaged is of no use to anyone, and never acknowledged: it goes, and a
- * keyframe is counted and named in its survey's lost ranges. */
-static void give_up_damaged(pf_store *s, const pf_slot *slot, size_t n)
-{
-    const bool is_frame = slot->item.kind == PF_OBJECT_KEYFRAME;
-    uint8_t value[PF_SURVEY_BYTES];
-    size_t value_n = 0;
-    pf_damage damage = {.is_known = false};
-    pf_log(PF_LOG_ERROR, "%s: it is given up", s->spool.ops->error(s->spool.self));
-    pf_status status =
-        is_frame ? pf_damage_settle(&damage, &s->spool, &slot->item, slot->bytes, s->slot_capacity, n) : PF_OK;
-    pthread_mutex_lock(&s->mutex);
-    if (is_frame && damage.is_known && !damage.is_named &&
-        memcmp(damage.survey_id, s->survey.id, sizeof damage.survey_id) == 0) {
-        pf_survey_lose(&s->survey, damage.index);
-        value_n = pf_survey_pack(&s->survey, value);
-    }
-    s->stats.keyframes_dropped += is_frame && status == PF_OK;
-    if (damage.is_named)
-        s->not_evicted += 2; /* the keyframe, and the end that another has replaced */
-    pthread_mutex_unlock(&s->mutex);
-    if (status == PF_OK && value_n > 0) /* before it goes, lest a power cut leave it unnamed */
-        status = s->spool.ops->set(s->spool.self, PF_SURVEY_KEY, value, value_n);
-    if (status == PF_OK && !damage.is_named)
-        status = s->spool.ops->remove(s->spool.self, slot->item.row);
-    if (status != PF_OK)
-        pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
-}
-
-/* Loads the next object into an empty slot. Enters and leaves with the mutex. */
-static void fill_slot(pf_store *s, pf_slot *slot)
-{
-    uint64_t after = s->cursor, one = 1;
-    size_t n = 0;
-    pf_status status;
-    /* Before the look: what is stored meanwhile sets it again. */
-    s->has_more = false;
-    pthread_mutex_unlock(&s->mutex);
-    status = s->spool.ops->next(s->spool.self, after, &slot->item);
-    if (status == PF_OK) {
-        status = s->spool.ops->read(s->spool.self, slot->item.row, slot->bytes, s->slot_capacity, &n);
-        if (status == PF_ERR_CHECKSUM)
-            give_up_damaged(s, slot, n);
-        else if (status == PF_ERR_SPACE)
-            pf_log(PF_LOG_ERROR, "%s: it stays in the spool", s->spool.ops->error(s->spool.self));
-        if (status != PF_ERR_IO)
-            after = slot->item.row;
-    }
-    note_failure(s, TROUBLE_READING, status == PF_ERR_IO);
-    pthread_mutex_lock(&s->mutex);
-    if (status == PF_OK || status == PF_ERR_IO)
-        note_trouble(s, TROUBLE_READING, status != PF_OK);
-    if (after != s->cursor || status == PF_ERR_IO)
-        s->has_more = true;
-    s->cursor = after;
-    if (status == PF_ERR_IO)
-        retry_later(s);
-    if (status != PF_OK)
-        return;
-    slot->state = SLOT_READY;
-    pthread_mutex_unlock(&s->mutex);
-    if (write(s->config.wake_fd, &one, sizeof one) < 0)
-        pf_log(PF_LOG_ERROR, "cannot wake the courier");
-    pthread_mutex_lock(&s->mutex);
-}
-
-/* Whether it has gone from the spool. Enters and leaves with the mutex. */
-static bool remove_row(pf_store *s, uint64_t row)
-{
-    bool is_removed;
-    pthread_mutex_unlock(&s->mutex);
-    is_removed = s->spool.ops->remove(s->spool.self, row) == PF_OK;
-    note_failure(s, TROUBLE_REMOVING, !is_removed);
-    pthread_mutex_lock(&s->mutex);
-    note_trouble(s, TROUBLE_REMOVING, !is_removed);
-    if (is_removed)
-        s->is_blocked = false;
-    else
-        s->retry_ns = pf_now() + RETRY_NS;
-    return is_removed;
-}
-
-/* What cannot be removed stays and counts, and keeps nothing behind it from being sent. */
-static void empty_slot(pf_store *s, pf_slot *slot)
-{
-    if (!remove_row(s, slot->item.row) && s->left_row == 0)
-        s->left_row = slot->item.row;
-    slot->state = SLOT_EMPTY;
-}
-
-/* Once the first that was left can be removed, the host is offered the others again: it has them, and says so. */
-static void try_left(pf_store *s)
-{
-    if (s->left_row != 0 && pf_now() >= s->retry_ns && remove_row(s, s->left_row)) {
-        s->left_row = 0;
-        s->is_rewinding = true;
-    }
-    for (uint32_t i = 0; i < s->config.slots; i++)
-        if (s->slots[i].state != SLOT_EMPTY)
-            return;
-    if (s->is_rewinding) {
-        s->cursor = 0;
-        s->has_more = true;
-        s->is_rewinding = false;
-    }
-}
+/* ---- the thread */
 
 static void refresh_spool_stats(pf_store *s)
 {
     pf_spool_stats stats;
     pthread_mutex_unlock(&s->mutex);
     s->spool.ops->stats(s->spool.self, &stats);
+    if (stats.healed != s->told_healed)
+        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->healing(s->spool.self));
+    s->told_healed = stats.healed;
     pthread_mutex_lock(&s->mutex);
-    if (stats.healed != s->stats.spool.healed)
-        pf_log(PF_LOG_ERROR, "%s", s->spool.ops->error(s->spool.self));
     stats.evicted -= s->not_evicted;
     s->stats.spool = stats;
     pthread_cond_broadcast(&s->change);
@@ -346,17 +68,17 @@ static bool do_round(pf_store *s)
 {
     bool is_busy = false;
     if (s->queue_count > 0 && !s->is_blocked) {
-        do_job(s);
+        pf_storing_do(s);
         is_busy = true;
     }
-    try_left(s);
+    pf_slots_try_left(s);
     for (uint32_t i = 0; i < s->config.slots; i++) {
         if (s->slots[i].state == SLOT_DONE) {
-            empty_slot(s, &s->slots[i]);
+            pf_slots_empty(s, &s->slots[i]);
             is_busy = true;
         }
         if (s->slots[i].state == SLOT_EMPTY && s->has_more && !s->is_failing && !s->is_rewinding && !s->is_quitting) {
-            fill_slot(s, &s->slots[i]);
+            pf_slots_fill(s, &s->slots[i]);
             is_busy = true;
         }
     }
@@ -542,8 +264,8 @@ void pf_store_give(pf_store *s, pf_job *job)
     pthread_mutex_lock(&s->mutex);
     is_late = s->is_quitting;
     if (is_late) {
-        lose_job(s, job);
-        free_job(s, job);
+        pf_store_lose_job(s, job);
+        pf_store_free_job(s, job);
     } else {
         s->queue[(s->queue_first + s->queue_count++) % s->config.jobs] = job;
         s->has_more =
@@ -552,13 +274,13 @@ void pf_store_give(pf_store *s, pf_job *job)
     }
     pthread_mutex_unlock(&s->mutex);
     if (is_late)
-        pf_log(PF_LOG_ERROR, "the store has quit: %s is lost", what(job));
+        pf_log(PF_LOG_ERROR, "the store has quit: %s is lost", pf_job_what(job));
 }
 
 void pf_store_give_back(pf_store *s, pf_job *job)
 {
     pthread_mutex_lock(&s->mutex);
-    free_job(s, job);
+    pf_store_free_job(s, job);
     pthread_mutex_unlock(&s->mutex);
 }
 

@@ -1,9 +1,10 @@
-"""Link, spool and daemon for long: what takes hours, in pieces that are kept.
+"""Link and daemon for long: what takes hours, in pieces that are kept.
 
 sessions    10,000 seeded sessions of two links over lines with faults of every kind at once (test_link_channel.c says
             which): every object once, whole and identical, or the session has failed
 soak        1,000,000 frames replayed through pipefishd to a host that takes everything: memory flat, nothing dropped,
             lost or twice. Frames of 96 x 80 pixels, so that it is the daemon's housekeeping that is tried
+control     pipefishd on an emulated cable of 921600 baud that is full of keyframes: how long a request takes, really
 
 A session's or a soak piece's figures are kept in build/accept/link/ and taken from there while the program is the same:
 what was interrupted goes on where it stopped. Pieces that would begin after --minutes are left out: the row then tells
@@ -27,16 +28,21 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from accept_rows import Row, at_most, exactly, print_rows
+from accept_rows import Row, at_least, at_most, exactly, figure, print_rows
 
+from pipefish import pipefish_pb2 as pb
+from pipefish.client import ACCEPT, STORED, Client, ObjectHandlers
 from pipefish.files import write_atomically
 from pipefish.survey import Survey
+from pipefish.transport import SerialTransport
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build/accept/link"
 CHANNEL = ROOT / "build/debug/tests/unit/test_link_channel"
 DAEMON = ROOT / "build/release/firmware/pipefishd"
+LINE = ROOT / "build/release/drivers/pipefish-line"
 SESSIONS, BATCH = 10_000, 100
+CONTROL_BAUD, REQUESTS = 921_600, 300
 SOAK, PIECE, LOOP, WIDTH, HEIGHT = 1_000_000, 50_000, 500, 96, 80
 SETTINGS = {
     "camera.driver": "replay",
@@ -174,7 +180,95 @@ def check_soak(minutes: float) -> list[Row]:
     return rows
 
 
-CHECKS = {"sessions": check_sessions, "soak": check_soak}
+# ---- control
+
+
+class Taker(ObjectHandlers):
+    """A host that takes everything and keeps nothing."""
+
+    def __init__(self) -> None:
+        self.bytes = 0
+
+    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+        return ACCEPT
+
+    def on_object(self, name: bytes, kind: int, data: bytes) -> int:
+        self.bytes += len(data)
+        return STORED
+
+
+def run_control(_piece: int) -> dict:
+    """REQUESTS requests to a daemon whose line has more to carry than it can; ms each, and the share of the line."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_loop(folder / "loop.y4m")
+        rows = [f"{i},{i * 10**9 // 30},{i}" for i in range(LOOP)]  # a millimetre each: a keyframe each
+        (folder / "loop.csv").write_text("\n".join(["sequence,time_ns,encoder_count", *rows]) + "\n")
+        (folder / "empty.ini").touch()
+        ends = folder / "crawler", folder / "host"
+        cable = subprocess.Popen([LINE, "--baud", str(CONTROL_BAUD), *ends], stdout=subprocess.DEVNULL)
+        while not ends[1].exists():
+            time.sleep(0.01)
+        settings = {
+            **SETTINGS,
+            "camera.path": folder / "loop.y4m",
+            "encoder.metres_per_count": "0.001",
+            "keyframe.step_mm": "1",
+            "keyframe.min_interval": "1",
+            "keyframe.jpeg_quality": "100",
+            "spool.path": folder / "spool.db",
+            "daemon.exit_when_done": "false",
+            "link.transport": "serial",
+            "link.device": ends[0],
+            "link.baud": CONTROL_BAUD,
+        }
+        flags = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+        with (folder / "log").open("wb") as log:
+            daemon = subprocess.Popen([DAEMON, "--config", folder / "empty.ini", *flags], stderr=log)
+        while "survey ends" not in (folder / "log").read_text():  # nobody tracks: what is timed is the link
+            time.sleep(0.1)
+        taker = Taker()
+        client = Client(SerialTransport(str(ends[1]), CONTROL_BAUD), taker)
+        took = []
+        try:
+            client.open()
+            client.run(lambda: taker.bytes > 200_000, 60)
+            start, before = time.monotonic(), taker.bytes
+            for _ in range(REQUESTS):
+                asked = time.monotonic()
+                client.answer_to(5, get_status=pb.Nothing())
+                took.append(1e3 * (time.monotonic() - asked))
+                pause = time.monotonic() + 0.02
+                client.run(lambda pause=pause: time.monotonic() > pause, 5)
+            share = (taker.bytes - before) / ((time.monotonic() - start) * CONTROL_BAUD / 10)
+        finally:
+            client.close()
+            for process in (daemon, cable):
+                process.kill()
+                process.wait()
+    took.sort()
+    return {
+        "median_ms": took[len(took) // 2],
+        "p95_ms": took[len(took) * 95 // 100],
+        "most_ms": took[-1],
+        "share": share,
+    }
+
+
+def check_control(minutes: float) -> list[Row]:
+    return [
+        row
+        for p in pieces("control", DAEMON, 1, minutes, run_control)
+        for row in (
+            at_most("link.daemon_control_ms_median", p["median_ms"], 40),
+            # What other programs of this machine delay is in these; the bound in virtual time is link.control_rtt_ms.
+            figure("link.daemon_control_ms_p95", p["p95_ms"], "told only", True),
+            at_least("link.daemon_line_share", p["share"], 0.8),  # the line was indeed full
+        )
+    ]
+
+
+CHECKS = {"sessions": check_sessions, "soak": check_soak, "control": check_control}
 
 
 def main() -> None:

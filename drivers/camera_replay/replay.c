@@ -1,5 +1,6 @@
 /* A recording as a camera: which frame is due when, loops, stamps, and the check of the recorded hashes. */
 #include "replay.h"
+#include "common/monotonic.h"
 
 #include "pipefish/drivers/sha256.h"
 
@@ -41,13 +42,6 @@ typedef struct replay {
     pf_failure failure;
 } replay;
 
-static uint64_t now_ns(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (uint64_t)t.tv_sec * SECOND_NS + (uint64_t)t.tv_nsec;
-}
-
 /* Recorded time of frame `index` of loop `loop`. */
 static uint64_t time_of(const replay *r, uint64_t index, uint64_t loop)
 {
@@ -85,7 +79,7 @@ static pf_status replay_start(void *self)
 {
     replay *r = self;
     r->started = true;
-    r->start_ns = now_ns();
+    r->start_ns = pf_monotonic_ns();
     r->start_time = is_over(r) ? 0 : time_of(r, r->index, r->loop);
     return PF_OK;
 }
@@ -101,14 +95,14 @@ static pf_status replay_stop(void *self)
  * late whose successor is due already. The last frame is never skipped. */
 static pf_status wait_until_due(replay *r, uint32_t timeout_ms)
 {
-    uint64_t now = now_ns(), due = due_ns(r, r->index, r->loop);
+    uint64_t now = pf_monotonic_ns(), due = due_ns(r, r->index, r->loop);
     if (now < due) {
         uint64_t until = now + (uint64_t)timeout_ms * 1000000u;
         if (until > due)
             until = due;
         struct timespec t = {(time_t)(until / SECOND_NS), (long)(until % SECOND_NS)};
         (void)clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL); /* a signal ends it early: AGAIN */
-        return now_ns() < due ? PF_ERR_AGAIN : PF_OK;
+        return pf_monotonic_ns() < due ? PF_ERR_AGAIN : PF_OK;
     }
     for (;;) {
         uint64_t index = r->index, loop = r->loop;

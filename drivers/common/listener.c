@@ -3,6 +3,7 @@
 
 #include <arpa/inet.h>
 #include <errno.h>
+#include <ifaddrs.h>
 #include <linux/sockios.h>
 #include <netinet/tcp.h>
 #include <stdio.h>
@@ -43,6 +44,26 @@ static void write_name(char *name, const pf_address *a, const char *numeric, con
     (void)snprintf(name, PF_LISTENER_NAME_MAX, is_v6 ? "%s [%s]:%u" : "%s %s:%u", what, numeric, port);
 }
 
+/* Whether one of the interfaces has it now. */
+static bool is_there(const pf_address *a)
+{
+    struct ifaddrs *all = NULL;
+    static const uint8_t any[16];
+    const bool is_v4 = a->any.sa_family == AF_INET;
+    const void *wanted = is_v4 ? (const void *)&a->v4.sin_addr : &a->v6.sin6_addr;
+    const size_t n = is_v4 ? 4 : 16;
+    bool found = memcmp(wanted, any, n) == 0 || pf_address_is_loopback(a) || getifaddrs(&all) != 0;
+    for (const struct ifaddrs *i = all; i != NULL && !found; i = i->ifa_next) {
+        if (i->ifa_addr == NULL || i->ifa_addr->sa_family != a->any.sa_family)
+            continue;
+        const pf_address *own = (const pf_address *)(const void *)i->ifa_addr;
+        found = memcmp(wanted, is_v4 ? (const void *)&own->v4.sin_addr : &own->v6.sin6_addr, n) == 0;
+    }
+    if (all != NULL)
+        freeifaddrs(all);
+    return found;
+}
+
 pf_status pf_listener_open(int *fd, char *name, const pf_address *address, const char *numeric, const char *what,
                            pf_failure *failure)
 {
@@ -53,7 +74,10 @@ pf_status pf_listener_open(int *fd, char *name, const pf_address *address, const
     *fd = socket(a.any.sa_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     if (*fd < 0)
         return pf_fail(failure, PF_ERR_IO, "%s: %s", name, strerror(errno));
-    if (setsockopt(*fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof on) != 0 || bind(*fd, &a.any, size) != 0 ||
+    /* Before the cable is in, or the address server has answered, a board does not have its address. */
+    const bool must_wait = !is_there(&a);
+    if ((must_wait && setsockopt(*fd, IPPROTO_IP, IP_FREEBIND, &on, sizeof on) != 0) ||
+        setsockopt(*fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof on) != 0 || bind(*fd, &a.any, size) != 0 ||
         listen(*fd, BACKLOG) != 0 || getsockname(*fd, &a.any, &size) != 0) {
         pf_status status = pf_fail(failure, PF_ERR_IO, "%s: %s", name, strerror(errno));
         (void)close(*fd);
@@ -61,6 +85,9 @@ pf_status pf_listener_open(int *fd, char *name, const pf_address *address, const
         return status;
     }
     write_name(name, &a, numeric, what);
+    if (must_wait)
+        (void)pf_fail(failure, PF_OK, "this device does not have the address %s yet: hosts come in once it has",
+                      numeric);
     return PF_OK;
 }
 

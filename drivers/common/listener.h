@@ -21,7 +21,7 @@ pf_status pf_address_parse(pf_address *address, const char *numeric, uint16_t po
 bool pf_address_is_loopback(const pf_address *address);
 
 /* *fd listens, without blocking; name[PF_LISTENER_NAME_MAX] becomes "tcp 127.0.0.1:7447" with the port that it got.
- * PF_ERR_IO. */
+ * An address that this device does not have yet is waited for: PF_OK, and failure says so. PF_ERR_IO. */
 pf_status pf_listener_open(int *fd, char *name, const pf_address *address, const char *numeric, const char *what,
                            pf_failure *failure);
 

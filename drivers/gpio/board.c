@@ -1,5 +1,6 @@
 /* A crawler's lamp, wheel, buttons and LED. One thread of its own watches the inputs: what a button does must not wait
  * for anybody. */
+#include "common/monotonic.h"
 #include "gpio/wheel.h"
 
 #include <errno.h>
@@ -10,7 +11,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/eventfd.h>
-#include <time.h>
 #include <unistd.h>
 
 #define TICK_MS 100u /* of the LED, and between two readings of a counter */
@@ -38,17 +38,11 @@ typedef struct board {
     bool is_over, is_stopped, lamp_is_broken;
     pf_indication indication;
     uint32_t ticks;
+    uint64_t round_ns;
     button button[BUTTONS];
     pf_wheel wheel;
     pf_failure failure;
 } board;
-
-static uint64_t now_ns(void)
-{
-    struct timespec t;
-    (void)clock_gettime(CLOCK_MONOTONIC, &t);
-    return (uint64_t)t.tv_sec * 1000000000u + (uint64_t)t.tv_nsec;
-}
 
 /* ---- lights */
 
@@ -183,7 +177,8 @@ static void show(board *b)
 static void *watch(void *argument)
 {
     board *b = argument;
-    uint64_t tick = now_ns();
+    uint64_t tick = pf_monotonic_ns();
+    (void)pthread_setname_np(pthread_self(), "GPIO");
     pthread_mutex_lock(&b->mutex);
     while (!b->is_over) {
         struct pollfd fd[2 + BUTTONS] = {{b->wake, POLLIN, 0}, {pf_wheel_fd(&b->wheel), POLLIN, 0}};
@@ -193,8 +188,9 @@ static void *watch(void *argument)
                 0};
         pthread_mutex_unlock(&b->mutex);
         (void)poll(fd, 2 + BUTTONS, (int)TICK_MS);
-        uint64_t now = now_ns();
+        uint64_t now = pf_monotonic_ns();
         pthread_mutex_lock(&b->mutex);
+        b->round_ns = now;
         if (fd[2].revents != 0)
             stop_if_pressed(b);
         for (uint32_t i = 1; i < BUTTONS; i++)
@@ -245,7 +241,7 @@ static pf_status board_encoder(void *self, uint64_t time_ns, int64_t *count, uin
     if (status != PF_OK)
         return status;
     pthread_mutex_lock(&b->mutex);
-    pf_wheel_read(&b->wheel, now_ns()); /* what the thread has not come to yet */
+    pf_wheel_read(&b->wheel, pf_monotonic_ns()); /* what the thread has not come to yet */
     *count = pf_history_at(&b->wheel.history, time_ns, b->wheel.decoder.count);
     *missed = b->wheel.decoder.missed;
     if (b->wheel.is_broken)
@@ -273,6 +269,7 @@ static void board_state(void *self, pf_gpio_state *state)
                              .missed = b->wheel.decoder.missed,
                              .repeated = b->wheel.decoder.repeated,
                              .illegal = b->wheel.decoder.illegal,
+                             .round_ns = b->round_ns,
                              .is_broken = b->wheel.is_broken || b->lamp_is_broken};
     for (uint32_t i = 0; i < BUTTONS; i++)
         state->is_broken = state->is_broken || b->button[i].is_broken;
@@ -319,6 +316,7 @@ static pf_status open_parts(board *b, const pf_gpio_config *c)
     b->is_stopped = b->button[0].is_pressed;
     if (has_light(&b->lamp) && !b->is_stopped && set_light(&b->lamp, c->lamp_level) != PF_OK)
         return pf_fail(f, PF_ERR_IO, "gpio.lamp: %s: cannot be set", c->lamp);
+    b->round_ns = pf_monotonic_ns();
     b->wake = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     if (b->wake < 0 || pthread_create(&b->thread, NULL, watch, b) != 0)
         return pf_fail(f, PF_ERR_SPACE, "gpio: cannot start its thread");

@@ -1,5 +1,6 @@
 /* Serial line: raw, non-blocking, any baud rate the device can make (termios2), reopened when it was unplugged. */
 #include "common/failure.h"
+#include "common/monotonic.h"
 #include "pipefish/drivers/transport.h"
 #include "pipefish/link.h"
 
@@ -13,7 +14,6 @@
 #include <sys/ioctl.h>
 #include <sys/stat.h>
 #include <sys/sysmacros.h>
-#include <time.h>
 #include <unistd.h>
 
 #define BAUD_MIN 9600u
@@ -36,13 +36,6 @@ typedef struct serial {
     char name[160];
     pf_failure failure;
 } serial;
-
-static uint64_t now_ns(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (uint64_t)t.tv_sec * 1000000000u + (uint64_t)t.tv_nsec;
-}
 
 /* Sets 8N1, raw, at a rate; *actual is what the driver made of it. */
 static int set_line(int fd, uint32_t baud, bool rtscts, uint32_t *actual)
@@ -133,7 +126,7 @@ static pf_status open_device(serial *s, bool *is_absent)
     s->fd = fd;
     s->fresh = true;
     s->pty_queue = 0;
-    s->pty_time_ns = now_ns();
+    s->pty_time_ns = pf_monotonic_ns();
     return PF_OK;
 }
 
@@ -188,7 +181,7 @@ static size_t five_ms(const serial *s)
 
 static void drain_pty(serial *s)
 {
-    uint64_t now = now_ns();
+    uint64_t now = pf_monotonic_ns();
     s->pty_queue -= (double)(now - s->pty_time_ns) * 1e-9 * s->baud / 10;
     if (s->pty_queue < 0)
         s->pty_queue = 0;

@@ -2,11 +2,14 @@
 #include "pipefish/drivers/sha256.h"
 
 #include <errno.h>
+#include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
 #include <unistd.h>
 
-#define ASIDE_MAX 99
+#define ASIDE_MAX     99
+#define CHUNK_OBJECTS 64 /* of one transaction: some megabytes, so that neither a kill nor the log costs much */
+#define PATH_BYTES    1024
 
 bool pf_spool_was_one(const char *path, uint32_t application_id)
 {
@@ -22,82 +25,223 @@ bool pf_spool_was_one(const char *path, uint32_t application_id)
     return (n >= 72 && memcmp(page + 68, id, sizeof id) == 0) || memmem(page, n, mark, sizeof mark - 1) != NULL;
 }
 
-pf_status pf_spool_set_aside(const char *path, char aside[PF_SALVAGE_PATH_MAX], pf_failure *failure)
+/* The log's name follows the file's. */
+static int rename_both(const char *from, const char *to)
 {
-    char from[PF_SALVAGE_PATH_MAX], to[PF_SALVAGE_PATH_MAX + 8];
+    char log_from[PATH_BYTES + 8], log_to[PATH_BYTES + 8];
+    if (rename(from, to) != 0)
+        return -1;
+    (void)snprintf(log_from, sizeof log_from, "%s-wal", from);
+    (void)snprintf(log_to, sizeof log_to, "%s-wal", to);
+    (void)rename(log_from, log_to);
+    return 0;
+}
+
+static void name_aside(const char *path, int number, char read[PATH_BYTES], char unread[PATH_BYTES])
+{
+    (void)snprintf(read, PATH_BYTES, "%s.damaged-%d", path, number);
+    (void)snprintf(unread, PATH_BYTES, "%s.damaged-%d.unread", path, number);
+}
+
+pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
+{
+    char read[PATH_BYTES], unread[PATH_BYTES];
     int number = 1;
-    do
-        (void)snprintf(aside, PF_SALVAGE_PATH_MAX, "%s.damaged-%d", path, number);
-    while (access(aside, F_OK) == 0 && ++number <= ASIDE_MAX);
-    if (rename(path, aside) != 0)
+    for (;; number++) {
+        name_aside(path, number, read, unread);
+        if (number == ASIDE_MAX || (access(read, F_OK) != 0 && access(unread, F_OK) != 0))
+            break;
+    }
+    if (rename_both(path, unread) != 0)
         return pf_fail(failure, PF_ERR_IO, "%s: damaged, and cannot be set aside: %s", path, strerror(errno));
-    (void)snprintf(from, sizeof from, "%s-wal", path);
-    (void)snprintf(to, sizeof to, "%s-wal", aside);
-    (void)rename(from, to);
     return PF_OK;
 }
 
-/* One row of the damaged file. */
-static bool copy_object(sqlite3_stmt *put, sqlite3_stmt *row)
+/* ---- one file */
+
+typedef struct salvage {
+    sqlite3 *from, *to;
+    sqlite3_stmt *put, *note;
+    void (*alive)(void);
+    char key[32];         /* of the value that says how far it has come */
+    int64_t up_to, after; /* rows that are done: from the first one up, from the last one down */
+    bool has_begun;       /* an earlier run has taken the values: they may have changed since */
+    int chunk;            /* objects of the open transaction */
+    char why[128];        /* the new file takes no more */
+} salvage;
+
+static bool run(sqlite3 *db, const char *text)
 {
-    uint8_t hash[32];
-    const void *name = sqlite3_column_blob(row, 2), *bytes = sqlite3_column_blob(row, 3);
-    const int n = sqlite3_column_bytes(row, 3);
-    if (name == NULL || bytes == NULL || sqlite3_column_bytes(row, 2) != 32 ||
-        pf_sha256(bytes, (size_t)n, hash) != PF_OK || memcmp(hash, name, sizeof hash) != 0)
-        return false;
-    for (int i = 0; i < 4; i++)
-        (void)sqlite3_bind_value(put, i + 1, sqlite3_column_value(row, i));
-    bool is_new = sqlite3_step(put) == SQLITE_DONE;
-    (void)sqlite3_reset(put);
-    return is_new;
+    return sqlite3_exec(db, text, NULL, NULL, NULL) == SQLITE_OK;
 }
 
-static void copy_values(sqlite3 *from, sqlite3 *to)
+static void load_progress(salvage *s)
+{
+    sqlite3_stmt *get = NULL;
+    s->after = INT64_MAX;
+    if (sqlite3_prepare_v2(s->to, "SELECT bytes FROM value WHERE key = ?1", -1, &get, NULL) == SQLITE_OK) {
+        (void)sqlite3_bind_text(get, 1, s->key, -1, SQLITE_STATIC);
+        if (sqlite3_step(get) == SQLITE_ROW && sqlite3_column_bytes(get, 0) == 16) {
+            const uint8_t *bytes = sqlite3_column_blob(get, 0);
+            memcpy(&s->up_to, bytes, 8);
+            memcpy(&s->after, bytes + 8, 8);
+            s->has_begun = true;
+        }
+    }
+    sqlite3_finalize(get);
+}
+
+/* SQLite ends the transaction itself on some errors. */
+static bool give_up(salvage *s)
+{
+    if (s->why[0] == '\0')
+        (void)snprintf(s->why, sizeof s->why, "%s", sqlite3_errmsg(s->to));
+    if (sqlite3_get_autocommit(s->to) == 0)
+        (void)run(s->to, "ROLLBACK");
+    return false;
+}
+
+static bool commit(salvage *s)
+{
+    int64_t rows[2] = {s->up_to, s->after};
+    (void)sqlite3_bind_text(s->note, 1, s->key, -1, SQLITE_STATIC);
+    (void)sqlite3_bind_blob(s->note, 2, rows, sizeof rows, SQLITE_TRANSIENT);
+    bool ok = sqlite3_step(s->note) == SQLITE_DONE;
+    ok = sqlite3_reset(s->note) == SQLITE_OK && ok && run(s->to, "COMMIT");
+    return ok || give_up(s);
+}
+
+static bool copy_values(salvage *s)
 {
     sqlite3_stmt *get = NULL, *set = NULL;
-    if (sqlite3_prepare_v2(from, "SELECT key, bytes FROM value", -1, &get, NULL) == SQLITE_OK &&
-        sqlite3_prepare_v2(to, "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)", -1, &set, NULL) ==
-            SQLITE_OK) {
-        while (sqlite3_step(get) == SQLITE_ROW) {
+    bool ok = sqlite3_prepare_v2(s->to, "INSERT OR IGNORE INTO value (key, bytes) VALUES (?1, ?2)", -1, &set, NULL) ==
+              SQLITE_OK;
+    if (ok && sqlite3_prepare_v2(s->from, "SELECT key, bytes FROM value", -1, &get, NULL) == SQLITE_OK) {
+        while (ok && sqlite3_step(get) == SQLITE_ROW) {
             (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
             (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
-            (void)sqlite3_step(set);
+            ok = sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
     }
     sqlite3_finalize(get);
     sqlite3_finalize(set);
+    return ok;
 }
 
-uint64_t pf_spool_salvage(sqlite3 *to, const char *aside)
+/* False: the new file does not take it. */
+static bool copy_object(salvage *s, sqlite3_stmt *row)
 {
-    /* From both ends: a page that cannot be read stops a walk over the table. */
-    static const char *const walks[] = {"SELECT row, kind, name, bytes FROM object NOT INDEXED ORDER BY row",
-                                        "SELECT row, kind, name, bytes FROM object NOT INDEXED ORDER BY row DESC"};
-    sqlite3 *from = NULL;
-    sqlite3_stmt *put = NULL;
-    uint64_t copied = 0;
-    if (sqlite3_open_v2(aside, &from, SQLITE_OPEN_READWRITE, NULL) == SQLITE_OK &&
-        sqlite3_exec(to, "BEGIN IMMEDIATE", NULL, NULL, NULL) == SQLITE_OK) {
-        copy_values(from, to);
-        if (sqlite3_prepare_v2(to, "INSERT OR IGNORE INTO object (row, kind, name, bytes) VALUES (?1, ?2, ?3, ?4)", -1,
-                               &put, NULL) == SQLITE_OK) {
-            for (size_t i = 0; i < sizeof walks / sizeof walks[0]; i++) {
-                sqlite3_stmt *walk = NULL;
-                if (sqlite3_prepare_v2(from, walks[i], -1, &walk, NULL) == SQLITE_OK)
-                    while (sqlite3_step(walk) == SQLITE_ROW)
-                        if (copy_object(put, walk))
-                            copied += (uint64_t)sqlite3_changes(to);
-                sqlite3_finalize(walk);
+    uint8_t hash[32];
+    const void *name = sqlite3_column_blob(row, 2), *bytes = sqlite3_column_blob(row, 3);
+    if (name == NULL || bytes == NULL || sqlite3_column_bytes(row, 2) != 32 ||
+        pf_sha256(bytes, (size_t)sqlite3_column_bytes(row, 3), hash) != PF_OK || memcmp(hash, name, sizeof hash) != 0)
+        return true;
+    for (int i = 0; i < 4; i++)
+        (void)sqlite3_bind_value(s->put, i + 1, sqlite3_column_value(row, i));
+    bool ok = sqlite3_step(s->put) == SQLITE_DONE;
+    (void)sqlite3_reset(s->put);
+    return ok;
+}
+
+/* Walks over the rows that are left, one way. False: the new file takes no more. *has_ended: it reached the end, and no
+ * page stopped it. */
+static bool walk(salvage *s, bool is_down, bool *has_ended)
+{
+    static const char *const orders[] = {
+        "SELECT row, kind, name, bytes FROM object NOT INDEXED WHERE row > ?1 AND row < ?2 ORDER BY row",
+        "SELECT row, kind, name, bytes FROM object NOT INDEXED WHERE row > ?1 AND row < ?2 ORDER BY row DESC"};
+    sqlite3_stmt *q = NULL;
+    bool ok = true;
+    int code = SQLITE_ERROR;
+    if (sqlite3_prepare_v2(s->from, orders[is_down], -1, &q, NULL) == SQLITE_OK) {
+        (void)sqlite3_bind_int64(q, 1, s->up_to);
+        (void)sqlite3_bind_int64(q, 2, s->after);
+        while (ok && (code = sqlite3_step(q)) == SQLITE_ROW) {
+            if (s->alive != NULL)
+                s->alive();
+            ok = copy_object(s, q);
+            if (!ok)
+                break;
+            *(is_down ? &s->after : &s->up_to) = sqlite3_column_int64(q, 0);
+            if (++s->chunk == CHUNK_OBJECTS) {
+                s->chunk = 0;
+                ok = commit(s) && run(s->to, "BEGIN IMMEDIATE");
             }
         }
-        sqlite3_finalize(put);
-        if (sqlite3_exec(to, "COMMIT", NULL, NULL, NULL) != SQLITE_OK) {
-            (void)sqlite3_exec(to, "ROLLBACK", NULL, NULL, NULL);
-            copied = 0;
-        }
     }
-    (void)sqlite3_close(from);
-    return copied;
+    sqlite3_finalize(q);
+    *has_ended = ok && code == SQLITE_DONE;
+    return ok;
+}
+
+/* From both ends: a page that cannot be read stops a walk over the table. False: there is more, which the new file does
+ * not take now. */
+static bool copy_all(salvage *s)
+{
+    bool has_ended = false;
+    load_progress(s);
+    bool ok = run(s->to, "BEGIN IMMEDIATE") && (s->has_begun || copy_values(s)) && walk(s, false, &has_ended) &&
+              (has_ended || walk(s, true, &has_ended)) && commit(s);
+    return ok || give_up(s);
+}
+
+static bool salvage_file(salvage *s, const char *file)
+{
+    /* Where its row is another's by now it gets a new one. */
+    static const char put[] = "INSERT OR IGNORE INTO object (row, kind, name, bytes) SELECT "
+                              "CASE WHEN EXISTS (SELECT 1 FROM object WHERE row = ?1) THEN NULL ELSE ?1 END, "
+                              "?2, ?3, ?4";
+    static const char note[] = "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)";
+    bool is_done = sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK; /* nothing can be had */
+    if (!is_done && sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) == SQLITE_OK &&
+        sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) == SQLITE_OK)
+        is_done = copy_all(s);
+    sqlite3_finalize(s->put);
+    sqlite3_finalize(s->note);
+    (void)sqlite3_close(s->from);
+    return is_done;
+}
+
+static uint64_t count(sqlite3 *db)
+{
+    sqlite3_stmt *q = NULL;
+    uint64_t n = 0;
+    if (sqlite3_prepare_v2(db, "SELECT count(*) FROM object", -1, &q, NULL) == SQLITE_OK &&
+        sqlite3_step(q) == SQLITE_ROW)
+        n = (uint64_t)sqlite3_column_int64(q, 0);
+    sqlite3_finalize(q);
+    return n;
+}
+
+uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf_failure *told)
+{
+    uint32_t files = 0, left = 0;
+    for (int number = 1; number <= ASIDE_MAX; number++) {
+        char read[PATH_BYTES], unread[PATH_BYTES];
+        salvage s = {.to = to, .alive = alive};
+        name_aside(path, number, read, unread);
+        if (access(unread, F_OK) != 0)
+            continue;
+        files++;
+        (void)snprintf(s.key, sizeof s.key, "salvage %d", number);
+        const uint64_t before = count(to);
+        bool is_done = salvage_file(&s, unread);
+        const uint64_t saved = count(to) - before; /* of those in a transaction that failed none are there */
+        if (!is_done) {
+            left++;
+            (void)pf_fail(told, PF_OK,
+                          "%s: was damaged: %" PRIu64
+                          " objects saved from it; more are in %s, and the next start tries "
+                          "again: %s",
+                          path, saved, unread, s.why);
+            continue;
+        }
+        left += rename_both(unread, read) != 0;
+        (void)pf_fail(told, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", path, saved,
+                      read);
+    }
+    if (left == 0) /* not before the names have changed, or the values would be taken once more */
+        (void)run(to, "DELETE FROM value WHERE key GLOB 'salvage [0-9]*'");
+    return files;
 }

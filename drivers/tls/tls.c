@@ -1,6 +1,7 @@
 /* Mutual TLS 1.3 by OpenSSL. One epoll descriptor holds the listener, the guests whose handshake is under way, the host
  * that has the line, and the visitors that look on: it is what the daemon polls, and it becomes readable for all. */
-#include "common/listener.h"
+#include "common/lines.h"
+#include "common/monotonic.h"
 #include "tls/gate.h"
 #include "trust/private.h"
 
@@ -10,7 +11,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
-#include <time.h>
 #include <unistd.h>
 
 #define GUESTS_MAX           4
@@ -27,8 +27,7 @@
 #define GROUPS "X25519:P-256"
 
 typedef struct guest {
-    struct tls *owner;
-    int fd; /* -1 = free */
+    pf_line line; /* first: a transport's self */
     SSL *ssl;
     bool is_counted; /* among the refused, by its key */
     bool is_leaving; /* it was refused; what it still sends is thrown away until it closes */
@@ -36,44 +35,33 @@ typedef struct guest {
     uint8_t address[16], key[32];
     pf_role role;
     char name[PF_PEER_NAME_MAX];
-    uint32_t events; /* that epoll watches */
-    bool is_new;     /* a visitor whom nobody has taken over yet */
 } guest;
 
 typedef struct tls {
+    pf_lines lines; /* first: what a line belongs to is a tls */
     SSL_CTX *context;
     pf_trust *trust;
-    int epoll, listener;
-    guest guests[GUESTS_MAX], host, visitors[PF_VISITORS_MAX]; /* host.fd -1 = nobody */
-    uint64_t silence_ns, heard_ns, recheck_ns;
+    guest guests[GUESTS_MAX], host, visitors[PF_VISITORS_MAX];
+    uint64_t recheck_ns;
     pf_gate gate;
     pf_transport_stats stats;
-    char name[PF_LISTENER_NAME_MAX];
-    pf_failure failure;
 } tls;
 
-static uint64_t now_ns(void)
+static tls *owner(const guest *g)
 {
-    struct timespec t;
-    (void)clock_gettime(CLOCK_MONOTONIC, &t);
-    return (uint64_t)t.tv_sec * 1000000000u + (uint64_t)t.tv_nsec;
+    return (tls *)g->line.lines;
 }
 
-static void watch(guest *g, uint32_t events)
+static guest nobody(tls *t)
 {
-    struct epoll_event e = {.events = events};
-    if (g->events == events)
-        return;
-    if (epoll_ctl(g->owner->epoll, g->events == 0 ? EPOLL_CTL_ADD : EPOLL_CTL_MOD, g->fd, &e) == 0)
-        g->events = events;
+    return (guest){.line = pf_line_empty(&t->lines)};
 }
 
 static void drop(guest *g)
 {
     SSL_free(g->ssl);
-    if (g->fd >= 0)
-        (void)close(g->fd); /* which also ends its watch */
-    *g = (guest){.owner = g->owner, .fd = -1};
+    pf_line_drop(&g->line);
+    *g = nobody(owner(g));
 }
 
 /* ---- who may come in */
@@ -96,11 +84,11 @@ static int verify(X509_STORE_CTX *store, void *argument)
     g->is_counted = true;
     if (g->role == PF_ROLE_REVOKED) {
         t->stats.refused_revoked++;
-        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a host whose key was revoked: %s (%.*s...)", g->name,
+        (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED, "a host whose key was revoked: %s (%.*s...)", g->name,
                       FINGERPRINT_IN_ERROR, key);
     } else {
         t->stats.refused_unknown++;
-        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a host that is not known: key %s", key);
+        (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED, "a host that is not known: key %s", key);
     }
     return 0;
 }
@@ -117,7 +105,7 @@ static pf_status open_context(tls *t)
               SSL_CTX_use_PrivateKey(t->context, pf_trust_private_key(t->trust)) == 1;
     if (!ok) {
         ERR_clear_error();
-        return pf_fail(&t->failure, PF_ERR_IO, "%s: OpenSSL gives no TLS 1.3", t->name);
+        return pf_fail(&t->lines.failure, PF_ERR_IO, "%s: OpenSSL gives no TLS 1.3", t->lines.name);
     }
     (void)SSL_CTX_set_session_cache_mode(t->context, SSL_SESS_CACHE_OFF);
     (void)SSL_CTX_set_options(t->context, SSL_OP_NO_TICKET | SSL_OP_NO_COMPRESSION);
@@ -153,7 +141,7 @@ static guest *free_place(tls *t, const uint8_t address[16], uint64_t now)
     guest *place = NULL;
     int same = 0;
     for (int i = 0; i < GUESTS_MAX; i++) {
-        if (t->guests[i].fd < 0)
+        if (t->guests[i].line.fd < 0)
             place = &t->guests[i];
         else if (!t->guests[i].is_leaving && memcmp(t->guests[i].address, address, 16) == 0)
             same++;
@@ -170,11 +158,11 @@ static pf_status take_guests(tls *t, uint64_t now)
     for (int i = 0; i < ACCEPTS_MAX; i++) {
         pf_address peer;
         uint8_t address[16];
-        int fd = pf_listener_accept(t->listener, &peer);
+        int fd = pf_listener_accept(t->lines.listener, &peer);
         if (fd < 0) {
             if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
                 return PF_OK;
-            return pf_fail(&t->failure, PF_ERR_IO, "accept: %s", strerror(errno));
+            return pf_fail(&t->lines.failure, PF_ERR_IO, "accept: %s", strerror(errno));
         }
         pf_gate_address(&peer, address);
         guest *g = pf_gate_is_open(&t->gate, address, now) ? free_place(t, address, now) : NULL;
@@ -183,14 +171,18 @@ static pf_status take_guests(tls *t, uint64_t now)
             SSL_free(ssl);
             (void)close(fd);
             t->stats.refused_often++;
-            (void)pf_fail(&t->failure, PF_ERR_CLOSED, "too many handshakes at once, or failed ones of one address");
+            (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED,
+                          "too many handshakes at once, or failed ones of one address");
             continue;
         }
-        *g = (guest){.owner = t, .fd = fd, .ssl = ssl, .deadline_ns = now + HANDSHAKE_NS};
+        *g = nobody(t);
+        g->line.fd = fd;
+        g->ssl = ssl;
+        g->deadline_ns = now + HANDSHAKE_NS;
         memcpy(g->address, address, sizeof g->address);
         SSL_set_accept_state(ssl);
         SSL_set_app_data(ssl, g);
-        watch(g, EPOLLIN);
+        pf_line_watch(&g->line, EPOLLIN);
     }
     return PF_OK;
 }
@@ -198,16 +190,16 @@ static pf_status take_guests(tls *t, uint64_t now)
 /* Says no more, but lets the peer read what was said: a close with bytes unread would destroy it on the way. */
 static void send_away(guest *g, uint64_t now)
 {
-    (void)shutdown(g->fd, SHUT_WR);
+    (void)shutdown(g->line.fd, SHUT_WR);
     g->is_leaving = true;
     g->deadline_ns = now + LEAVING_NS;
-    watch(g, EPOLLIN);
+    pf_line_watch(&g->line, EPOLLIN);
 }
 
 static void see_off(guest *g, uint64_t now)
 {
     uint8_t bytes[4096];
-    ssize_t k = recv(g->fd, bytes, sizeof bytes, 0);
+    ssize_t k = recv(g->line.fd, bytes, sizeof bytes, 0);
     if (k == 0 || (k < 0 && errno != EAGAIN && errno != EINTR) || now >= g->deadline_ns)
         drop(g);
 }
@@ -217,15 +209,15 @@ static void see_off(guest *g, uint64_t now)
 static bool is_taken(const tls *t, const guest *g, uint64_t now)
 {
     bool is_same = memcmp(t->host.key, g->key, 32) == 0;
-    return t->host.fd >= 0 && now - t->heard_ns < (is_same ? t->silence_ns * 3 / 8 : t->silence_ns);
+    return t->host.line.fd >= 0 &&
+           now - t->lines.heard_ns < (is_same ? t->lines.silence_ns * 3 / 8 : t->lines.silence_ns);
 }
 
 static void seat(guest *place, guest *g)
 {
     drop(place);
     *place = *g;
-    g->ssl = NULL;
-    g->fd = -1;
+    *g = nobody(owner(g));
     SSL_set_app_data(place->ssl, place);
 }
 
@@ -234,20 +226,19 @@ static bool welcome(tls *t, guest *g, uint64_t now)
 {
     if (g->role > PF_ROLE_VIEWER && !is_taken(t, g, now)) {
         seat(&t->host, g);
-        t->heard_ns = now;
+        t->lines.heard_ns = now;
         t->stats.sessions++;
         return true;
     }
-    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++) {
-        if (t->visitors[i].fd >= 0)
-            continue;
-        seat(&t->visitors[i], g);
-        t->visitors[i].is_new = true;
+    pf_line *place = pf_lines_place(&t->lines);
+    if (place != NULL) {
+        seat((guest *)place, g);
+        place->is_new = true;
         t->stats.sessions++;
         return false;
     }
     t->stats.refused_busy++;
-    (void)pf_fail(&t->failure, PF_ERR_CLOSED, "%s wanted to look on, as %u do already", g->name, PF_VISITORS_MAX);
+    (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED, "%s wanted to look on, as %u do already", g->name, PF_VISITORS_MAX);
     (void)SSL_shutdown(g->ssl);
     send_away(g, now);
     return false;
@@ -267,15 +258,15 @@ static bool serve_guest(tls *t, guest *g, uint64_t now)
         return welcome(t, g, now);
     if (why == SSL_ERROR_WANT_READ || why == SSL_ERROR_WANT_WRITE) {
         if (now < g->deadline_ns) {
-            watch(g, why == SSL_ERROR_WANT_WRITE ? EPOLLIN | EPOLLOUT : EPOLLIN);
+            pf_line_watch(&g->line, why == SSL_ERROR_WANT_WRITE ? EPOLLIN | EPOLLOUT : EPOLLIN);
             return false;
         }
         t->stats.refused_late++;
-        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a handshake took longer than 5 s");
+        (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED, "a handshake took longer than 5 s");
     } else if (!g->is_counted) {
         const char *reason = ERR_reason_error_string(ERR_peek_last_error());
         t->stats.refused_handshake++;
-        (void)pf_fail(&t->failure, PF_ERR_CLOSED, "a handshake failed: %s", reason != NULL ? reason : "closed");
+        (void)pf_fail(&t->lines.failure, PF_ERR_CLOSED, "a handshake failed: %s", reason != NULL ? reason : "closed");
     }
     ERR_clear_error();
     pf_gate_note_failure(&t->gate, g->address, now);
@@ -287,16 +278,16 @@ static bool serve_guest(tls *t, guest *g, uint64_t now)
 
 static pf_status hang_up(guest *g, const char *why)
 {
-    tls *t = g->owner;
+    tls *t = owner(g);
     drop(g);
-    return pf_fail(&t->failure, PF_ERR_CLOSED, "%s", why);
+    return pf_fail(&t->lines.failure, PF_ERR_CLOSED, "%s", why);
 }
 
 /* A key that was revoked while its host is there ends the session. So does another role: what it may do is settled when
  * a session begins. */
 static void recheck(guest *g)
 {
-    if (g->fd < 0 || pf_trust_role(g->owner->trust, g->key, g->name) == g->role)
+    if (g->line.fd < 0 || pf_trust_role(owner(g)->trust, g->key, g->name) == g->role)
         return;
     (void)SSL_shutdown(g->ssl);
     (void)hang_up(g, "the host's role was changed");
@@ -316,7 +307,7 @@ static void recheck_all(tls *t, uint64_t now)
  * is, stands for them. */
 static void rewatch(guest *g, bool is_full)
 {
-    watch(g, is_full || SSL_pending(g->ssl) > 0 ? EPOLLIN | EPOLLOUT : EPOLLIN);
+    pf_line_watch(&g->line, is_full || SSL_pending(g->ssl) > 0 ? EPOLLIN | EPOLLOUT : EPOLLIN);
 }
 
 /* What an SSL_read or SSL_write of `k` came to. True: it may be tried again later. */
@@ -332,7 +323,7 @@ static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     guest *g = self;
     bool is_full = false;
     *done = 0;
-    if (g->fd < 0)
+    if (g->line.fd < 0)
         return PF_ERR_CLOSED;
     if (capacity == 0)
         return PF_OK;
@@ -340,8 +331,7 @@ static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     int k = SSL_read(g->ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
     if (k > 0) {
         *done = (size_t)k;
-        if (g == &g->owner->host)
-            g->owner->heard_ns = now_ns();
+        pf_line_heard(&g->line, pf_monotonic_ns());
     } else if (!may_go_on(g, k, &is_full)) {
         return hang_up(g, "the other side closed the connection");
     }
@@ -354,7 +344,7 @@ static pf_status tls_write(void *self, const uint8_t *bytes, size_t n, size_t *d
     guest *g = self;
     bool is_full = false;
     *done = 0;
-    if (g->fd < 0)
+    if (g->line.fd < 0)
         return PF_ERR_CLOSED;
     if (n == 0)
         return PF_OK;
@@ -370,77 +360,36 @@ static pf_status tls_write(void *self, const uint8_t *bytes, size_t n, size_t *d
 
 /* ---- the interface */
 
-static int tls_fd(void *self)
-{
-    guest *g = self;
-    return g->owner->epoll;
-}
-
 static pf_status tls_service(void *self, bool *fresh)
 {
     guest *g = self;
-    tls *t = g->owner;
-    uint64_t now = now_ns();
+    tls *t = owner(g);
+    uint64_t now = pf_monotonic_ns();
     *fresh = false;
     if (g != &t->host)
-        return g->fd >= 0 ? PF_OK : PF_ERR_CLOSED;
+        return g->line.fd >= 0 ? PF_OK : PF_ERR_CLOSED;
     pf_status status = take_guests(t, now);
     for (int i = 0; i < GUESTS_MAX; i++)
-        if (t->guests[i].fd >= 0 && serve_guest(t, &t->guests[i], now))
+        if (t->guests[i].line.fd >= 0 && serve_guest(t, &t->guests[i], now))
             *fresh = true;
     recheck_all(t, now);
-    if (t->host.fd >= 0)
+    if (t->host.line.fd >= 0)
         return PF_OK;
     *fresh = false;
     return status == PF_OK ? PF_ERR_AGAIN : status;
 }
 
-static const pf_transport_ops tls_ops;
-
-static bool tls_visitor(void *self, pf_transport *visitor)
-{
-    guest *g = self;
-    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++) {
-        guest *v = &g->owner->visitors[i];
-        if (!v->is_new)
-            continue;
-        v->is_new = false;
-        visitor->self = v;
-        visitor->ops = &tls_ops;
-        return true;
-    }
-    return false;
-}
-
-static size_t tls_room(void *self)
-{
-    guest *g = self;
-    return pf_tcp_queue_room(g->fd);
-}
-
 static pf_role tls_peer(void *self, const char **name, const pf_transport_stats **stats)
 {
     guest *g = self;
-    *stats = &g->owner->stats;
+    *stats = &owner(g)->stats;
     *name = g->name;
     return g->role;
 }
 
-static const char *tls_name(void *self)
-{
-    guest *g = self;
-    return g->owner->name;
-}
-
-static const char *tls_error(void *self)
-{
-    guest *g = self;
-    return g->owner->failure.text;
-}
-
 static void leave(guest *g)
 {
-    if (g->fd >= 0)
+    if (g->line.fd >= 0)
         (void)SSL_shutdown(g->ssl);
     drop(g);
 }
@@ -448,7 +397,7 @@ static void leave(guest *g)
 static void tls_close(void *self)
 {
     guest *g = self;
-    tls *t = g->owner;
+    tls *t = owner(g);
     leave(g);
     if (g != &t->host)
         return;
@@ -456,39 +405,21 @@ static void tls_close(void *self)
         leave(&t->visitors[i]);
     for (int i = 0; i < GUESTS_MAX; i++)
         drop(&t->guests[i]);
-    if (t->listener >= 0)
-        (void)close(t->listener);
-    if (t->epoll >= 0)
-        (void)close(t->epoll);
+    pf_lines_close(&t->lines);
     SSL_CTX_free(t->context);
     free(t);
 }
 
-static pf_status open_sockets(tls *t, const pf_tls_config *config)
-{
-    pf_address a;
-    struct epoll_event e = {.events = EPOLLIN};
-    pf_status status = pf_address_parse(&a, config->address, config->port, "tls", &t->failure);
-    if (status == PF_OK)
-        status = pf_listener_open(&t->listener, t->name, &a, config->address, "tls", &t->failure);
-    if (status != PF_OK)
-        return status;
-    t->epoll = epoll_create1(EPOLL_CLOEXEC);
-    if (t->epoll < 0 || epoll_ctl(t->epoll, EPOLL_CTL_ADD, t->listener, &e) != 0)
-        return pf_fail(&t->failure, PF_ERR_IO, "%s: epoll: %s", t->name, strerror(errno));
-    return PF_OK;
-}
-
 static const pf_transport_ops tls_ops = {
-    .fd = tls_fd,
+    .fd = pf_line_fd,
     .service = tls_service,
-    .visitor = tls_visitor,
+    .visitor = pf_line_visitor,
     .read = tls_read,
     .write = tls_write,
-    .room = tls_room,
+    .room = pf_line_room,
     .peer = tls_peer,
-    .name = tls_name,
-    .error = tls_error,
+    .name = pf_line_name,
+    .error = pf_line_error,
     .close = tls_close,
 };
 
@@ -498,23 +429,31 @@ pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, ch
     tls *t = calloc(1, sizeof *t);
     if (t == NULL)
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "tls: no memory"), error, n);
-    t->epoll = t->listener = -1;
-    t->host = (guest){.owner = t, .fd = -1};
+    t->lines = (pf_lines){.epoll = -1,
+                          .listener = -1,
+                          .host = &t->host.line,
+                          .ops = &tls_ops,
+                          .silence_ns = config->silence_ms * UINT64_C(1000000)};
+    t->host = nobody(t);
     for (int i = 0; i < GUESTS_MAX; i++)
         t->guests[i] = t->host;
-    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
+    for (uint32_t i = 0; i < PF_VISITORS_MAX; i++) {
         t->visitors[i] = t->host;
+        t->lines.visitors[i] = &t->visitors[i].line;
+    }
     t->trust = config->trust;
-    t->silence_ns = config->silence_ms * UINT64_C(1000000);
-    pf_status status = open_sockets(t, config);
+    pf_address a;
+    pf_status status = pf_address_parse(&a, config->address, config->port, "tls", &t->lines.failure);
+    if (status == PF_OK)
+        status = pf_lines_open(&t->lines, &a, config->address, "tls");
     if (status == PF_OK)
         status = open_context(t);
     if (status != PF_OK) {
-        pf_failure_copy(&t->failure, status, error, n);
+        pf_failure_copy(&t->lines.failure, status, error, n);
         tls_close(&t->host);
         return status;
     }
-    transport->self = &t->host;
+    transport->self = &t->host.line;
     transport->ops = &tls_ops;
     return PF_OK;
 }

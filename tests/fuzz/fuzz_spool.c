@@ -268,7 +268,7 @@ static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
         size_t n = 0;
         require(item.row > row);
         row = item.row;
-        if (spool->ops->read(spool->self, row, bytes, sizeof bytes, &n) != PF_OK)
+        if (spool->ops->read(spool->self, &item, bytes, sizeof bytes, &n) != PF_OK)
             continue;
         require(n <= sizeof bytes && pf_sha256(bytes, n, hash) == PF_OK && memcmp(hash, item.name, 32) == 0);
         intact++;

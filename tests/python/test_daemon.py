@@ -294,6 +294,26 @@ def test_without_time_to_drain_every_keyframe_made_and_the_end_are_still_stored(
     assert spooled(crawler) == {START: 1, KEYFRAME: made, END: 1}
 
 
+def test_a_signal_without_a_host_does_not_wait_for_all_the_time_to_drain(crawler: Crawler):
+    crawler.start("--set", "daemon.drain_s=3600")
+    wait_for_log(crawler, "survey ends")
+    crawler.terminate()
+    assert crawler.wait(60) == 0
+    assert spooled(crawler) == {START: 1, KEYFRAME: 20, END: 1}
+
+
+def test_a_host_that_comes_soon_after_the_signal_gets_the_rest(crawler: Crawler):
+    store = Store(crawler.port)
+    crawler.start("--set", "camera.loops=0")
+    wait_for_log(crawler, "begins")
+    time.sleep(0.3)
+    crawler.terminate()
+    wait_for_log(crawler, "survey ends")
+    time.sleep(0.3)
+    assert receive_all(crawler, store) == 0
+    assert len(store.ends) == 1 and spooled(crawler) == {}
+
+
 class LateStore(Store):
     """A host that takes the survey's end in, but acknowledges it only when `may_acknowledge` says so."""
 

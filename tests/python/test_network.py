@@ -560,10 +560,16 @@ def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawle
         block = hashlib.shake_256(b"garbage").digest(1 << 20)
         with contextlib.suppress(OSError):
             s.sendall(block)
+            s.sendall(b"x" * (1 << 20) + b"\0")  # one frame of a megabyte
     client = open_client(device)
     client.run(lambda: client.up, 5)
+    client.answer_to(5, get_status=pb.Nothing())
     client.close()
     assert device.process.poll() is None
+    end = time.monotonic() + 5
+    while device.status()["link"]["crc_errors"] < 1000:  # a zero in 256 bytes ends a frame
+        assert time.monotonic() < end, device.status()["link"]
+        time.sleep(0.05)
 
 
 def test_pairings_at_the_same_time_are_all_kept(device: Crawler):
@@ -689,3 +695,22 @@ def test_tcp_is_for_loopback_only_and_tls_needs_its_folder(tmp_path: Path):
     crawler = Crawler(tmp_path, link__transport="tls")
     crawler.start()
     assert crawler.wait() == 1 and "link.trust" in crawler.log.read_text()
+
+
+def test_an_address_that_comes_later_is_waited_for(tmp_path: Path, device: Crawler):
+    let_in(device, "operator")
+    device.kill()
+    address = "192.0.2.41"  # of those that documents may use: nobody's
+    device.start("--set", f"link.address={address}")
+    wait_for_log(device, f"does not have the address {address} yet")
+    assert "survey" in device.text() and device.process.poll() is None
+    added = subprocess.run(["ip", "address", "add", f"{address}/32", "dev", "lo"], capture_output=True, text=True)
+    if added.returncode != 0:
+        pytest.skip(f"that the device serves an address that came later is NOT tested: {added.stderr.strip()}")
+    try:
+        client = Client(TlsTransport(address, device.port), Handlers())
+        client.open()
+        client.run(lambda: client.up, 5)
+        client.close()
+    finally:
+        subprocess.run(["ip", "address", "del", f"{address}/32", "dev", "lo"], check=True)

@@ -26,7 +26,7 @@ void tearDown(void)
 
 static inline void open_spool(const char *name, uint64_t quota)
 {
-    pf_spool_config config = {temporary_path(name), quota};
+    pf_spool_config config = {.path = temporary_path(name), .quota = quota};
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_spool_open(&spool, &config, error, sizeof error), error);
 }
 
@@ -66,7 +66,7 @@ static inline uint64_t check_item(const pf_spool_item *item)
 {
     uint64_t id;
     size_t n = 0;
-    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, item->row, read_bytes, sizeof read_bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, item, read_bytes, sizeof read_bytes, &n));
     TEST_ASSERT_EQUAL_size_t(item->size, n);
     memcpy(&id, read_bytes, sizeof id);
     TEST_ASSERT_EQUAL_size_t(make_object(id), n);

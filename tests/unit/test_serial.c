@@ -163,6 +163,27 @@ static void test_room_bounds_the_queue(void)
     }
 }
 
+/* Proves: link.rtscts makes the line one with hardware flow control, and its absence one without, whatever it was
+ * before; it is raw, 8N1, in both cases. That a wire stops by it only a wire can show. */
+static void test_flow_control_is_set_as_asked(void)
+{
+    for (int i = 0; i < 2; i++) {
+        struct termios t;
+        pf_serial_config config = {make_pty(), 921600, i == 0};
+        TEST_ASSERT_EQUAL_INT(0, tcgetattr(master, &t));
+        t.c_cflag = i == 0 ? t.c_cflag & ~(tcflag_t)CRTSCTS : t.c_cflag | CRTSCTS;
+        TEST_ASSERT_EQUAL_INT(0, tcsetattr(master, TCSANOW, &t));
+        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_serial_open(&line, &config, error, sizeof error), error);
+        TEST_ASSERT_EQUAL_INT(0, tcgetattr(line.ops->fd(line.self), &t));
+        TEST_ASSERT_EQUAL_INT(i == 0, (t.c_cflag & CRTSCTS) != 0);
+        TEST_ASSERT_EQUAL_INT(CS8, t.c_cflag & (CSIZE | CSTOPB | PARENB));
+        TEST_ASSERT_EQUAL_INT(0, t.c_lflag);
+        TEST_ASSERT_EQUAL_INT(0, t.c_iflag);
+        TEST_ASSERT_EQUAL_INT(0, t.c_oflag);
+        close_all();
+    }
+}
+
 /* Proves: with nobody reading at the other end writing never blocks, and a full pty is no room. */
 static void test_full_pty_does_not_block(void)
 {
@@ -398,6 +419,7 @@ int main(void)
     RUN_TEST(test_every_byte_passes);
     RUN_TEST(test_unplugged_and_plugged_in_again);
     RUN_TEST(test_room_bounds_the_queue);
+    RUN_TEST(test_flow_control_is_set_as_asked);
     RUN_TEST(test_full_pty_does_not_block);
     RUN_TEST(test_wrong_devices_are_refused);
     RUN_TEST(test_clean_cable);

@@ -38,12 +38,13 @@ static void test_first_in_first_out(void)
     TEST_ASSERT_EQUAL_UINT64(10, stats().objects);
     TEST_ASSERT_EQUAL_UINT64(10, stats().acknowledged);
     size_t n;
-    TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->read(spool.self, row, read_bytes, sizeof read_bytes, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_END,
+                          spool.ops->read(spool.self, &(pf_spool_item){.row = row}, read_bytes, sizeof read_bytes, &n));
     TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, UINT64_MAX, &item));
     /* A row is never used again, though the last one was removed. */
     TEST_ASSERT_EQUAL_INT(PF_OK, put(100));
     TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, row, &item));
-    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->read(spool.self, item.row, read_bytes, item.size - 1, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, spool.ops->read(spool.self, &item, read_bytes, item.size - 1, &n));
     TEST_ASSERT_TRUE(spool.ops->error(spool.self)[0] != '\0');
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, spool.ops->put(spool.self, 2, object_name, object_bytes, 0));
 }
@@ -148,7 +149,7 @@ static void test_threads(void)
 
 static void refused(const char *path, pf_status expected, const char *word)
 {
-    pf_spool_config config = {path, 0};
+    pf_spool_config config = {.path = path};
     error[0] = '\0';
     TEST_ASSERT_EQUAL_INT_MESSAGE(expected, pf_spool_open(&spool, &config, error, sizeof error), error);
     TEST_ASSERT_NULL(spool.self);
@@ -198,7 +199,7 @@ static void test_second_opener_is_refused(void)
 {
     pf_spool second = {NULL, NULL};
     open_spool("shared.db", 0);
-    pf_spool_config config = {temporary_path("shared.db"), 0};
+    pf_spool_config config = {.path = temporary_path("shared.db")};
     pf_status status = pf_spool_open(&second, &config, error, sizeof error);
     if (second.self != NULL)
         second.ops->close(second.self);

@@ -1,10 +1,8 @@
 /* The spool on media that fail. */
-#include "spool_objects.h"
+#include "spool_medium.h"
 
-#include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
-#include <sqlite3.h>
 #include <sys/resource.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
@@ -155,7 +153,7 @@ static void test_kill_at_any_time_loses_nothing(void)
 /* Opens a damaged file and takes everything out of it that it gives: the answer may be an error, never wrong bytes. */
 static void drain_damaged(const char *path)
 {
-    pf_spool_config config = {path, 0};
+    pf_spool_config config = {.path = path};
     error[0] = '\0';
     pf_status status = pf_spool_open(&spool, &config, error, sizeof error);
     if (status != PF_OK) {
@@ -167,7 +165,7 @@ static void drain_damaged(const char *path)
     uint64_t row = 0;
     size_t n;
     for (int i = 0; i < 100 && spool.ops->next(spool.self, row, &item) == PF_OK; i++) {
-        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
+        status = spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &n);
         if (status == PF_OK)
             (void)check_item(&item);
         else
@@ -232,174 +230,6 @@ static void test_full_medium(void)
     }
 }
 
-/* ---- a damaged file is replaced */
-
-static void damage(const char *path, long at, size_t n)
-{
-    uint8_t junk[8192];
-    FILE *f = fopen(path, "r+b");
-    TEST_ASSERT_NOT_NULL(f);
-    for (size_t i = 0; i < sizeof junk; i++)
-        junk[i] = (uint8_t)(37 * i + 11);
-    TEST_ASSERT_EQUAL_INT(0, fseek(f, at, SEEK_SET));
-    TEST_ASSERT_EQUAL_size_t(n, fwrite(junk, 1, n, f));
-    fclose(f);
-}
-
-/* Checks that what is in the spool is whole and in order; how many. */
-static uint64_t count_whole(void)
-{
-    pf_spool_item item;
-    uint64_t row = 0, n = 0, last = 0;
-    for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
-        uint64_t id = check_item(&item);
-        TEST_ASSERT_TRUE(id > last);
-        last = id;
-    }
-    return n;
-}
-
-/* As the daemon does: what has other bytes than its name says is removed, what cannot be read is asked for again. */
-static void sift(void)
-{
-    pf_spool_item item;
-    uint64_t row = 0;
-    size_t n;
-    pf_status status;
-    for (int i = 0; i < 100; i++) {
-        status = spool.ops->next(spool.self, row, &item);
-        if (status == PF_ERR_END)
-            return;
-        if (status != PF_OK)
-            continue;
-        status = spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n);
-        if (status == PF_ERR_CHECKSUM)
-            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->remove(spool.self, item.row));
-        if (status != PF_ERR_IO)
-            row = item.row;
-    }
-    TEST_FAIL_MESSAGE("no end of it");
-}
-
-/* Proves: whatever page of a spool is overwritten, the daemon gets one that takes objects, with those that could be
- * reached, and what it has is whole; the damaged file is kept under another name. What is no spool is not touched
- * (test_spool.c). */
-static void test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved(void)
-{
-    static uint8_t good[2 << 20];
-    uint64_t worst = UINT64_MAX, value = 7;
-    size_t size;
-    open_spool("worn.db", 0);
-    for (uint64_t id = 1; id <= 20; id++)
-        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
-    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, "survey", &value, sizeof value));
-    close_spool();
-    size = slurp(temporary_path("worn.db"), good, sizeof good);
-    TEST_ASSERT_TRUE(size < sizeof good);
-    for (size_t page = 0; page + 4096 <= size; page += page < 12 * 4096 ? 4096 : 11 * 4096) {
-        const char *path = temporary_write("worn.db", good, size);
-        damage(path, (long)(page == 0 ? 100 : page), page == 0 ? 300 : 4096);
-        open_spool("worn.db", 0);
-        sift(); /* may find it only now */
-        uint64_t there = count_whole();
-        worst = page >= 8 * 4096 && there < worst ? there : worst;
-        TEST_ASSERT_EQUAL_INT(PF_OK, put(30));
-        TEST_ASSERT_EQUAL_UINT64(there + 1, count_whole());
-        if (page == 0) {
-            TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "saved from it"));
-            TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
-        }
-        close_spool();
-        for (int i = 1; i < 4; i++) {
-            char aside[64];
-            (void)snprintf(aside, sizeof aside, "worn.db.damaged-%d", i);
-            TEST_ASSERT_TRUE(i > 1 || page > 0 || access(temporary_path(aside), F_OK) == 0);
-            (void)unlink(temporary_path(aside));
-        }
-    }
-    TEST_ASSERT_TRUE(worst >= 15); /* a page of one object's bytes costs that one; one of the tree costs a few */
-}
-
-/* Proves: a page that goes bad while the spool is in use costs what lies in it, and the survey goes on; rows that
- * somebody holds keep their numbers. */
-static void test_damage_found_in_use_is_healed(void)
-{
-    open_spool("used.db", 0);
-    for (uint64_t id = 1; id <= 20; id++)
-        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
-    close_spool();
-    open_spool("used.db", 0);
-    for (long page = 2; page < 6; page++)
-        damage(temporary_path("used.db"), page * 4096, 4096);
-    for (uint64_t id = 21; id <= 24; id++)
-        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, put(id), spool.ops->error(spool.self));
-    sift();
-    TEST_ASSERT_TRUE(count_whole() >= 4);
-}
-
-/* Proves: the row of an object that was lost with its page, which a courier may still hold, is given to no other: its
- * acknowledgement would remove that. */
-static void test_rows_of_lost_objects_are_not_given_again(void)
-{
-    enum { COUNT = 80 }; /* more than SQLite keeps in memory */
-    pf_spool_item item = {0};
-    struct stat file;
-    open_spool("rows.db", 0);
-    for (uint64_t id = 1; id <= COUNT; id++)
-        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
-    close_spool();
-    open_spool("rows.db", 0);
-    sift(); /* somebody holds them */
-    TEST_ASSERT_EQUAL_INT(0, stat(temporary_path("rows.db"), &file));
-    for (long at = 4096; at + 4096 <= file.st_size; at += 4096)
-        damage(temporary_path("rows.db"), at, 4096);
-    for (int i = 0; i < 3 && stats().healed == 0; i++)
-        (void)spool.ops->next(spool.self, 0, &item);
-    TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
-    TEST_ASSERT_EQUAL_INT(PF_OK, put(COUNT + 1));
-    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
-    TEST_ASSERT_TRUE(item.row > COUNT);
-}
-
-/* ---- a medium that refuses: SQLite's own way to put other system calls in place */
-
-static int refuse_with;  /* errno of every write; 0 = none fails */
-static uint64_t allowed; /* writes before that */
-
-static bool refuses(void)
-{
-    if (refuse_with == 0 || (allowed > 0 && allowed--))
-        return false;
-    errno = refuse_with;
-    return true;
-}
-
-static ssize_t write_or_not(int fd, const void *bytes, size_t n)
-{
-    return refuses() ? -1 : write(fd, bytes, n);
-}
-
-static ssize_t pwrite_or_not(int fd, const void *bytes, size_t n, off_t at)
-{
-    return refuses() ? -1 : pwrite(fd, bytes, n, at);
-}
-
-static int fallocate_or_not(int fd, off_t at, off_t n)
-{
-    return refuses() ? errno : posix_fallocate(fd, at, n);
-}
-
-static int ftruncate_or_not(int fd, off_t n)
-{
-    return refuses() ? -1 : ftruncate(fd, n);
-}
-
-static void hook(const char *name, sqlite3_syscall_ptr call)
-{
-    sqlite3_vfs *vfs = sqlite3_vfs_find(NULL);
-    (void)vfs->xSetSystemCall(vfs, name, call);
-}
-
 /* ---- killed at every write: what lies on the disk before each is looked at by another process */
 
 static struct {
@@ -425,14 +255,14 @@ static void copy_file(const char *from, const char *to)
 /* As after a kill at this moment: the ids there are removed + 1 (or + 2, under way) .. stored (or + 1). */
 static int look_at_cut(const char *path, uint64_t stored, uint64_t removed)
 {
-    pf_spool_config config = {path, 0};
+    pf_spool_config config = {.path = path};
     pf_spool_item item;
     uint64_t row = 0, first = 0, last = 0, id;
     size_t n;
     if (pf_spool_open(&spool, &config, error, sizeof error) != PF_OK)
         return 1;
     for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row) {
-        if (spool.ops->read(spool.self, item.row, read_bytes, sizeof read_bytes, &n) != PF_OK)
+        if (spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &n) != PF_OK)
             return 2;
         memcpy(&id, read_bytes, sizeof id);
         if (last != 0 && id != last + 1)
@@ -474,16 +304,6 @@ static ssize_t pwrite_looked_at(int fd, const void *bytes, size_t n, off_t at)
 {
     look();
     return pwrite(fd, bytes, n, at);
-}
-
-static pf_status put_small(uint64_t id)
-{
-    uint8_t bytes[300], name[32];
-    memset(bytes, (int)id, sizeof bytes);
-    memcpy(bytes, &id, sizeof id);
-    if (pf_sha256(bytes, sizeof bytes, name) != PF_OK)
-        return PF_ERR_IO;
-    return spool.ops->put(spool.self, 2, name, bytes, sizeof bytes);
 }
 
 /* Proves: a kill before any single write that SQLite makes, over 1,000 records (12 unless PIPEFISH_TEST_LONG) of which
@@ -595,9 +415,6 @@ int main(int argc, char **argv)
     RUN_TEST(test_every_change_is_synced);
     RUN_TEST(test_kill_at_any_time_loses_nothing);
     RUN_TEST(test_damaged_spool_never_gives_wrong_bytes);
-    RUN_TEST(test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved);
-    RUN_TEST(test_damage_found_in_use_is_healed);
-    RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_full_medium);
     RUN_TEST(test_killed_at_every_write_nothing_acknowledged_is_lost);
     RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);

@@ -1,12 +1,14 @@
+#include "clock.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/link.h"
-#include "store.h"
+#include "pulse.h"
+#include "store_inside.h"
 #include "temporary.h"
 #include "unity.h"
 
 #include <limits.h>
 #include <poll.h>
-#include <pthread.h>
+#include <stdatomic.h>
 #include <string.h>
 #include <sys/eventfd.h>
 #include <unistd.h>
@@ -23,12 +25,33 @@ static struct {
     uint64_t rows;
     int fail_puts, fail_next, fail_reads, fail_removes; /* so many of the calls to come fail */
     bool is_full;
+    uint64_t healed;
+    _Atomic bool is_hanging;        /* a write takes for ever */
     uint8_t value[PF_SURVEY_BYTES]; /* as stored with the newest object */
     size_t value_n;
 } fake = {.mutex = PTHREAD_MUTEX_INITIALIZER};
 
+static pf_store *_Atomic watched; /* NULL = none is open */
+static _Atomic int asked_with_mutex;
+
+/* Called by each call of the spool: the store's mutex, which tracking and link take, must be free, or they wait for the
+ * disk. Others hold it for moments only. */
+static void check_mutex(void)
+{
+    pf_store *s = atomic_load(&watched);
+    for (int i = 0; s != NULL && i < 200; i++) {
+        if (pthread_mutex_trylock(&s->mutex) == 0) {
+            (void)pthread_mutex_unlock(&s->mutex);
+            return;
+        }
+        (void)poll(NULL, 0, 10);
+    }
+    atomic_fetch_add(&asked_with_mutex, s != NULL);
+}
+
 static bool fails(int *count)
 {
+    check_mutex();
     return *count > 0 && (*count)--;
 }
 
@@ -42,6 +65,8 @@ static pf_status exchange(void *self, const pf_spool_victim *victims, uint32_t c
     (void)count;
     (void)rank;
     (void)key;
+    while (fake.is_hanging)
+        (void)poll(NULL, 0, 5);
     (void)pthread_mutex_lock(&fake.mutex);
     if (fake.is_full) {
         status = PF_ERR_SPACE;
@@ -78,7 +103,7 @@ static pf_status next(void *self, uint64_t after, pf_spool_item *item)
     return status;
 }
 
-static pf_status read_object(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n)
+static pf_status read_object(void *self, const pf_spool_item *item, void *bytes, size_t capacity, size_t *n)
 {
     pf_status status = PF_OK;
     (void)self;
@@ -87,8 +112,8 @@ static pf_status read_object(void *self, uint64_t row, void *bytes, size_t capac
     if (fails(&fake.fail_reads)) {
         status = PF_ERR_IO;
     } else {
-        *n = fake.object[row - 1].item.size;
-        memcpy(bytes, fake.object[row - 1].bytes, *n);
+        *n = fake.object[item->row - 1].item.size;
+        memcpy(bytes, fake.object[item->row - 1].bytes, *n);
     }
     (void)pthread_mutex_unlock(&fake.mutex);
     return status;
@@ -133,7 +158,9 @@ static pf_status keep_all(void *self)
 static void get_stats(void *self, pf_spool_stats *stats)
 {
     (void)self;
+    check_mutex();
     memset(stats, 0, sizeof *stats);
+    stats->healed = fake.healed;
     (void)pthread_mutex_lock(&fake.mutex);
     for (uint64_t i = 0; i < fake.rows; i++)
         stats->objects += fake.object[i].item.size > 0;
@@ -143,7 +170,15 @@ static void get_stats(void *self, pf_spool_stats *stats)
 static const char *get_error(void *self)
 {
     (void)self;
+    check_mutex();
     return "fake";
+}
+
+static const char *get_healing(void *self)
+{
+    (void)self;
+    check_mutex();
+    return "was damaged: 3 objects saved";
 }
 
 static const pf_spool_ops ops = {.next = next,
@@ -153,14 +188,15 @@ static const pf_spool_ops ops = {.next = next,
                                  .exchange = exchange,
                                  .keep_all = keep_all,
                                  .stats = get_stats,
-                                 .error = get_error};
+                                 .error = get_error,
+                                 .healing = get_healing};
 static pf_store *store;
 static int wake_fd;
 
 void setUp(void)
 {
     pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
-    memset(&fake, 0, sizeof fake);
+    memset((void *)&fake, 0, sizeof fake);
     keep_status = PF_OK;
     victims_asked = 0;
     fake.mutex = mutex;
@@ -170,6 +206,7 @@ void setUp(void)
 void tearDown(void)
 {
     (void)close(wake_fd);
+    TEST_ASSERT_EQUAL_INT(0, asked_with_mutex);
 }
 
 static void open_store(bool is_patient)
@@ -180,6 +217,7 @@ static void open_store(bool is_patient)
         .jobs = 4, .slots = 2, .capacity = BYTES_MAX, .is_patient = is_patient, .wake_fd = wake_fd};
     char error[256];
     TEST_ASSERT_TRUE_MESSAGE(pf_store_open(&store, &spool, &survey, &config, error, sizeof error), error);
+    atomic_store(&watched, store);
 }
 
 static void give(uint32_t kind, uint32_t index, const char *break_reason)
@@ -205,6 +243,7 @@ static pf_store_stats stats(void)
 static void close_store(void)
 {
     pf_store_quit(store);
+    atomic_store(&watched, NULL);
     pf_store_close(store);
 }
 
@@ -350,6 +389,33 @@ static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
     close_store();
 }
 
+/* Proves: a disk that takes for ever makes the store a thread that hangs, for whoever feeds the watchdogs; one that
+ * waits for work, or for a full disk, does not hang. */
+static void test_a_disk_that_hangs_starves_the_watchdogs(void)
+{
+    const char *hung = NULL;
+    open_store(true);
+    (void)poll(NULL, 0, 60);
+    TEST_ASSERT_NULL(pf_pulse_hung(pf_now(), 50000000));
+    fake.is_full = true;
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    (void)poll(NULL, 0, 60);
+    TEST_ASSERT_NULL(pf_pulse_hung(pf_now(), 50000000));
+    fake.is_hanging = true;
+    for (int i = 0; i < 3000 && hung == NULL; i++) {
+        (void)poll(NULL, 0, 10);
+        hung = pf_pulse_hung(pf_now(), 50000000);
+    }
+    TEST_ASSERT_EQUAL_STRING("store", hung);
+    fake.is_full = false;
+    fake.is_hanging = false;
+    pf_store_settle(store);
+    for (int i = 0; i < 3000 && pf_pulse_hung(pf_now(), 50000000) != NULL; i++)
+        (void)poll(NULL, 0, 10);
+    TEST_ASSERT_NULL(pf_pulse_hung(pf_now(), 50000000));
+    close_store();
+}
+
 /* Proves: what is stored with a keyframe never lists a keyframe that the next boot will make again as lost. */
 static void test_losses_of_later_keyframes_are_not_kept(void)
 {
@@ -381,6 +447,7 @@ static void test_flush_and_quit_count_what_is_lost(void)
     TEST_ASSERT_EQUAL_UINT64(1, stats().keyframes_dropped);
     TEST_ASSERT_TRUE(stats().has_failed);
     fake.is_full = false;
+    atomic_store(&watched, NULL);
     pf_store_quit(store);
     late->kind = PF_OBJECT_KEYFRAME;
     late->index = 1;
@@ -402,7 +469,7 @@ static uint32_t list_spool(const pf_spool *real, uint8_t *indices)
     while (real->ops->next(real->self, item.row, &item) == PF_OK) {
         uint8_t bytes[BYTES_MAX];
         size_t n;
-        TEST_ASSERT_EQUAL_INT(PF_OK, real->ops->read(real->self, item.row, bytes, sizeof bytes, &n));
+        TEST_ASSERT_EQUAL_INT(PF_OK, real->ops->read(real->self, &item, bytes, sizeof bytes, &n));
         indices[count++] = bytes[1];
     }
     return count;
@@ -424,7 +491,7 @@ static void test_a_full_spool_gives_up_the_least_important(void)
 {
     pf_spool real;
     pf_survey survey = {.boots = 1};
-    const pf_spool_config quota = {temporary_path("evict.db"), ROOM * 100};
+    const pf_spool_config quota = {.path = temporary_path("evict.db"), .quota = ROOM * 100};
     pf_store_config config = {.jobs = 4, .slots = 2, .capacity = BYTES_MAX, .wake_fd = wake_fd};
     char error[256];
     uint8_t there[MADE], value[PF_SURVEY_BYTES], expected[PF_SURVEY_BYTES];
@@ -495,6 +562,7 @@ int main(void)
     RUN_TEST(test_a_failing_disk_is_tried_again);
     RUN_TEST(test_what_cannot_be_removed_stays_and_keeps_nothing_back);
     RUN_TEST(test_a_disk_that_is_full_at_the_start_gives_nothing_up);
+    RUN_TEST(test_a_disk_that_hangs_starves_the_watchdogs);
     RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
     RUN_TEST(test_flush_and_quit_count_what_is_lost);
     RUN_TEST(test_a_full_spool_gives_up_the_least_important);

@@ -15,7 +15,7 @@ typedef struct view {
     size_t n;
 } view;
 
-static uint64_t varint(view *v)
+static inline uint64_t varint(view *v)
 {
     uint64_t value = 0;
     for (unsigned shift = 0;; shift += 7) {
@@ -29,12 +29,12 @@ static uint64_t varint(view *v)
     }
 }
 
-static int64_t zigzag(uint64_t value)
+static inline int64_t zigzag(uint64_t value)
 {
     return (int64_t)(value >> 1) ^ -(int64_t)(value & 1);
 }
 
-static view take(view *v, size_t n)
+static inline view take(view *v, size_t n)
 {
     view taken = {v->data, n};
     TEST_ASSERT_TRUE_MESSAGE(v->n >= n, "field cut off");
@@ -44,7 +44,7 @@ static view take(view *v, size_t n)
 }
 
 /* The last occurrence of a field; *count gets how many there are. A number comes as its bits, bytes as a view. */
-static bool find(view message, uint32_t field, uint64_t *number, view *bytes, uint32_t *count)
+static inline bool find(view message, uint32_t field, uint64_t *number, view *bytes, uint32_t *count)
 {
     bool is_found = false;
     *count = 0;
@@ -79,7 +79,7 @@ static bool find(view message, uint32_t field, uint64_t *number, view *bytes, ui
     return is_found;
 }
 
-static uint64_t number(view message, uint32_t field)
+static inline uint64_t number(view message, uint32_t field)
 {
     uint64_t value = 0;
     view bytes;
@@ -87,7 +87,7 @@ static uint64_t number(view message, uint32_t field)
     return find(message, field, &value, &bytes, &count) ? value : 0;
 }
 
-static view bytes(view message, uint32_t field)
+static inline view bytes(view message, uint32_t field)
 {
     uint64_t value;
     view contents = {NULL, 0};
@@ -96,7 +96,7 @@ static view bytes(view message, uint32_t field)
     return contents;
 }
 
-static bool has(view message, uint32_t field)
+static inline bool has(view message, uint32_t field)
 {
     uint64_t value;
     view contents;
@@ -104,7 +104,7 @@ static bool has(view message, uint32_t field)
     return find(message, field, &value, &contents, &count);
 }
 
-static float real32(view message, uint32_t field)
+static inline float real32(view message, uint32_t field)
 {
     uint64_t bits = number(message, field);
     float value;
@@ -112,7 +112,7 @@ static float real32(view message, uint32_t field)
     return value;
 }
 
-static double real64(view message, uint32_t field)
+static inline double real64(view message, uint32_t field)
 {
     uint64_t bits = number(message, field);
     double value;
@@ -120,7 +120,7 @@ static double real64(view message, uint32_t field)
     return value;
 }
 
-static void check_text(const char *expected, view got)
+static inline void check_text(const char *expected, view got)
 {
     TEST_ASSERT_EQUAL_size_t(strlen(expected), got.n);
     TEST_ASSERT_EQUAL_MEMORY(expected, got.data, got.n);

@@ -28,6 +28,7 @@ typedef struct pf_gpio_state {
     uint32_t missed;            /* encoder edges known to be lost */
     uint32_t repeated, illegal; /* encoder: see pf_quadrature */
     bool is_broken;             /* a chip or an input has gone since opening, or the lamp does not go off */
+    uint64_t round_ns;          /* when the driver's thread last went round (it does each 100 ms); 0 = it has none */
     char encoder[80];           /* where counts come from; "" = nowhere */
 } pf_gpio_state;
 

@@ -19,7 +19,7 @@ typedef struct pf_spool_item {
 typedef struct pf_spool_stats {
     uint64_t objects, bytes;                        /* waiting now */
     uint64_t stored, acknowledged, evicted, errors; /* since opening */
-    uint64_t healed; /* times the file was found damaged and replaced; error() says by what right after opening */
+    uint64_t healed; /* times that a damaged file was set aside, or one from before was read on; healing() tells */
 } pf_spool_stats;
 
 /* Of an object that may have to make room for others; those stored without one never have to. */
@@ -45,9 +45,9 @@ typedef struct pf_spool_ops {
     /* The first item with row > after, oldest first. PF_OK, PF_ERR_END (no more), PF_ERR_IO. */
     pf_status (*next)(void *self, uint64_t after, pf_spool_item *item);
 
-    /* Reads an item's bytes into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone), PF_ERR_IO,
-     * PF_ERR_CHECKSUM (the medium has damaged it: bytes are what it gives). */
-    pf_status (*read)(void *self, uint64_t row, void *bytes, size_t capacity, size_t *n);
+    /* Reads the bytes of an item, as next() gave it, into the caller's buffer. PF_OK, PF_ERR_SPACE, PF_ERR_END (gone),
+     * PF_ERR_IO, PF_ERR_CHECKSUM (the medium has damaged it, or its place: bytes are what it gives). */
+    pf_status (*read)(void *self, const pf_spool_item *item, void *bytes, size_t capacity, size_t *n);
 
     /* Removes what the host has acknowledged. PF_OK (also if it is gone already), PF_ERR_IO. */
     pf_status (*remove)(void *self, uint64_t row);
@@ -75,20 +75,22 @@ typedef struct pf_spool_ops {
     pf_status (*keep_all)(void *self);
 
     void (*stats)(void *self, pf_spool_stats *stats);
-    const char *(*error)(void *self); /* last failure in words; valid until this thread asks again */
+    const char *(*error)(void *self);   /* last failure in words; valid until this thread asks again */
+    const char *(*healing)(void *self); /* likewise: what came of the last damaged file; "" = there was none */
     void (*close)(void *self);
 } pf_spool_ops;
 
 typedef struct pf_spool_config {
-    const char *path; /* SQLite file; its folder must exist */
-    uint64_t quota;   /* most bytes of objects; 0 = no limit */
+    const char *path;    /* SQLite file; its folder must exist */
+    uint64_t quota;      /* most bytes of objects; 0 = no limit */
+    void (*alive)(void); /* called now and then by what takes long: reading a damaged file. NULL: nobody asks */
 } pf_spool_config;
 
 /* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
- * new one begun with every object that can still be read: under its row, but never to make room for others. Anybody
- * else's file is refused. A medium that is read-only gives what is there, takes and removes nothing, and is asked at
- * each call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool),
- * PF_ERR_VERSION.
+ * new one begun with every object that can still be read: under its row, but never to make room for others. What a
+ * kill, or a new file that is full, keeps from that is done at the next opening. Anybody else's file is refused. A
+ * medium that is read-only gives what is there, takes and removes nothing, and is asked at each call whether it still
+ * is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool), PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
 

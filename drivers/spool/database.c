@@ -1,0 +1,273 @@
+#include "spool/database.h"
+#include "spool/readonly.h"
+#include "spool/salvage.h"
+
+#include <errno.h>
+#include <inttypes.h>
+#include <stdio.h>
+#include <string.h>
+#include <unistd.h>
+
+#define APPLICATION_ID 0x50465350 /* "PFSP" */
+#define SCHEMA_VERSION 1
+
+/* AUTOINCREMENT: a row number is never used again, so that next() in order of rows is next() in order of storing. */
+static const char schema[] = "CREATE TABLE object ("
+                             "row INTEGER PRIMARY KEY AUTOINCREMENT,"
+                             "kind INTEGER NOT NULL,"
+                             "name BLOB NOT NULL UNIQUE CHECK (length(name) = 32),"
+                             "bytes BLOB NOT NULL);"
+                             "CREATE TABLE value (key TEXT PRIMARY KEY, bytes BLOB NOT NULL) WITHOUT ROWID;";
+
+/* Beside the objects, so that taking a rank away does not write the object anew, and so that programs without ranks can
+ * go on with the file: to them it is a table that looks after itself. */
+static const char ranks[] = "CREATE TABLE IF NOT EXISTS evictable (row INTEGER PRIMARY KEY,"
+                            "importance INTEGER NOT NULL, number INTEGER NOT NULL);"
+                            "CREATE INDEX IF NOT EXISTS evictable_order ON evictable (importance, row);"
+                            "CREATE TRIGGER IF NOT EXISTS evictable_gone AFTER DELETE ON object BEGIN "
+                            "DELETE FROM evictable WHERE row = old.row; END;";
+
+static const char *const sql[SQL_STATEMENTS] = {
+    [SQL_BEGIN] = "BEGIN IMMEDIATE",
+    [SQL_COMMIT] = "COMMIT",
+    [SQL_ROLLBACK] = "ROLLBACK",
+    [SQL_HAS] = "SELECT 1 FROM object WHERE name = ?1",
+    [SQL_PUT] = "INSERT INTO object (kind, name, bytes) VALUES (?1, ?2, ?3)",
+    [SQL_NEXT] = "SELECT row, kind, name, length(bytes) FROM object WHERE row > ?1 ORDER BY row LIMIT 1",
+    [SQL_READ] = "SELECT bytes FROM object WHERE row = ?1",
+    [SQL_SIZE] = "SELECT length(bytes) FROM object WHERE row = ?1",
+    [SQL_REMOVE] = "DELETE FROM object WHERE row = ?1",
+    [SQL_GET] = "SELECT bytes FROM value WHERE key = ?1",
+    [SQL_SET] = "INSERT INTO value (key, bytes) VALUES (?1, ?2) ON CONFLICT (key) DO UPDATE SET bytes = excluded.bytes",
+    [SQL_DELETE] = "DELETE FROM value WHERE key = ?1",
+    [SQL_RANK] = "INSERT OR REPLACE INTO evictable (row, importance, number) VALUES (?1, ?2, ?3)",
+    [SQL_VICTIMS] = ("SELECT e.row, e.number, length(o.bytes) FROM evictable e JOIN object o ON o.row = e.row "
+                     "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3"),
+    [SQL_KEEP_ALL] = "DELETE FROM evictable",
+};
+
+static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
+{
+    pf_status status = PF_ERR_IO;
+    switch (sqlite3_errcode(d->db)) {
+    case SQLITE_NOTADB:
+        d->is_damaged = pf_spool_was_one(d->path, APPLICATION_ID);
+        return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: not an SQLite file", d->path);
+    case SQLITE_CORRUPT:
+        d->is_damaged = true;
+        status = PF_ERR_FORMAT;
+        break;
+    case SQLITE_BUSY:
+        return pf_fail(&d->failure, PF_ERR_IO, "%s: another program uses it", d->path);
+    case SQLITE_FULL:
+    case SQLITE_TOOBIG:
+        status = PF_ERR_SPACE;
+        break;
+    default:
+        break;
+    }
+    return pf_fail(&d->failure, status, "%s: %s: %s", d->path, doing, sqlite3_errmsg(d->db));
+}
+
+pf_status pf_spool_fail(pf_spool_database *d, const char *doing)
+{
+    pf_status status = fail_sqlite(d, doing);
+    d->stats.errors++;
+    return status == PF_ERR_FORMAT ? PF_ERR_IO : status;
+}
+
+bool pf_spool_run(pf_spool_database *d, pf_spool_statement which)
+{
+    int code = sqlite3_step(d->statements[which]);
+    int reset = sqlite3_reset(d->statements[which]);
+    sqlite3_clear_bindings(d->statements[which]);
+    return code == SQLITE_DONE && reset == SQLITE_OK;
+}
+
+static pf_status run_text(pf_spool_database *d, const char *text)
+{
+    if (sqlite3_exec(d->db, text, NULL, NULL, NULL) != SQLITE_OK)
+        return fail_sqlite(d, "opening");
+    return PF_OK;
+}
+
+/* The one integer that a query gives. */
+static pf_status ask(pf_spool_database *d, const char *query, int64_t *value)
+{
+    sqlite3_stmt *q = NULL;
+    pf_status status = PF_OK;
+    if (sqlite3_prepare_v2(d->db, query, -1, &q, NULL) != SQLITE_OK || sqlite3_step(q) != SQLITE_ROW)
+        status = fail_sqlite(d, "opening");
+    else
+        *value = sqlite3_column_int64(q, 0);
+    sqlite3_finalize(q);
+    return status;
+}
+
+/* Tells a spool from an empty file and from everything else, before anything is written. */
+static pf_status identify(pf_spool_database *d, bool *is_empty)
+{
+    int64_t id = 0, version = 0, objects = 0;
+    pf_status status = ask(d, "PRAGMA application_id", &id);
+    if (status == PF_OK)
+        status = ask(d, "PRAGMA user_version", &version);
+    if (status == PF_OK)
+        status = ask(d, "SELECT count(*) FROM sqlite_schema", &objects);
+    if (status != PF_OK)
+        return status;
+    *is_empty = id == 0 && version == 0 && objects == 0;
+    if (*is_empty)
+        return PF_OK;
+    if (id != APPLICATION_ID)
+        return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: an SQLite database of another program", d->path);
+    if (version != SCHEMA_VERSION)
+        return pf_fail(&d->failure, PF_ERR_VERSION, "%s: spool of version %" PRId64 "; this program reads version %d",
+                       d->path, version, SCHEMA_VERSION);
+    return PF_OK;
+}
+
+static pf_status create(pf_spool_database *d)
+{
+    char text[sizeof schema + 128];
+    (void)snprintf(text, sizeof text, "BEGIN IMMEDIATE;%sPRAGMA application_id = %d;PRAGMA user_version = %d;COMMIT;",
+                   schema, APPLICATION_ID, SCHEMA_VERSION);
+    return run_text(d, text);
+}
+
+/* The row of an object that could not be saved may be held by somebody, who will remove it: it is given to no other. */
+static pf_status go_on_after_highest(pf_spool_database *d)
+{
+    char text[320];
+    (void)snprintf(text, sizeof text,
+                   "INSERT INTO sqlite_sequence (name, seq) SELECT 'object', 0 WHERE NOT EXISTS "
+                   "(SELECT 1 FROM sqlite_sequence WHERE name = 'object'); "
+                   "UPDATE sqlite_sequence SET seq = %" PRId64 " WHERE name = 'object' AND seq < %" PRId64,
+                   d->highest, d->highest);
+    return d->highest == 0 ? PF_OK : run_text(d, text);
+}
+
+static pf_status open_for_writing(pf_spool_database *d)
+{
+    bool is_empty = false;
+    if (sqlite3_open_v2(d->path, &d->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
+        SQLITE_OK)
+        return d->db != NULL ? fail_sqlite(d, "opening") : pf_fail(&d->failure, PF_ERR_SPACE, "%s: no memory", d->path);
+    (void)sqlite3_busy_timeout(d->db, 2000); /* the daemon before us may still be closing */
+    /* Exclusive: a second daemon on the same spool is refused, and WAL needs no shared memory. */
+    pf_status status = run_text(d, "PRAGMA locking_mode = EXCLUSIVE");
+    if (status == PF_OK)
+        status = identify(d, &is_empty);
+    /* The log is cut back to 4 MB after a checkpoint, lest it hold an SD card's free space for ever. */
+    if (status == PF_OK)
+        status =
+            run_text(d, "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA journal_size_limit = 4194304;");
+    if (status == PF_OK && is_empty)
+        status = create(d);
+    if (status == PF_OK)
+        status = run_text(d, ranks);
+    if (status == PF_OK)
+        status = go_on_after_highest(d);
+    if (status == PF_OK)
+        d->stats.healed += pf_spool_salvage(d->db, d->path, d->alive, &d->healing);
+    return status;
+}
+
+void pf_spool_database_close(pf_spool_database *d)
+{
+    for (int i = 0; i < SQL_STATEMENTS; i++) {
+        sqlite3_finalize(d->statements[i]);
+        d->statements[i] = NULL;
+    }
+    (void)sqlite3_close(d->db);
+    d->db = NULL;
+}
+
+/* What cannot be written can still be sent. Where there is nothing yet, or nothing that can be read, an empty spool in
+ * memory stands in, so that everybody else need not know. */
+static pf_status open_for_reading(pf_spool_database *d)
+{
+    bool is_empty = access(d->path, F_OK) != 0;
+    pf_status status = PF_OK;
+    if (!is_empty) {
+        status = pf_spool_open_read_only(d->path, &d->db) == SQLITE_OK ? run_text(d, "PRAGMA locking_mode = EXCLUSIVE")
+                                                                       : fail_sqlite(d, "opening");
+        if (status == PF_OK)
+            status = identify(d, &is_empty);
+    }
+    if (is_empty || d->is_damaged) {
+        d->is_damaged = false;
+        pf_spool_database_close(d);
+        status = sqlite3_open(":memory:", &d->db) == SQLITE_OK ? create(d) : fail_sqlite(d, "opening");
+    }
+    if (status == PF_OK) /* over the file's own: nothing has to go while nothing can come */
+        status = run_text(d, "PRAGMA temp_store = MEMORY; CREATE TEMP TABLE evictable (row INTEGER PRIMARY KEY,"
+                             "importance INTEGER NOT NULL, number INTEGER NOT NULL)");
+    return status;
+}
+
+static pf_status open_file(pf_spool_database *d)
+{
+    d->is_read_only = pf_spool_is_read_only(d->path);
+    pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
+    int64_t objects = 0, bytes = 0;
+    if (status == PF_OK)
+        status = ask(d, "SELECT count(*) FROM object", &objects);
+    if (status == PF_OK)
+        status = ask(d, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
+    d->stats.objects = (uint64_t)objects;
+    d->stats.bytes = (uint64_t)bytes;
+    for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
+        if (sqlite3_prepare_v3(d->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[i], NULL) != SQLITE_OK)
+            status = fail_sqlite(d, "opening");
+    return status;
+}
+
+pf_status pf_spool_heal(pf_spool_database *d)
+{
+    d->is_damaged = false;
+    d->stats.errors++;
+    pf_status status = pf_spool_set_aside(d->path, &d->failure);
+    if (status != PF_OK)
+        return status;
+    pf_spool_database_close(d);
+    status = open_file(d);
+    if (status != PF_OK)
+        pf_spool_database_close(d);
+    return status;
+}
+
+pf_status pf_spool_database_open(pf_spool_database *d)
+{
+    pf_status status = open_file(d);
+    if (d->is_damaged)
+        return pf_spool_heal(d);
+    if (status != PF_OK)
+        pf_spool_database_close(d);
+    return status;
+}
+
+bool pf_spool_enter(pf_spool_database *d)
+{
+    pthread_mutex_lock(&d->mutex);
+    if (d->is_read_only && !pf_spool_is_read_only(d->path))
+        pf_spool_database_close(d);
+    if (d->db != NULL || pf_spool_database_open(d) == PF_OK)
+        return true;
+    d->stats.errors++;
+    pthread_mutex_unlock(&d->mutex);
+    return false;
+}
+
+void pf_spool_leave(pf_spool_database *d)
+{
+    if (d->is_damaged)
+        (void)pf_spool_heal(d);
+    pthread_mutex_unlock(&d->mutex);
+}
+
+pf_status pf_spool_fail_read_only(pf_spool_database *d)
+{
+    d->stats.errors++;
+    (void)pf_spool_is_read_only(d->path);
+    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: cannot be written: %s", d->path, strerror(errno));
+}

@@ -1,0 +1,69 @@
+/* The spool's database: its statements, how it is opened, and how it comes back from damage. All but enter() want the
+ * mutex. */
+#ifndef PIPEFISH_SPOOL_DATABASE_H
+#define PIPEFISH_SPOOL_DATABASE_H
+
+#include "common/failure.h"
+#include "pipefish/drivers/spool.h"
+
+#include <pthread.h>
+#include <sqlite3.h>
+
+typedef enum pf_spool_statement {
+    SQL_BEGIN,
+    SQL_COMMIT,
+    SQL_ROLLBACK,
+    SQL_HAS,
+    SQL_PUT,
+    SQL_NEXT,
+    SQL_READ,
+    SQL_SIZE,
+    SQL_REMOVE,
+    SQL_GET,
+    SQL_SET,
+    SQL_DELETE,
+    SQL_RANK,
+    SQL_VICTIMS,
+    SQL_KEEP_ALL,
+    SQL_STATEMENTS,
+} pf_spool_statement;
+
+typedef struct pf_spool_database {
+    pthread_mutex_t mutex;
+    sqlite3 *db; /* NULL: it could not be opened again after it was found damaged */
+    sqlite3_stmt *statements[SQL_STATEMENTS];
+    char *path;
+    uint64_t quota;
+    void (*alive)(void);
+    bool is_damaged; /* SQLite has found the file to be, and it is to be replaced */
+    bool is_read_only;
+    int64_t highest; /* row given or shown to anybody */
+    pf_spool_stats stats;
+    pf_failure failure, healing;
+} pf_spool_database;
+
+/* Opens, and heals if need be; goes on with what an earlier healing has not finished. PF_OK, or as pf_spool_open. */
+pf_status pf_spool_database_open(pf_spool_database *d);
+void pf_spool_database_close(pf_spool_database *d);
+
+/* Takes the mutex and sees to it that the database is open. False, without the mutex: it cannot be. A medium that was
+ * read-only is asked whether it still is. */
+bool pf_spool_enter(pf_spool_database *d);
+
+/* Gives the mutex back; what was found damaged meanwhile is replaced first. */
+void pf_spool_leave(pf_spool_database *d);
+
+/* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
+ * some need not know. A file that cannot be set aside stays in use. */
+pf_status pf_spool_heal(pf_spool_database *d);
+
+/* Runs a statement that gives no rows, and leaves it ready for the next time. The error stays in the connection. */
+bool pf_spool_run(pf_spool_database *d, pf_spool_statement which);
+
+/* The call that failed is counted and told in SQLite's words. PF_ERR_SPACE, else PF_ERR_IO. */
+pf_status pf_spool_fail(pf_spool_database *d, const char *doing);
+
+/* Likewise where the medium is read-only: later it may be written. PF_ERR_SPACE. */
+pf_status pf_spool_fail_read_only(pf_spool_database *d);
+
+#endif

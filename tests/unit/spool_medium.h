@@ -1,0 +1,60 @@
+/* A medium under the spool that refuses writes when told to, and small objects for it. */
+#ifndef PIPEFISH_TESTS_SPOOL_MEDIUM_H
+#define PIPEFISH_TESTS_SPOOL_MEDIUM_H
+
+#include "spool_objects.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <sqlite3.h>
+
+/* SQLite's own way to put other system calls in place. */
+static int refuse_with;  /* errno of every write; 0 = none fails */
+static uint64_t allowed; /* writes before that */
+
+static inline bool refuses(void)
+{
+    if (refuse_with == 0 || (allowed > 0 && allowed--))
+        return false;
+    errno = refuse_with;
+    return true;
+}
+
+static inline ssize_t write_or_not(int fd, const void *bytes, size_t n)
+{
+    return refuses() ? -1 : write(fd, bytes, n);
+}
+
+static inline ssize_t pwrite_or_not(int fd, const void *bytes, size_t n, off_t at)
+{
+    return refuses() ? -1 : pwrite(fd, bytes, n, at);
+}
+
+static inline int fallocate_or_not(int fd, off_t at, off_t n)
+{
+    return refuses() ? errno : posix_fallocate(fd, at, n);
+}
+
+static inline int ftruncate_or_not(int fd, off_t n)
+{
+    return refuses() ? -1 : ftruncate(fd, n);
+}
+
+static inline void hook(const char *name, sqlite3_syscall_ptr call)
+{
+    sqlite3_vfs *vfs = sqlite3_vfs_find(NULL);
+    (void)vfs->xSetSystemCall(vfs, name, call);
+}
+
+/* Object `id` of 300 bytes. */
+static inline pf_status put_small(uint64_t id)
+{
+    uint8_t bytes[300], name[32];
+    memset(bytes, (int)id, sizeof bytes);
+    memcpy(bytes, &id, sizeof id);
+    if (pf_sha256(bytes, sizeof bytes, name) != PF_OK)
+        return PF_ERR_IO;
+    return spool.ops->put(spool.self, 2, name, bytes, sizeof bytes);
+}
+
+#endif
