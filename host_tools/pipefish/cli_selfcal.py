@@ -73,7 +73,7 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     texts = {key: getattr(args, key) for key in ("name", "serial", "lens") if getattr(args, key)}
     camera = dataclasses.replace(found.camera, **texts)
     camera.save(args.output)
-    keys = ("status", "sigma", "rms", "ambiguous", "alpha_sigma", "bearing_sigma", "theta", "area", "tilt")
+    keys = ("status", "sigma", "rms", "usable", "ambiguous", "alpha_sigma", "bearing_sigma", "theta", "area", "tilt")
     document: dict[str, Any] = {key: getattr(found, key) for key in keys}
     document |= {"starts": {key: getattr(found, key) for key in ("starts", "refined", "agreeing", "runner_up")}}
     sigma = math.sqrt(camera.covariance[0, 0])
@@ -97,6 +97,10 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     if found.ambiguous:
         rows.append(
             ("CAUTION", "that lens explains the matches as well: this one may be wrong. Take a third view or more")
+        )
+    elif not found.usable:
+        rows.append(
+            ("CAUTION", "rough: focal length to 3 % or bearings to 0.5 degrees are not certain. Take more views")
         )
     used = [p for p in pairs if p["status"] == "ok"]
     rows.append(("pairs", f"{len(used)} of {len(pairs)}, {sum(p['inliers'] for p in used)} matches"))

@@ -26,6 +26,7 @@ ALPHA_LIMIT = 0.08
 #: The same by the matches alone. 500 set-ups of general motion: at most 0.008; 100 without rotation or along the axis:
 #: at least 0.1.
 ALONE_LIMIT = 0.02
+USABLE_FOCAL, USABLE_BEARING = 0.03, math.radians(0.5)  # largest sigmas of what one may measure with
 AS_GOOD = 1.01  # times the cost of the one found
 AREA_LEAST = 0.10  # of the picture, that the matches must span
 AXIAL = math.radians(12.0)
@@ -113,6 +114,14 @@ class SelfCalibration:
     refined: int = 0
     agreeing: int = 0
     runner_up: float = 0.0
+
+    @property
+    def usable(self) -> bool:
+        """Whether its own sigmas are below 3 % of the focal length and 0.5 degrees of bearings, without a rival."""
+        if self.camera is None or self.ambiguous:
+            return False
+        focal = math.sqrt(self.camera.covariance[0, 0]) / self.camera.f_u
+        return focal < USABLE_FOCAL and self.bearing_sigma < USABLE_BEARING
 
     @property
     def ambiguous(self) -> bool:

@@ -32,12 +32,14 @@ SIZE = (1280, 960)
 def test_two_pairs_find_the_lens(kind):
     """Within three of its own sigmas and half a degree, at 0.5 px and with wrong matches, for every kind of lens."""
     setup = make_setup(2, kind, pairs=2, noise=0.5, outliers=0.3)
-    found = self_calibrate(setup.pairs, SIZE)
+    found = self_calibrate(setup.pairs, SIZE, views=[(0, 1), (1, 2)])
     assert found.status == "ok", found.reason
     error = bearing_error(found.camera, setup.lens, found.radius)
     assert error < 3 * found.bearing_sigma
     assert math.degrees(error) < 0.5
     assert found.sigma == pytest.approx(0.5, rel=0.15)
+    assert found.camera.provenance.views == 3
+    assert found.camera.rms_px == found.rms == pytest.approx(0.5, rel=0.2)
     for pair, right in zip(found.pairs, setup.right, strict=True):
         assert (pair.inlier & right).sum() > 0.95 * right.sum()
         assert (pair.inlier & ~right).sum() < 0.05 * right.sum()
@@ -256,12 +258,16 @@ def test_command_reads_matches_and_refuses_in_one_line(tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["status"] == "ok"
     assert document["starts"]["agreeing"] >= 1
+    assert document["usable"] is True and document["ambiguous"] is False
+    assert document["camera"]["f_u"] == pf.Camera.load(out).f_u and document["camera"]["f_u_sigma"] > 0
     assert pf.Camera.load(out).f_u == pytest.approx(good.lens.f, rel=0.03)
     assert main(["selfcal", str(tmp_path / "bad.csv"), "--size", "1280x960", "-o", str(tmp_path / "no.json")]) == 1
     assert "along its optical axis" in capsys.readouterr().err
     assert not (tmp_path / "no.json").exists()
     assert main(["selfcal", str(tmp_path / "good.npz"), "-o", str(out)]) == 1
     assert "--size" in capsys.readouterr().err
+    assert main(["selfcal", str(tmp_path / "good.npz"), "--size", "640x480", "-o", str(out)]) == 1
+    assert "good.npz, x1 y1: a pixel outside the picture" in capsys.readouterr().err
 
 
 def test_what_cannot_be_done_is_said_before_the_work(tmp_path, capsys, monkeypatch):
