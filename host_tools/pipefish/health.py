@@ -401,7 +401,7 @@ def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget:
     probability = min(1.0, (1 + len(causes)) * least)
     moved = probability < FALSE_ALARM
     what = likeliest.text() + (
-        ", if nothing else changed" if likeliest.rest >= FALSE_ALARM else " and something else too"
+        ", if nothing else changed" if likeliest.rest >= FALSE_ALARM else ", which does not explain all of it"
     )
     open_text = f"sigma(alpha) is {100 * open_sigma:.2g} % of the diameter"
     if open_sigma > budget:
