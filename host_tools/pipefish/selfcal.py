@@ -230,23 +230,29 @@ def self_calibrate(
     reports = [
         PairReport(p["status"], p["pose"], p["inlier"], p["median_shift_px"], p["rms_px"]) for p in found["pairs"]
     ]
-    values: dict[str, Any] = {key: found[key] for key in ("starts", "refined", "agreeing", "runner_up")}
-    if found["found"]:
-        values |= {key: found[key] for key in ("alpha_sigma", "bearing_sigma", "theta", "area", "tilt", "needed")}
-        good = [p for p in found["pairs"] if p["status"] == "ok"]
-        inliers = sum(p["inliers"] for p in good)
-        rms = math.sqrt(sum(p["inliers"] * p["rms_px"] ** 2 for p in good) / max(inliers, 1))
-        values |= {"sigma": found["sigma_px"], "radius": found["radius_px"], "rms": rms if good else math.nan}
-        if not good:  # at the lens that was found a plane looks as if it told of lenses
-            found |= {"alpha_sigma": math.inf, "bearing_sigma": math.inf}
-            values |= {"alpha_sigma": math.inf, "bearing_sigma": math.inf}
+    used = [k for k, p in enumerate(found["pairs"]) if p["status"] == "ok"]
+    if found["found"] and not used:  # at the lens that was found a plane looks as if it told of lenses
+        found |= {"alpha_sigma": math.inf, "bearing_sigma": math.inf}
+    values = _values(found)
     status = _status(found)
     if status != "ok":
         return SelfCalibration(status, _reason(status, found), None, reports, **values)
     which = [(2 * k, 2 * k + 1) for k in range(len(taken))] if views is None else views
-    used = [k for k, p in enumerate(found["pairs"]) if p["status"] == "ok"]
     camera = _camera(found, width, height, len(used), len({v for k in used for v in which[k]}), values["rms"])
     return SelfCalibration("ok", "", camera, reports, **values)
+
+
+def _values(found: dict[str, Any]) -> dict[str, Any]:
+    """Fields of SelfCalibration."""
+    values: dict[str, Any] = {key: found[key] for key in ("starts", "refined", "agreeing", "runner_up")}
+    if found["found"]:
+        values |= {key: found[key] for key in ("alpha_sigma", "bearing_sigma", "theta", "area", "tilt", "needed")}
+        values |= {"sigma": found["sigma_px"], "radius": found["radius_px"]}
+        good = [p for p in found["pairs"] if p["status"] == "ok"]
+        if good:
+            squares = sum(p["inliers"] * p["rms_px"] ** 2 for p in good)
+            values["rms"] = math.sqrt(squares / sum(p["inliers"] for p in good))
+    return values
 
 
 def _status(found: dict[str, Any]) -> str:
@@ -293,7 +299,8 @@ def _reason(status: str, found: dict[str, Any]) -> str:
     if status == "low_coverage":
         area = math.floor(1000 * found["area"]) / 10
         text += f" ({area:g} %; {100 * AREA_LEAST:.0f} % are needed"
-        text += f"; along alpha it is open by {100 * found['alpha_sigma']:.2g} %" if found["found"] else ""
+        if found["found"] and found["alpha_sigma"] < 1:
+            text += f"; along alpha it is open by {100 * found['alpha_sigma']:.2g} %"
         text += "). Take a scene that fills it"
     if status == "planar":
         text += ". Take a scene in depth: near and far things, not a wall or a board alone"
