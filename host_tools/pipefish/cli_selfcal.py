@@ -67,7 +67,7 @@ def run_selfcal(args: argparse.Namespace) -> Result:
         for name, p in zip(given.names, found.pairs, strict=True)
     ]
     if found.camera is None:
-        hint = "; or --size is not that of the pictures" if given.size is None and found.status != "no_matches" else ""
+        hint = ". Or is --size not that of the pictures?" if given.size is None and found.status != "no_matches" else ""
         of = args.inputs[0] + (f" and {len(args.inputs) - 1} more" if len(args.inputs) > 1 else "")
         raise PipefishError(f"{of}: {found.reason}{hint}")
     texts = {key: getattr(args, key) for key in ("name", "serial", "lens") if getattr(args, key)}
