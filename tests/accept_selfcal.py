@@ -61,9 +61,11 @@ def general(seed: int, noise: float | None = None) -> Row:
 
 
 def degenerate(seed: int) -> Row:
-    """One set-up that must be refused."""
+    """One set-up that must be refused: one pair; in every fourth block of sixteen three, which change nothing (but of
+    small patches, as three would cover more)."""
     case = DEGENERATE[seed // 4 % 4]
-    setup = make_setup(10_000 + seed, KINDS[seed % 4], case)
+    pairs = 3 if seed // 16 % 4 == 3 and case != "low_coverage" else 1
+    setup = make_setup(10_000 + seed, KINDS[seed % 4], case, pairs=pairs)
     found = self_calibrate(setup.pairs, (setup.lens.width, setup.lens.height), threads=1)
     return {"case": case, "kind": setup.kind, "status": found.status}
 
@@ -162,7 +164,7 @@ def boards() -> list[Row]:
     def one_case(number: int) -> Row:
         name, pair, of = cases[number]
         found = self_calibrate([pair], of, threads=1)
-        return {"name": name, "status": found.status, "matches": len(pair[0])}
+        return {"name": name, "status": found.status, "pair": found.pairs[0].status, "matches": len(pair[0])}
 
     rows = kept_series(KEEP, "boards", len(cases), one_case)
     files = sorted((DATA / "calibration/jy_stereo/left").glob("*.jpg"))[:5]
@@ -172,10 +174,25 @@ def boards() -> list[Row]:
             one, two = (read_grey(files[number + k]) for k in (0, 1))
             pair = match_pictures(one, two, threads=1)
             found = self_calibrate([pair], one.shape[::-1], sigma_least=COMMON_SIGMA, threads=1)
-            return {"name": "static", "status": found.status, "matches": len(pair[0])}
+            return {"name": "static", "status": found.status, "pair": found.pairs[0].status, "matches": len(pair[0])}
 
         rows += kept_series(KEEP, "static", 4, standing)
     return rows
+
+
+#: Pairs of ov_plane between which the camera turned about itself: by its calibration it moved by 0.00 and 0.03 of the
+#: distance to the board, by 0.06 to 0.24 in all others.
+OV_PLANE_TURNED = (10, 14)
+
+
+def rightly_refused(row: Row) -> bool:
+    """A plane seen without a tilt is told by the tilt that is missing, a small one by what it covers."""
+    if row["name"] == "static":
+        return row["status"] == "standing"
+    if row["status"] == "turning":
+        return row["name"] == "ov_plane" and row["seed"] in OV_PLANE_TURNED
+    plane = row["status"] in ("planar", "no_rotation", "axial") and row["pair"] == "plane"
+    return plane or row["status"] == "low_coverage"
 
 
 FOCAL, BEARING_DEG = 0.03, 0.5  # largest errors of focal length, relative, and of a bearing
@@ -204,8 +221,8 @@ def check_real() -> Iterator[Row]:
     refused = boards()
     for row in refused:
         print(f"  {row['name']}: {row['matches']} matches, {row['status']}", file=sys.stderr)
-    accepted = sum(r["status"] == "ok" for r in refused)
-    yield figure("selfcal.boards_accepted", accepted, "= 0", accepted == 0)
+    wrong = [r for r in refused if not rightly_refused(r)]
+    yield exactly("selfcal.boards_misjudged", float(len(wrong)), 0.0)
     yield figure("selfcal.fountain_rest_dishonest", len(rest) - honest, "= 0", honest == len(rest))
 
 
@@ -218,6 +235,9 @@ def check_health(count: int) -> Iterator[Row]:
             rows = kept_series(KEEP, f"health_{case}_{change}", count, lambda s, c=case, x=change: health_of(s, c, x))
             share = sum(r["verdict"].startswith("drifted") for r in rows) / len(rows)
             yield at_least(f"health.{case}_{change}_detected", share, 0.95)
+            name, true = {"scale": ("angle scale", -1.0), "centre": ("centre u", -3.0)}[change]
+            off = [abs(r["changes"][name][0] - true) / r["changes"][name][1] for r in rows]
+            yield at_least(f"health.{case}_{change}_within_3_sigma", sum(o < 3 for o in off) / len(rows), 0.95)
         rows = kept_series(KEEP, f"health_{case}_none", count, lambda s, c=case: health_of(s, c, ""))
         yield at_most(
             f"health.{case}_false_alarms", sum(r["verdict"].startswith("drifted") for r in rows) / len(rows), 0.02
@@ -259,6 +279,9 @@ def check_rendered() -> Iterator[Row]:
     for row in (right, *changed):
         print(f"  rendered, {row['change'] or 'right'}: {row['text']}", file=sys.stderr)
     yield exactly("health.rendered_right_called_valid", float(right["verdict"].endswith("valid")), 1.0)
+    for row, (name, true) in zip(changed, (("angle scale", -1.0), ("centre u", -3.0)), strict=True):
+        off = abs(row["changes"][name]["value"] - true) / row["changes"][name]["sigma"]
+        yield at_most(f"health.rendered_{row['change']}_off_sigmas", off, 3.0)
     yield exactly("health.rendered_drifts_found", sum(r["verdict"].startswith("drifted") for r in changed), 2)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,25 @@ STATES = {
 }
 
 
+def _with_file_name(message: str, names: list[str]) -> str:
+    """pairs[k] is what Python calls the k-th file."""
+    place = re.match(r"pairs\[(\d+)\](: view \d)?", message)
+    if place is None:
+        return message
+    column = {": view 1": ", x1 y1", ": view 2": ", x2 y2", None: ""}[place[2]]
+    return names[int(place[1])] + column + message[place.end() :]
+
+
 def run_selfcal(args: argparse.Namespace) -> Result:
     """Calibrates from views of an unknown scene and writes the profile."""
     from pipefish.progress import Progress
-    from pipefish.selfcal import self_calibrate
+    from pipefish.selfcal import PARAMETERS, self_calibrate
     from pipefish.selfcal_input import read
 
     if not Path(args.output).absolute().parent.is_dir():
         raise ArgumentError(f"--output: {Path(args.output).parent} is no folder")
     with Progress("selfcal", 100, args.json) as bar:
-        given = read(args.inputs, args.threads, lambda done, of: bar.update(80 * done // of, "matching"))
+        given = read(args.inputs, args.threads, lambda done, of: bar.update(80 * done // of, "matching"), args.size)
         if args.size and given.size and tuple(args.size) != given.size:
             raise ArgumentError(f"--size: the pictures are {given.size[0]}x{given.size[1]}")
         size = given.size or args.size
@@ -38,7 +48,12 @@ def run_selfcal(args: argparse.Namespace) -> Result:
         if not given.pairs:
             raise PipefishError(f"{args.inputs[0]}: no two keyframes have enough tracks in common")
         bar.update(80, "calibrating")
-        found = self_calibrate(given.pairs, size, sigma_least=given.sigma_least, threads=args.threads)
+        try:
+            found = self_calibrate(
+                given.pairs, size, sigma_least=given.sigma_least, views=given.views, threads=args.threads
+            )
+        except ArgumentError as error:
+            raise ArgumentError(_with_file_name(str(error), given.names)) from None
     pairs = [
         {
             "name": name,
@@ -52,24 +67,41 @@ def run_selfcal(args: argparse.Namespace) -> Result:
         for name, p in zip(given.names, found.pairs, strict=True)
     ]
     if found.camera is None:
-        raise PipefishError(f"{args.inputs[0]}: {found.reason}")
+        hint = ". Or is --size not that of the pictures?" if given.size is None and found.status != "no_matches" else ""
+        of = args.inputs[0] + (f" and {len(args.inputs) - 1} more" if len(args.inputs) > 1 else "")
+        raise PipefishError(f"{of}: {found.reason}{hint}")
     texts = {key: getattr(args, key) for key in ("name", "serial", "lens") if getattr(args, key)}
     camera = dataclasses.replace(found.camera, **texts)
     camera.save(args.output)
-    keys = ("status", "sigma", "alpha_sigma", "bearing_sigma", "theta", "area", "tilt")
+    keys = ("status", "sigma", "rms", "usable", "ambiguous", "alpha_sigma", "bearing_sigma", "theta", "area", "tilt")
     document: dict[str, Any] = {key: getattr(found, key) for key in keys}
     document |= {"starts": {key: getattr(found, key) for key in ("starts", "refined", "agreeing", "runner_up")}}
-    document |= {"pairs": pairs, "files": [args.output]}
     sigma = math.sqrt(camera.covariance[0, 0])
+    document |= {"camera": {key: getattr(camera, key) for key in PARAMETERS} | {"f_u_sigma": sigma}}
+    document |= {"pairs": pairs, "files": [args.output]}
     rows: list[tuple[str, object]] = [
         ("focal length", f"{camera.f_u:.1f} +- {sigma:.1f} px a radian"),
         ("centre", f"{camera.c_u:.1f}, {camera.c_v:.1f}"),
-        ("covered", f"to {math.degrees(found.theta):.1f} degrees off the axis"),
+        (
+            "covered",
+            f"to {math.degrees(found.theta):.1f} degrees off the axis; to {math.degrees(camera.theta_max):.1f} it is "
+            "extrapolated",
+        ),
         ("bearings", f"within {math.degrees(found.bearing_sigma):.2f} degrees there (1 sigma)"),
         ("alpha", f"{100 * found.alpha_sigma:.2f} % (1 sigma)"),
-        ("noise", f"{found.sigma:.2f} px"),
+        ("residuals", f"{found.rms:.2f} px rms; a match counts with {found.sigma:.2f} px"),
         ("starts", f"{found.agreeing} of {found.refined} end at this camera"),
     ]
+    if found.runner_up > 0:
+        rows.append(("next best", f"another lens, at {found.runner_up:.4g} times the cost of this one"))
+    if found.ambiguous:
+        rows.append(
+            ("CAUTION", "that lens explains the matches as well: this one may be wrong. Take a third view or more")
+        )
+    elif not found.usable:
+        rows.append(
+            ("CAUTION", "rough: focal length to 3 % or bearings to 0.5 degrees are not certain. Take more views")
+        )
     used = [p for p in pairs if p["status"] == "ok"]
     rows.append(("pairs", f"{len(used)} of {len(pairs)}, {sum(p['inliers'] for p in used)} matches"))
     rows += [("left out", f"{p['name']}: {STATES[p['status']]}") for p in pairs if p["status"] != "ok"]

@@ -23,8 +23,9 @@ MATCHES = (".npz", ".csv", ".txt")
 MOST_MATCHES = 2000  # a pair: more say little more and take longer
 DENSE_PIXELS = 2_000_000  # larger pictures are halved before they are matched: four times as fast, a tenth less sharp
 SURVEY_PAIRS = 24
-# Pixels: a tracker's errors are common to neighbours (measure.TRACK_FLOOR_PX) and a dense matcher's too. Residuals show
-# 0.06 and 0.2, which made bearings of fountain-P11's triples wrong by up to six of their sigmas.
+# Pixels: a tracker's errors are common to neighbours (measure.TRACK_FLOOR_PX), and a dense matcher's may be; residuals
+# show 0.06 and 0.2. By 0.06 bearings from a survey were wrong by a degree. For pictures it is caution: fountain-P11's
+# triples are then right to 0.9 of their sigmas, and to 1.2 with 0.2.
 COMMON_SIGMA = 0.5
 SURVEY_COMMON = 50  # tracks that two keyframes must have in common
 ALL_PAIRS = 4  # pictures up to which every two of them are matched
@@ -34,12 +35,13 @@ Pair = tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class Input:
-    """Pairs of views of one camera, picture size or None, a name for each pair, and the least sigma of a match."""
+    """Pairs of views of one camera, picture size or None, a name for each pair, the least sigma of a match."""
 
     pairs: list[Pair]
     size: tuple[int, int] | None
     names: list[str]
     sigma_least: float = SIGMA_LEAST
+    views: list[tuple[int, int]] | None = None  #: which two each pair is of, where that is known
 
 
 def _thinned(one: Floats, two: Floats) -> Pair:
@@ -71,8 +73,11 @@ def match_pictures(one: Any, two: Any, threads: int = 1) -> Pair:
     return first[best], second[best]
 
 
-def from_pictures(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -> Input:
-    """Every two of up to four pictures, of more each with the next two. Raises FormatError, OSError."""
+def from_pictures(
+    paths: Sequence[str], threads: int, tell: Callable[[int, int], None], size: tuple[int, int] | None = None
+) -> Input:
+    """Every two of up to four pictures, of more each with the next two. Raises ArgumentError where they are not of the
+    size given, FormatError, OSError."""
     pictures = [read_grey(path) for path in paths]
     for path, picture in zip(paths, pictures, strict=True):
         if picture.shape != pictures[0].shape:
@@ -82,6 +87,9 @@ def from_pictures(paths: Sequence[str], threads: int, tell: Callable[[int, int],
                 f"{picture.shape[1]}x{picture.shape[0]}, the first is {pictures[0].shape[1]}x{pictures[0].shape[0]}: "
                 "not of one camera",
             )
+    found = (pictures[0].shape[1], pictures[0].shape[0])
+    if size and tuple(size) != found:
+        raise ArgumentError(f"--size: the pictures are {found[0]}x{found[1]}")
     every = itertools.combinations(range(len(paths)), 2)
     chosen = [(a, b) for a, b in every if len(paths) <= ALL_PAIRS or b - a <= 2]
     pairs = []
@@ -89,7 +97,7 @@ def from_pictures(paths: Sequence[str], threads: int, tell: Callable[[int, int],
         tell(done, len(chosen))
         pairs.append(match_pictures(pictures[a], pictures[b], threads))
     names = [f"{Path(paths[a]).name}, {Path(paths[b]).name}" for a, b in chosen]
-    return Input(pairs, (pictures[0].shape[1], pictures[0].shape[0]), names, COMMON_SIGMA)
+    return Input(pairs, found, names, COMMON_SIGMA, chosen)
 
 
 def from_matches(path: str | os.PathLike[str]) -> Input:
@@ -105,7 +113,7 @@ def from_matches(path: str | os.PathLike[str]) -> Input:
         except (ValueError, EOFError, OSError) as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise
-            raise FormatError(path, None, f"not an .npz file of arrays: {error}") from None
+            raise FormatError(path, None, "not an .npz file of arrays") from None
         if one.ndim != 2 or one.shape[1:] != (2,) or one.shape != two.shape:
             raise FormatError(path, "xy1, xy2", f"shapes {one.shape} and {two.shape} are not both (n,2)")
     else:
@@ -143,11 +151,15 @@ def from_survey(path: str | os.PathLike[str]) -> Input:
     frame = survey.keyframes[0]
     pairs = [pair for *_, pair in found[:SURVEY_PAIRS]]
     names = [f"keyframes {frames[a]}, {frames[b]}" for _, a, b, _ in found[:SURVEY_PAIRS]]
-    return Input(pairs, (frame.width, frame.height), names, COMMON_SIGMA)
+    return Input(
+        pairs, (frame.width, frame.height), names, COMMON_SIGMA, [(a, b) for _, a, b, _ in found[:SURVEY_PAIRS]]
+    )
 
 
-def read(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -> Input:
-    """What the files hold: pictures; or files of matches, a pair each; or one survey.
+def read(
+    paths: Sequence[str], threads: int, tell: Callable[[int, int], None], size: tuple[int, int] | None = None
+) -> Input:
+    """What the files hold: pictures, of `size` if that is given; or files of matches, a pair each; or one survey.
 
     Raises ArgumentError, FormatError, OSError."""
     lower = [path.lower() for path in paths]
@@ -166,4 +178,4 @@ def read(paths: Sequence[str], threads: int, tell: Callable[[int, int], None]) -
             f"{paths[0]}: alone; give two pictures or more, or a file of matches (.npz, .csv, .txt), or a survey "
             "(.mcap)"
         )
-    return from_pictures(paths, threads, tell)
+    return from_pictures(paths, threads, tell, size)

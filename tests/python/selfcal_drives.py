@@ -79,6 +79,7 @@ def health_of(seed: int, case: str, change: str, **more: float) -> dict[str, Any
     )
     return {
         "verdict": found.verdict,
+        "text": found.text,
         "alpha_sigma": found.alpha_sigma,
         "probability": found.probability,
         "observed": found.observed,

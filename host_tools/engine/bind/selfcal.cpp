@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <memory>
+#include <stdexcept>
 
 namespace nb = nanobind;
 namespace selfcal = pipefish::selfcal;
@@ -78,6 +79,46 @@ double span_of(const std::vector<selfcal::Pair> &pairs)
     return most;
 }
 
+using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+
+// Errors (n,) and derivatives (n,13) of one pair's matches at a lens (8,) and a pose (12,), after a step (13,).
+nb::tuple selfcal_errors(const Numbers &lens, double theta_end, uint32_t width, uint32_t height, const Numbers &pose,
+                         const Pixels &first, const Pixels &second, const Numbers &step)
+{
+    using Unknowns = Eigen::Matrix<double, selfcal::kLens + selfcal::Adjustment::kPose, 1>;
+    if (lens.shape(0) != selfcal::kLens || pose.shape(0) != 12 || step.shape(0) != Unknowns::RowsAtCompileTime ||
+        first.shape(0) != second.shape(0)) {
+        throw std::invalid_argument("selfcal_errors: sizes");
+    }
+    std::vector<selfcal::Pair> pairs(1);
+    pairs[0].uv1.assign(first.data(), first.data() + first.size());
+    pairs[0].uv2.assign(second.data(), second.data() + second.size());
+    const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> of(pose.data());
+    selfcal::Adjustment at;
+    at.width = width;
+    at.height = height;
+    at.family = selfcal::LensFamily(theta_end, at.prior.bend);
+    at.lens = Eigen::Map<const selfcal::LensVector>(lens.data());
+    at.pairs = &pairs;
+    at.used = {0};
+    at.poses.resize(1);
+    at.poses[0].r = of.leftCols<3>();
+    at.poses[0].t = of.col(3).normalized();
+    at.match.resize(1);
+    for (size_t i = 0; i < pairs[0].size(); i++) {
+        at.match[0].push_back(static_cast<int>(i));
+    }
+    const auto found = at.errors_after(0, Eigen::Map<const Unknowns>(step.data()));
+    const pf_camera c = at.camera();
+    nb::dict camera;
+    for (const auto &[name, value] :
+         {std::pair("f", c.f_u), std::pair("c_u", c.c_u), std::pair("c_v", c.c_v), std::pair("k2", c.k2),
+          std::pair("k3", c.k3), std::pair("k4", c.k4), std::pair("k5", c.k5), std::pair("theta_max", c.theta_max)}) {
+        camera[name] = value;
+    }
+    return nb::make_tuple(matrix_to_numpy(found.value), matrix_to_numpy(found.slope), camera);
+}
+
 nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixels> &second, uint32_t width,
                         uint32_t height, double c_u, double c_v, double centre_sigma, double bend, double alpha_limit,
                         double alone_limit, double sigma_least, uint64_t seed, int threads)
@@ -126,7 +167,6 @@ nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixe
         camera[name] = value;
     }
     out["camera"] = camera;
-    out["shape"] = found.lens[selfcal::kShape];
     out["covariance"] = matrix_to_numpy(profile_covariance(found));
     out["sigma_px"] = found.sigma;
     const selfcal::Observability &o = found.observed;
@@ -147,6 +187,9 @@ void bind_selfcal(nb::module_ &m)
           nb::arg("c_u"), nb::arg("c_v"), nb::arg("centre_sigma"), nb::arg("bend"), nb::arg("alpha_limit"),
           nb::arg("alone_limit"), nb::arg("sigma_least"), nb::arg("seed"), nb::arg("threads"),
           "A camera from matches of pairs of views; see pipefish.selfcal.");
+    m.def("selfcal_errors", &selfcal_errors, nb::arg("lens"), nb::arg("theta_end"), nb::arg("width"), nb::arg("height"),
+          nb::arg("pose"), nb::arg("first"), nb::arg("second"), nb::arg("step"),
+          "Signed errors of matches in pixels, their derivatives, and the camera, after a step of the unknowns.");
     m.def(
         "bearing_difference",
         [](const pf_profile &a, const pf_profile &b, double u, double v, double radius) {

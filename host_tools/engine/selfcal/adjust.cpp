@@ -182,6 +182,33 @@ template <class Sink> void Adjustment::linearize(int e, Sink &sink) const
     }
 }
 
+Adjustment::Errors Adjustment::errors_after(int place, const Eigen::Matrix<double, kLens + kPose, 1> &step)
+{
+    struct Rows {
+        std::vector<double> values;
+        void add(int, const double *r, const optim::RobustLoss &, const double *by_pose, std::span<const int>,
+                 std::span<const double *const>, const double *by_lens)
+        {
+            values.push_back(*r);
+            for (int i = 0; i < kLens + kPose; i++) {
+                values.push_back(i < kLens ? by_lens[i] : by_pose[i - kLens]);
+            }
+        }
+    } rows;
+    set_stage(Stage::all);
+    save();
+    optim::Step<kPose, 1> moved;
+    moved.g = step.head<kLens>();
+    moved.e.resize(used.size(), Eigen::Matrix<double, kPose, 1>::Zero());
+    moved.e[static_cast<size_t>(place)] = step.tail<kPose>();
+    apply(moved);
+    linearize(place, rows);
+    constexpr Eigen::Index WIDE = 1 + kLens + kPose;
+    const Eigen::Map<const Eigen::Matrix<double, Eigen::Dynamic, WIDE, Eigen::RowMajor>> all(
+        rows.values.data(), static_cast<Eigen::Index>(rows.values.size()) / WIDE, WIDE);
+    return {all.col(0), all.rightCols<kLens + kPose>()};
+}
+
 double Adjustment::cost(int e) const
 {
     if (!valid_) {

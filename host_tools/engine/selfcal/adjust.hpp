@@ -50,6 +50,13 @@ public:
 
     // Residual of a match in pixels; NaN where a pixel is outside the model, 0 for a ray along the baseline.
     double error(size_t pair, size_t i) const;
+    // Of the matches that count of a used pair (its place in `used`), after a step of all unknowns, the lens's and the
+    // pose's: errors in sigmas, and their derivatives there. What adjust() works with, for tests.
+    struct Errors {
+        Eigen::VectorXd value;
+        Eigen::Matrix<double, Eigen::Dynamic, kLens + kPose> slope;
+    };
+    Errors errors_after(int place, const Eigen::Matrix<double, kLens + kPose, 1> &step);
     // Sum of min(square, 9) in sigmas over all matches of the used pairs.
     double truncated(double at_sigma) const;
 

@@ -31,7 +31,8 @@ void fill_beam(const T &sin_t, const T &cos_t, const T &cos_p, const T &sin_p, c
 // Signed error of a pair in pixels. one, two: beams of the two views, the first turned into the second's axes; t: unit
 // baseline. With A, B of that paper for rays scaled by their spreads across the epipolar plane, the error's square is
 // B / (A / 2 + sqrt(A^2 / 4 - B)), which keeps its digits where A / 2 - sqrt(A^2 / 4 - B) loses them all, and its root
-// with the sign of e = t . (g x f) passes smoothly through zero. False: a ray along the baseline, which fits any plane.
+// with the sign of e = t . (one x two) passes smoothly through zero. False: a ray along the baseline, which fits any
+// plane.
 template <class T> bool angular_error(const Beam<T> &one, const Beam<T> &two, const Vec<T> &t, T &error)
 {
     constexpr double AT_EPIPOLE = 1e-6; // sin^2

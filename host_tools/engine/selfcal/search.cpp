@@ -224,13 +224,13 @@ private:
         start.cost = sum + start.at.truncated(coarse_);
     }
 
-    static void keep_best(std::vector<Start> &starts, size_t most)
+    // By cost; those that failed go.
+    static void sort_found(std::vector<Start> &starts)
     {
         std::stable_sort(starts.begin(), starts.end(), [](const Start &a, const Start &b) { return a.cost < b.cost; });
         while (!starts.empty() && !std::isfinite(starts.back().cost)) {
             starts.pop_back();
         }
-        starts.resize(std::min(starts.size(), most));
     }
 
     // Matches within `limit` pixels of their epipolar curves, with depths ahead where there is parallax; the robust
@@ -365,7 +365,7 @@ private:
             }
         }
         std::vector<Start> finalists = starts;
-        keep_best(finalists, starts.size());
+        sort_found(finalists);
         std::vector<Start> different;
         for (const Start &start : finalists) {
             const bool known = std::any_of(different.begin(), different.end(),

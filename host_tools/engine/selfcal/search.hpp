@@ -24,7 +24,6 @@ enum class PairStatus {
     standing, // hardly anything moved
     turning,  // a rotation alone explains it: no translation
     plane,    // a homography of rays explains it
-    behind,   // points lie behind the cameras
 };
 
 struct PairReport {
