@@ -232,6 +232,7 @@ def tube_figures(seed: int) -> dict[str, Any]:
         "diameter": (stations["d_mean"][known] / true - 1).tolist(),
         "sigma": np.hypot(stations["d_mean_sigma"][known] / true, wander).tolist(),
         "ovality": ((stations["d_max"] - stations["d_min"])[known] / DIAMETER - OVALITY).tolist(),
+        "ovality_sigma": np.hypot(stations["ovality_sigma"], stations["ovality_systematic"])[known].tolist(),
         "held": ((stations["ovality_lo"] <= 2 * (b - a) / (a + b)) & (stations["ovality_hi"] >= 2 * (b - a) / (a + b)))[
             known
         ].tolist(),

@@ -24,7 +24,7 @@ from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
-from pipefish.tube_water import mirrored
+from pipefish.tube_water import depth, mirrored
 
 T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
@@ -442,6 +442,9 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             wet, water = mirrored(tube, structure.down is not None)
             if water:
                 tube = fit(np.where(wet[:, None], np.nan, points))
+            for w in water:
+                at = w.pop("at")
+                w["depth"] = depth(tube, at) if tube.status == "ok" else None
         tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
         origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
         m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign, water=water))
