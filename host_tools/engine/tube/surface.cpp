@@ -93,7 +93,6 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
             measure_correlation();
             converged_ = solve(options.rounds / 2, true);
         }
-        settle();
     }
     tabulate();
     reweigh(true);

@@ -97,8 +97,6 @@ private:
     void measure_correlation();
     int choose_order() const;
     bool solve(int rounds, bool adapt);
-    void settle();
-    std::vector<std::vector<Eigen::MatrixXd>> blocks(const SurfaceVariance &between, size_t each) const;
     void widen(int order);
     void smooth(const SurfaceProblem &problem, const SurfaceVariance &variance, bool adapt);
     void tabulate();

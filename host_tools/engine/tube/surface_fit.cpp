@@ -20,9 +20,6 @@ namespace
 
 constexpr double GATE = 0.5; // radii: distances beyond are gross whatever the scale
 constexpr double ELLIPSE_GAP = 150.0 * std::numbers::pi / 180.0;
-// Of second differences, in radii. A pipe may be straight and round to a hair over all its length: a limit at 1e-4 left
-// ellipses more freedom than they had. What the limit itself leaves them is taken off by settle().
-constexpr double LEAST = 1e-6, MOST = 0.3;
 
 } // namespace
 
@@ -115,25 +112,6 @@ void Surface::find_gaps()
     }
 }
 
-// Of each control with itself and the three before, of a problem with `each` scalars a control.
-std::vector<std::vector<Eigen::MatrixXd>> Surface::blocks(const SurfaceVariance &between, size_t each) const
-{
-    std::vector<std::vector<Eigen::MatrixXd>> out(control_.size());
-    for (size_t c = 0; c < control_.size(); c++) {
-        for (size_t back = 0; back <= std::min<size_t>(3, c); back++) {
-            Eigen::MatrixXd block(each, each);
-            for (size_t p = 0; p < each; p++) {
-                for (size_t q = 0; q < each; q++) {
-                    block(static_cast<Eigen::Index>(p), static_cast<Eigen::Index>(q)) =
-                        between(c * each + p, (c - back) * each + q);
-                }
-            }
-            out[c].push_back(block);
-        }
-    }
-    return out;
-}
-
 bool Surface::solve(int rounds, bool adapt)
 {
     SurfaceProblem problem(*this);
@@ -147,9 +125,19 @@ bool Surface::solve(int rounds, bool adapt)
         solver.minimize(problem, {.max_iterations = round == 0 ? 3 : 1}); // the loop around goes on
         const auto known = solver.covariance(problem);
         const auto between = [&](size_t a, size_t b) { return a >= b ? known.f[a][a - b][0] : known.f[b][b - a][0]; };
-        covariance_ = blocks(between, each);
+        covariance_.assign(control_.size(), {});
         moved = 0.0;
         for (size_t c = 0; c < control_.size(); c++) {
+            for (size_t back = 0; back <= std::min<size_t>(3, c); back++) {
+                Eigen::MatrixXd block(each, each);
+                for (size_t p = 0; p < each; p++) {
+                    for (size_t q = 0; q < each; q++) {
+                        block(static_cast<Eigen::Index>(p), static_cast<Eigen::Index>(q)) =
+                            between(c * each + p, (c - back) * each + q);
+                    }
+                }
+                covariance_[c].push_back(block);
+            }
             const Eigen::MatrixXd &v = covariance_[c][0];
             const size_t rho = c * static_cast<size_t>(floats_);
             moved = std::max({moved, (control_[c] - where[c]).norm() / std::sqrt(v(0, 0) + v(1, 1)),
@@ -188,7 +176,9 @@ void Surface::smooth(const SurfaceProblem &problem, const SurfaceVariance &varia
         count[c][k] += 1.0;
     });
     freedom_ = static_cast<double>(problem.each()) * static_cast<double>(control_.size());
-    const double least = LEAST * 0.5 * diameter_, most = MOST * 0.5 * diameter_;
+    // A pipe may be straight and round to a hair over all its length: a limit at 1e-4 of the radius left ellipses more
+    // freedom than they had, and their intervals a quarter too wide.
+    const double least = 1e-6 * 0.5 * diameter_, most = 0.3 * 0.5 * diameter_;
     for (size_t k = 0; k < 4; k++) {
         freedom_ -= trace[k];
         if (adapt && rows[k] > 0.0) {
@@ -201,37 +191,6 @@ void Surface::smooth(const SurfaceProblem &problem, const SurfaceVariance &varia
                 give_[c][k] = (GIVE + count[c][k]) / (GIVE + local[c][k] * stiffness_[k] / before);
             }
         }
-    }
-}
-
-// A posterior covariance V = (W + P)^-1 of data W and smoothness P holds what the smoothness may have bent the truth
-// by, V P V. Where the data wanted it smoother than the limit allows, there is none of that: V - V P V is left, the
-// noise alone. By the derivative: P (1 + t) makes V - t V P V. Of a round straight pipe an eighth of the ellipse's
-// sigma.
-void Surface::settle()
-{
-    constexpr double T = 0.01;
-    const double stiffest = 1.0 / std::pow(LEAST * 0.5 * diameter_, 2);
-    const std::array<double, 4> before = stiffness_;
-    SurfaceProblem problem(*this);
-    optim::LeastSquares<1, 1> solver;
-    const auto now = [&] {
-        const auto known = solver.covariance(problem);
-        const auto between = [&](size_t a, size_t b) { return a >= b ? known.f[a][a - b][0] : known.f[b][b - a][0]; };
-        return blocks(between, static_cast<size_t>(problem.each()));
-    };
-    covariance_ = now();
-    for (double &stiffness : stiffness_) {
-        stiffness *= stiffness > 0.99 * stiffest ? 1.0 + T : 1.0;
-    }
-    if (stiffness_ != before) {
-        const auto stiffer = now();
-        for (size_t c = 0; c < covariance_.size(); c++) {
-            for (size_t back = 0; back < covariance_[c].size(); back++) {
-                covariance_[c][back] += (stiffer[c][back] - covariance_[c][back]) / T;
-            }
-        }
-        stiffness_ = before;
     }
 }
 
