@@ -130,7 +130,7 @@ class Course:
         self.measured_at = min(len(indices), max(self.measured_at + WINDOW // 2, LEAST))
         indices = indices[max(0, self.measured_at - WINDOW) : self.measured_at]
         try:
-            m = measure(self._part(indices), method="incremental", threads=1)
+            m = measure(self._part(indices), method="incremental", threads=1, pictures=False)
         except PipefishError as error:
             self.why = str(error).removeprefix(f"{self.path}: ")
             return self._warn("not measured", indices[-1], f"not measured: {self.why}", WINDOW)

@@ -35,6 +35,7 @@ REASONS = {
     "no_rigid_scene": "the tracks agree with no motion of this camera (wrong profile, or a scene that moves)",
     "low_parallax": "the points' depths are not determined",
     "merge_failed": "two stretches do not fit together",
+    "repeated_pattern": "the wall looks the same again and again, and the tracks went on to the next repeat",
     "zoom": "the lens zoomed, and from there on its profile does not hold",
 }
 
