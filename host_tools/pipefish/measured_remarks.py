@@ -156,9 +156,11 @@ def _repeated_remark(m: Measurement) -> list[str]:
     words += f", {length_text(found.period, m.scale.unit)} further along the pipe"
     if m.jumped:
         gaps = sum(g.reason == "repeated_pattern" for g in m.structure.gaps)
+        names = ", ".join(str(m.index[f]) for f in m.jumped)
         words += (
-            f". At {len(m.jumped)} keyframes all tracks had gone on to the next repeat, as the encoder says; they were "
-            f"cut there and {'joined again' if not gaps else 'joined again but for the gaps told'}."
+            f". At keyframe{'s' if len(m.jumped) > 1 else ''} {names} all tracks had gone on to the next "
+            "repeat, as the encoder says; they were cut there and "
+            f"{'joined again' if not gaps else 'joined again but for the gaps told'}."
         )
         return [words]
     steps = np.linalg.norm(np.diff(m.structure.centres, axis=0), axis=1)[np.diff(m.structure.segment) == 0]

@@ -81,7 +81,7 @@ def second_best(found: Floats, at: int) -> tuple[float, int] | None:
         dipped, k = False, at + step
         while 0 < k < len(found) - 1 and np.isfinite(found[k]):
             dipped = dipped or found[k] < 0.5 * best
-            if dipped and found[k] >= np.nanmax(found[k - 1 : k + 2]):
+            if dipped and 0 < found[k] >= np.nanmax(found[k - 1 : k + 2]):
                 others.append((float(found[k]), abs(k - at)))
             k += step
     if not others:

@@ -12,6 +12,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.measure import Measurement, measure
+from pipefish.measured_remarks import not_measured
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_KEYFRAME
 from synthetic import as_object, write_survey
@@ -20,7 +21,7 @@ from test_water import seen_from
 from tube_tracks import Drive, fisheye, tube_drive
 
 PERIOD, GRAIN, RADIUS = 0.06, 0.006, 0.15
-JUMP = 14  # the frame from which on
+JUMP = 10  # the frame from which on
 
 
 def texture(seed: int, period: float) -> np.ndarray:
@@ -28,31 +29,32 @@ def texture(seed: int, period: float) -> np.ndarray:
     return np.random.default_rng(seed).uniform(40, 220, (round(period / GRAIN), round(2 * np.pi * RADIUS / GRAIN)))
 
 
-def photograph(camera: pf.Camera, pose: np.ndarray, grain: np.ndarray) -> bytes:
-    """The wall of a round pipe along z as the camera sees it, between the grains' centres, as JPEG."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays, ok = camera.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+def photograph(camera: pf.Camera, rays: np.ndarray, pose: np.ndarray, grain: np.ndarray) -> bytes:
+    """The wall of a round pipe along z as the camera sees it along the rays of all its pixels (n,3), NaN where there
+    are none, between the grains' centres, as JPEG."""
     centre, d = -pose[:, :3].T @ pose[:, 3], rays @ pose[:, :3]
     a, b = (d[:, :2] ** 2).sum(1), d[:, :2] @ centre[:2]
     reach = (-b + np.sqrt(b**2 + a * (RADIUS**2 - centre[:2] @ centre[:2]))) / np.maximum(a, 1e-12)
     x = centre + reach[:, None] * d
     place = np.column_stack([x[:, 2] / GRAIN, (np.arctan2(x[:, 1], x[:, 0]) % (2 * np.pi)) * RADIUS / GRAIN])
+    ok = np.isfinite(place).all(1) & (reach < 1.0)
+    place[~ok] = 0.0
     low, part = np.floor(place).astype(int), place - np.floor(place)
     grey = np.zeros(len(x))
     for i, j in np.ndindex(2, 2):
         weight = np.abs(1 - i - part[:, 0]) * np.abs(1 - j - part[:, 1])
         grey += weight * grain[(low[:, 0] + i) % grain.shape[0], (low[:, 1] + j) % grain.shape[1]]
-    grey = np.where(ok & (reach < 1.0), grey, 0).reshape(camera.height, camera.width)
+    grey = np.where(ok, grey, 0).reshape(camera.height, camera.width)
     out = io.BytesIO()
     Image.fromarray(grey.astype(np.uint8), "L").save(out, "JPEG", quality=92)
     return out.getvalue()
 
 
 def repeating() -> Drive:
-    """A drive through a round pipe whose corners repeat along it, a camera of 400 pixels."""
-    camera = fisheye(95, size=400, f_u=117.0, f_v=117.0)
-    drive = tube_drive(31, 1.5, camera=camera, ovality=0.0)
-    random, repeats = np.random.default_rng(9), np.arange(-2, 40)
+    """A drive through a round pipe whose corners repeat along it, a camera of 320 pixels."""
+    camera = fisheye(95, size=320, f_u=94.0, f_v=94.0)
+    drive = tube_drive(31, 1.0, camera=camera, ovality=0.0)
+    random, repeats = np.random.default_rng(9), np.arange(-2, 32)
     z, phi = random.uniform(0, PERIOD, 45), random.uniform(0, 2 * np.pi, 45)
     z, phi = (z + PERIOD * repeats[:, None]).ravel(), np.tile(phi, len(repeats))
     points = np.column_stack([RADIUS * np.cos(phi), RADIUS * np.sin(phi), z])
@@ -74,11 +76,14 @@ def jumped(drive: Drive) -> Drive:
 
 
 def measured(drive: Drive, grain: np.ndarray, path: Path) -> Measurement:
-    objects = []
+    objects, camera = [], drive.camera
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays, ok = camera.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    rays[~ok] = np.nan
     for name, kind, data in objects_of(drive):
         if kind == OBJECT_KEYFRAME:
             message = pb.Keyframe.FromString(data)
-            message.jpeg = photograph(drive.camera, drive.poses[message.index], grain)
+            message.jpeg = photograph(camera, rays, drive.poses[message.index], grain)
             name, kind, data = as_object(kind, message)
         objects.append((name, kind, data))
     write_survey(path, objects=objects)
@@ -91,10 +96,12 @@ def test_tracks_that_went_on_to_the_next_repeat_are_cut_and_told(tmp_path) -> No
     m = measured(jumped(drive), texture(1, PERIOD), tmp_path / "a.mcap")
     assert m.repeats.alarm and m.repeats.share > 0.6 and m.repeats.period == pytest.approx(PERIOD, abs=0.004)
     assert m.jumped == [JUMP]
-    print(m.structure.status, m.structure.gaps, m.remarks)
     at = [np.linalg.norm(m.structure.centres[i] - m.structure.centres[0]) for i in range(len(m.structure.frames))]
     assert at == pytest.approx(drive.driven[m.structure.frames], abs=0.02)
-    assert any("60" in r and "next repeat" in r for r in m.remarks)
+    (told,) = [r for r in m.remarks if "next repeat" in r]
+    assert "mm further along the pipe" in told and f"keyframe {JUMP}" in told
+    gap = next(g for g in not_measured(m) if g["reason"] == "repeated_pattern")
+    assert gap["start"] == pytest.approx(0.05 * JUMP, abs=0.2) and m.measured
 
 
 def test_a_wall_that_does_not_repeat_is_believed(tmp_path) -> None:
