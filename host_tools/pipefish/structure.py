@@ -367,7 +367,11 @@ def reconstruct(
         )
 
     found, end = run(frames), frames
-    noise = sigma if tracks.covariance is None else np.sqrt(np.median(np.einsum("nii->n", tracks.covariance)) / 2)
+    noise = (
+        sigma
+        if tracks.covariance is None or not frames
+        else np.sqrt(np.median(np.einsum("nii->n", tracks.covariance)) / 2)
+    )
     zoomed = Zooms(camera, tracks.frame, numbers, tracks.pixels, float(noise)).first(found, run)
     if zoomed:
         end, found = zoomed

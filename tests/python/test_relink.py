@@ -48,7 +48,7 @@ def test_a_drive_whose_tracks_all_broke_off_is_one_stretch_again(seed: int, enco
     assert len(lasting) > 20 and once.mean() > 0.6
 
 
-@pytest.mark.parametrize("seed", [83, 84, 85])
+@pytest.mark.parametrize("seed", [83, 84])
 def test_what_is_behind_a_break_is_not_joined_to_a_wall_that_is_not_there(seed: int) -> None:
     """As many corners, none of them the same: chance finds some near each place."""
     drive = tube_drive(seed, 2.0)

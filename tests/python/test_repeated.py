@@ -22,6 +22,7 @@ from tube_tracks import Drive, fisheye, tube_drive
 
 PERIOD, GRAIN, RADIUS = 0.06, 0.006, 0.15
 JUMP = 10  # the frame from which on
+COUNT = 32  # corners to a period
 
 
 def texture(seed: int, period: float) -> np.ndarray:
@@ -55,17 +56,17 @@ def repeating() -> Drive:
     camera = fisheye(95, size=320, f_u=94.0, f_v=94.0)
     drive = tube_drive(31, 1.0, camera=camera, ovality=0.0)
     random, repeats = np.random.default_rng(9), np.arange(-2, 32)
-    z, phi = random.uniform(0, PERIOD, 45), random.uniform(0, 2 * np.pi, 45)
+    z, phi = random.uniform(0, PERIOD, COUNT), random.uniform(0, 2 * np.pi, COUNT)
     z, phi = (z + PERIOD * repeats[:, None]).ravel(), np.tile(phi, len(repeats))
     points = np.column_stack([RADIUS * np.cos(phi), RADIUS * np.sin(phi), z])
     return seen_from(drive, points, drive.poses, 9)
 
 
 def jumped(drive: Drive) -> Drive:
-    """From a frame on the tracks that were there before are of the next repeat: 45 points further."""
+    """From a frame on the tracks that were there before are of the next repeat: COUNT points further."""
     t = drive.tracks
     old = np.isin(t.track, np.unique(t.track[t.frame < JUMP])) & (t.frame >= JUMP)
-    after = drive.points[np.minimum(t.track + 45, len(drive.points) - 1)]
+    after = drive.points[np.minimum(t.track + COUNT, len(drive.points) - 1)]
     poses = drive.poses[t.frame]
     uv, ok = drive.camera.project(np.einsum("nij,nj->ni", poses[:, :, :3], after) + poses[:, :, 3])
     pixels = np.where(old[:, None], uv, t.pixels)
