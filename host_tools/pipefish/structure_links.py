@@ -65,7 +65,7 @@ def found_again(
 
 
 def _depth(part: dict[str, Any], frame: int, near: Ints) -> float:
-    """Median distance of some points of a stretch from one of its frames' axes."""
+    """Median distance of some points of a stretch from the optical axis of one of its frames."""
     pose = part["poses"][frame]
     seen = part["points"][near] @ pose[:, :3].T + pose[:, 3]
     return float(np.median(np.hypot(seen[:, 0], seen[:, 1])))
@@ -86,16 +86,15 @@ def seen_before(
     units, about."""
     own, last = after["poses"][0], before["poses"][-1]
     local = after["points"][near] @ own[:, :3].T + own[:, 3]
-    scales = np.ones(1)
-    if not after["metric"]:
-        scales = SCALES * ratio
+    scales = np.ones(1) if after["metric"] else SCALES * ratio
     best: tuple[Ints, Ints] = np.zeros(0, np.int64), np.zeros(0, np.int64)
     for scale in scales:
         inside, uv = in_picture(camera, (scale * local - pose[:, 3]) @ pose[:, :3], last)
         if min(len(inside), len(pixels)) < LEAST:
             continue
         a, b = pairs_within(uv, pixels, 2 * gate)
-        if len(a) > len(best[0]) and enough(len(a), uv, pixels, 2 * gate, SHARE / 2):  # nor new ones behind
+        # Many of these points come into the picture only now: half the share will do.
+        if len(a) > len(best[0]) and enough(len(a), uv, pixels, 2 * gate, SHARE / 2):
             best = near[inside[a]], b
     return best
 
@@ -130,8 +129,9 @@ def linked(
         for k, other in zip(old, new, strict=True):
             join(int(a["tracks"][k]), int(other))
         young = at_last[~np.isin(track[at_last], a["tracks"][old])]
-        ratio = _depth(a, -1, near) / _depth(b, 0, near := np.flatnonzero(np.isin(b["tracks"], track[at_first])))
-        ours, theirs = seen_before(camera, a, b, near, again[2], pixels[young], gate, ratio)
+        first_seen = np.flatnonzero(np.isin(b["tracks"], track[at_first]))
+        ratio = _depth(a, -1, near) / _depth(b, 0, first_seen) if len(first_seen) else 1.0
+        ours, theirs = seen_before(camera, a, b, first_seen, again[2], pixels[young], gate, ratio)
         for k, item in zip(ours, young[theirs], strict=True):
             if b["tracks"][k] not in new:
                 join(int(track[item]), int(b["tracks"][k]))

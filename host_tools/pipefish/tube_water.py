@@ -47,8 +47,10 @@ def mirrored(tube: Tube, gravity: bool) -> tuple[np.ndarray, list[dict[str, Any]
     turn = LEVEL_TURN if gravity else ROLL_TURN
     found: dict[int, tuple[float, float]] = {}  # of a window, how far below the axis the surface is, and where down is
     unsure: dict[int, tuple[float, float]] = {}
+    by_twins: set[int] = set()
 
     def take(k: int, level: float, down: float) -> None:
+        by_twins.add(k)
         near = known[np.abs(p["s"][known] - middles[k]) < 0.5 * d]
         mask[near[p["r"][near] * np.cos(p["clock"][near] - down) > level]] = True
         found[k] = level, down
@@ -68,10 +70,12 @@ def mirrored(tube: Tube, gravity: bool) -> tuple[np.ndarray, list[dict[str, Any]
         elif twins is not None:
             unsure[k] = twins
     for k in [*sorted(unsure), *sorted(unsure, reverse=True)]:
-        if k not in found and ({k - 1, k + 1} & set(found)):
+        if k not in found and ({k - 1, k + 1} & by_twins):
             take(k, *unsure[k])
-    for k, of in _too_little(found, [int((np.abs(p["s"][known] - at) < 0.5 * d).sum()) for at in middles]):
-        take(k, *found[of])
+    points = [int((np.abs(p["s"][known] - at) < 0.5 * d).sum()) for at in middles]
+    for k, of in _too_little(by_twins, points):
+        if k not in found:
+            take(k, *found[of])
     stretches: list[dict[str, Any]] = []
     for k in sorted(found):
         middle, (level, down) = middles[k], found[k]
@@ -89,7 +93,7 @@ def mirrored(tube: Tube, gravity: bool) -> tuple[np.ndarray, list[dict[str, Any]
     return mask, stretches
 
 
-def _too_little(found: dict[int, Any], points: list[int]) -> list[tuple[int, int]]:
+def _too_little(found: set[int], points: list[int]) -> list[tuple[int, int]]:
     """Windows that are as the one of the second number: between two under water, or before the first or behind the last
     and with less than half of their points."""
     usual = float(np.median([points[k] for k in found])) if found else 0.0
