@@ -23,6 +23,7 @@ AGREED_SIGMAS = 3.0  # enough where frames' own zooms say the same
 ZOOM_SHARE = 0.6  # of the points that must agree with a zoom
 ONE, ONE_SIGMAS = 0.015, 5.0  # of one frame against the median of those before it, to be doubted
 END, END_SIGMAS = 3, 2.5  # of the last frames before a gap
+CHUNK, LEAD = 200, 30  # frames that are looked at together, and before them for their tracks' earlier views
 RUN, RUN_LEAST, RUN_SIGMAS = 5, 0.01, 6.0  # of the mean of so many
 
 
@@ -128,10 +129,25 @@ def frame_zooms(
     that is known; of each frame: pose and zoom that fit those best, to first order.
 
     place (n,) of each observation's frame in the stretch, track (n,), pixels (n,2), sorted by track and frame."""
-    poses, count = segment["poses"], len(segment["poses"])
+    count = len(segment["poses"])
     rows = np.minimum(np.searchsorted(segment["tracks"], track), len(segment["tracks"]) - 1)
     on = np.flatnonzero((segment["tracks"][rows] == track) & (place >= 0) & (place < count))
     place, track, pixels, points = place[on], track[on], pixels[on], segment["points"][rows[on]]
+    out = [np.zeros(0), np.zeros(0)]
+    for low in range(0, count, CHUNK):  # so much at a time that it stays near the processor
+        here = np.flatnonzero((place >= low - LEAD) & (place < low + CHUNK))
+        found = _zooms(camera, segment["poses"], place[here], track[here], pixels[here], points[here], sigma)
+        out = [np.append(known, new[low : low + CHUNK]) for known, new in zip(out, found, strict=True)]
+    return out[0], out[1]
+
+
+def _zooms(
+    camera: Camera, poses: Floats, place: Ints, track: Ints, pixels: Floats, points: Floats, sigma: float
+) -> tuple[Floats, Floats]:
+    """As frame_zooms(), of some observations, whose points (n,3) are about there."""
+    count = len(poses)
+    if not len(track):
+        return np.zeros(count), np.full(count, np.inf)
     rays, ok = camera.unproject(pixels)
     turn = poses[place, :, :3]
     centre = -np.einsum("nji,nj->ni", turn, poses[place, :, 3])
