@@ -232,6 +232,7 @@ def tube_figures(seed: int) -> dict[str, Any]:
         "diameter": (stations["d_mean"][known] / true - 1).tolist(),
         "sigma": np.hypot(stations["d_mean_sigma"][known] / true, wander).tolist(),
         "ovality": ((stations["d_max"] - stations["d_min"])[known] / DIAMETER - OVALITY).tolist(),
+        "ovality_sigma": np.hypot(stations["ovality_sigma"], stations["ovality_systematic"])[known].tolist(),
         "held": ((stations["ovality_lo"] <= 2 * (b - a) / (a + b)) & (stations["ovality_hi"] >= 2 * (b - a) / (a + b)))[
             known
         ].tolist(),
@@ -242,14 +243,14 @@ def tube_figures(seed: int) -> dict[str, Any]:
 def check_tubes() -> list[dict[str, Any]]:
     """The fitted tube's stations."""
     every = [kept(FOLDER, f"tubes-{s}", lambda s=s: tube_figures(s)) for s in range(SEEDS)]
-    diameter, sigma, ovality, held = (
-        np.concatenate([d[name] for d in every]) for name in ("diameter", "sigma", "ovality", "held")
-    )
+    names = ("diameter", "sigma", "ovality", "ovality_sigma", "held")
+    diameter, sigma, ovality, ovality_sigma, held = (np.concatenate([d[name] for d in every]) for name in names)
     return [
         row("tubes.diameter_rms_pct", 100 * math.sqrt(np.mean(diameter**2)), high=0.2),
         row("tubes.diameter_p95_pct", 100 * float(np.percentile(np.abs(diameter), 95)), high=0.5),
         row("tubes.diameter_held", float(np.mean(np.abs(diameter) <= NORMAL_95 * sigma)), low=0.9),
         row("tubes.ovality_rms_points", 100 * math.sqrt(np.mean(ovality**2)), high=0.15),
+        row("tubes.ovality_over_sigma", math.sqrt(np.mean(ovality**2) / np.mean(ovality_sigma**2)), high=1.1),
         row("tubes.ovality_held", float(np.mean(held)), 0.90, 0.98),
         row("tubes.events_per_drive", sum(d["events"] for d in every) / SEEDS, high=0.05),
     ]

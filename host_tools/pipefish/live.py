@@ -21,6 +21,7 @@ import numpy as np
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
 from pipefish.scene import STATES, frames_in
+from pipefish.structure import REASONS
 from pipefish.survey import Keyframe, Observations, Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
 
@@ -50,6 +51,7 @@ class Course:
     warnings: list[str] = field(default_factory=list)
     measured_at: int = 0  # keyframes at the last run
     why: str = ""  # the last run gave nothing
+    void: bool = False  # the lens zoomed: from there on nothing is measured
     unit: str = "metre"
 
     def take(self, kind: int, data: bytes) -> list[str]:
@@ -114,7 +116,9 @@ class Course:
     def due(self, over: bool = False) -> bool:
         """Whether there is enough for another run; over: nothing more will come."""
         count = len(self.keyframes)
-        return bool(self.starts) and count >= LEAST and count - self.measured_at >= (1 if over else STEP)
+        return (
+            bool(self.starts) and not self.void and count >= LEAST and count - self.measured_at >= (1 if over else STEP)
+        )
 
     def measure(self) -> list[str]:
         """Measures the next stretch; returns new warnings."""
@@ -126,12 +130,16 @@ class Course:
         self.measured_at = min(len(indices), max(self.measured_at + WINDOW // 2, LEAST))
         indices = indices[max(0, self.measured_at - WINDOW) : self.measured_at]
         try:
-            m = measure(self._part(indices), method="incremental", threads=1)
+            m = measure(self._part(indices), method="incremental", threads=1, pictures=False)
         except PipefishError as error:
             self.why = str(error).removeprefix(f"{self.path}: ")
             return self._warn("not measured", indices[-1], f"not measured: {self.why}", WINDOW)
         self.why, self.unit = "", m.scale.unit
         told = self._warn("scale", 0, "no scale: diameters are not measured") if m.scale.unit != "metre" else []
+        for gap in m.structure.gaps:
+            if gap.reason == "zoom":
+                self.void, self.why = True, REASONS[gap.reason]
+                told += self._warn("zoom", int(m.index[gap.first]), f"not measured from here on: {self.why}")
         along = self.along()
         offset = next((along[i] - c for i, c in zip(indices, _driven(m), strict=True) if math.isfinite(c)), math.nan)
         if not math.isfinite(offset):

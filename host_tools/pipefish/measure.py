@@ -16,6 +16,7 @@ from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.repeated import Repetition, cut, jumps, renamed, repetition
 from pipefish.rolling import shutter_of
 from pipefish.scale import Known, Scale, with_diameter
 from pipefish.scale_sources import beforehand, find_scale
@@ -24,7 +25,7 @@ from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
-from pipefish.tube_water import mirrored
+from pipefish.tube_water import depth, mirrored
 
 T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
@@ -98,6 +99,8 @@ class Measurement:
     camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
                 not known
     health      what the survey says of its profile
+    repeats     how often the wall looks the same elsewhere; None: its pictures were not looked at
+    jumped      frames at which tracks had gone on to the next repeat, and were cut
     remarks     what one should know, in words, most serious first
     factors     of each segment: by what the adjustment's unit was multiplied
     """
@@ -115,6 +118,8 @@ class Measurement:
     residuals: Residuals
     backwards: bool
     health: ProfileCheck | None = None
+    repeats: Repetition | None = None
+    jumped: list[int] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     factors: list[float] = field(default_factory=list)
 
@@ -231,7 +236,9 @@ def measure(
     method: str = "hierarchical",
     threads: int | None = None,
     line_time: float | None = None,
+    pictures: bool = True,
     tell: Tell | None = None,
+    _jumped: list[int] | None = None,
 ) -> Measurement:
     """Measures a survey.
 
@@ -241,6 +248,7 @@ def measure(
     target     of known size, somewhere in the pipe; not a sleeve
     nominal    nominal diameter, metres [the survey's], for what is defined against it
     line_time  of a rolling shutter, seconds from a row's exposure to the next one's [as the survey says]
+    pictures   whether to look at them: for a wall that looks the same again and again
     tell       is called with a fraction done and a word
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
@@ -262,6 +270,8 @@ def measure(
         tracks,
         frame=np.searchsorted(index, tracks.frame),  # missing keyframes take no number
     )
+    if _jumped:
+        tracks = cut(tracks, _jumped)
     walk = np.hypot(TRACK_FLOOR_PX, TRACK_WALK_PX * _travel(tracks, camera))
     weighed = dataclasses.replace(tracks, covariance=tracks.covariance + (walk**2)[:, None, None] * np.eye(2))
     shutter = shutter_of(survey, line_time)
@@ -282,6 +292,7 @@ def measure(
         ),
         lambda: tell(0.05, "poses and points"),
     )
+    structure.gaps = renamed(structure.gaps, _jumped or [])
     if structure.status == "failed":
         raise PipefishError(f"{survey.path}: nothing could be measured: {_why(survey, structure)}")
     ahead = np.einsum("ni,ni->n", np.diff(structure.centres, axis=0), structure.poses[:-1, 2, :3])
@@ -308,6 +319,23 @@ def measure(
             f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
             f"found, but no pipe around them: {'; '.join(reasons)} (a wrong camera profile?)"
         )
+    if pictures:
+        m.repeats, m.jumped = repetition(m), _jumped or []
+        jumped = jumps(m, m.repeats) if _jumped is None else []
+        if jumped:
+            return measure(
+                survey,
+                camera,
+                diameter=known.diameter,
+                joint_spacing=known.spacing,
+                target=target,
+                nominal=nominal,
+                method=method,
+                threads=threads,
+                line_time=line_time,
+                tell=tell,
+                _jumped=jumped,
+            )
     _sigmas(m)
     _check_diameter(m, known.diameter)
     m.health = _while_telling(
@@ -442,6 +470,9 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             wet, water = mirrored(tube, structure.down is not None)
             if water:
                 tube = fit(np.where(wet[:, None], np.nan, points))
+            for w in water:
+                at = w.pop("at")
+                w["depth"] = depth(tube, at) if tube.status == "ok" else None
         tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
         origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
         m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign, water=water))

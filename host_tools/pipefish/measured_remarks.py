@@ -89,6 +89,7 @@ def remark(m: Measurement) -> None:
         )
     if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
         remarks.append(m.health.text)
+    remarks += _repeated_remark(m)
     remarks += _water_remark(m) + _invert_remark(m)
     if m.camera.covariance is None:
         whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
@@ -141,6 +142,37 @@ def _nominal_remark(m: Measurement) -> list[str]:
         f"The mean diameter of {1000 * value:.0f} mm is {100 * abs(off):.0f} % {'over' if off > 0 else 'under'} the "
         f"nominal {1000 * m.nominal:.0f} mm: a wrong camera profile, a wrong scale of {m.scale.source}, or another "
         "pipe than was said?"
+    ]
+
+
+def _repeated_remark(m: Measurement) -> list[str]:
+    """Of a wall whose tracks may have gone on to the next repeat."""
+    found = m.repeats
+    if found is None or not (found.alarm or m.jumped):
+        return []
+    words = f"The wall looks the same again in {100 * found.share:.0f} % of the places looked at"
+    if not math.isfinite(found.period):
+        return [words + ": tracks may have gone on to another place that looks alike."]
+    words += f", {length_text(found.period, m.scale.unit)} further along the pipe"
+    if m.jumped:
+        gaps = sum(g.reason == "repeated_pattern" for g in m.structure.gaps)
+        names = ", ".join(str(m.index[f]) for f in m.jumped)
+        words += (
+            f". At keyframe{'s' if len(m.jumped) > 1 else ''} {names} all tracks had gone on to the next "
+            "repeat, as the encoder says; they were cut there and "
+            f"{'joined again' if not gaps else 'joined again but for the gaps told'}."
+        )
+        return [words]
+    steps = np.linalg.norm(np.diff(m.structure.centres, axis=0), axis=1)[np.diff(m.structure.segment) == 0]
+    step, value = float(np.median(steps)), mean_diameter(m)[0]
+    if m.encoder is None or m.scale.unit != "metre":
+        return [words + ": without an encoder nobody knows whether tracks went on to the next repeat."]
+    other = [value * step / (step + k * found.period) for k in (-1, 1) if step + k * found.period > 0.2 * step]
+    sizes = " or ".join(length_text(d, m.scale.unit) for d in other)
+    return [
+        words
+        + ". Encoder and pictures agree about each step; had tracks gone on by one repeat at every keyframe, they "
+        f"would, too, and the diameter would be {sizes}."
     ]
 
 

@@ -18,6 +18,8 @@ import numpy.typing as npt
 from . import _engine
 from .camera import PARAMETERS, Camera
 from .errors import ArgumentError
+from .structure_gaps import Zooms
+from .structure_links import linked
 from .survey import Tracks
 
 Floats = npt.NDArray[np.float64]
@@ -33,6 +35,8 @@ REASONS = {
     "no_rigid_scene": "the tracks agree with no motion of this camera (wrong profile, or a scene that moves)",
     "low_parallax": "the points' depths are not determined",
     "merge_failed": "two stretches do not fit together",
+    "repeated_pattern": "the wall looks the same again and again, and the tracks went on to the next repeat",
+    "zoom": "the lens zoomed, and from there on its profile does not hold",
 }
 
 
@@ -330,35 +334,60 @@ def reconstruct(
         shutter = _checked(shutter, frames, camera)
     share = HELD if hold_camera else 1.0
     uncertain = [PARAMETERS.index(name) for name in camera.covariance_parameters]
-    found = _engine.reconstruct(
-        camera._profile,
-        frames,
-        len(names),
-        tracks.frame.astype(np.int32),
-        numbers.astype(np.int32),
-        tracks.pixels,
-        tracks.covariance,
-        float(sigma),
-        method,
-        seed,
-        threads or len(os.sched_getaffinity(0)),
-        float(still),
-        step,
-        step_sigma,
-        float(encoder.scale_sigma),
-        down,
-        float(attitude_sigma),
-        uncertain,
-        None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
-        [PARAMETERS.index(name) for name in drift[0]] if drift else [],
-        np.ascontiguousarray(drift[1]) if drift else None,
-        float(drift[2]) if drift else 1.0,
-        float(sag_sigma),
-        None if shutter is None else shutter.time,
-        0.0 if shutter is None else shutter.line_time,
-        0.0 if shutter is None else shutter.middle_row,
+
+    def run(end: int) -> dict[str, Any]:  # of the frames before one
+        kept = tracks.frame < end
+        return _engine.reconstruct(
+            camera._profile,
+            end,
+            len(names),
+            tracks.frame[kept].astype(np.int32),
+            numbers[kept].astype(np.int32),
+            np.ascontiguousarray(tracks.pixels[kept]),
+            None if tracks.covariance is None else np.ascontiguousarray(tracks.covariance[kept]),
+            float(sigma),
+            method,
+            seed,
+            threads or len(os.sched_getaffinity(0)),
+            float(still),
+            None if step is None else step[:end],
+            None if step_sigma is None else step_sigma[:end],
+            float(encoder.scale_sigma),
+            None if down is None else down[:end],
+            float(attitude_sigma),
+            uncertain,
+            None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
+            [PARAMETERS.index(name) for name in drift[0]] if drift else [],
+            np.ascontiguousarray(drift[1]) if drift else None,
+            float(drift[2]) if drift else 1.0,
+            float(sag_sigma),
+            None if shutter is None else np.asarray(shutter.time)[:end],
+            0.0 if shutter is None else shutter.line_time,
+            0.0 if shutter is None else shutter.middle_row,
+        )
+
+    found, end = run(frames), frames
+    noise = (
+        sigma
+        if tracks.covariance is None or not frames
+        else np.sqrt(np.median(np.einsum("nii->n", tracks.covariance)) / 2)
     )
-    out = _result(found, names, frames, step, encoder, camera, share)
+    zoomed = Zooms(camera, tracks.frame, numbers, tracks.pixels, float(noise)).first(found, run)
+    if zoomed:
+        end, found = zoomed
+    joined = linked(camera, found, tracks.frame, numbers, tracks.pixels, float(noise), step)
+    if joined is not None:
+        numbers, before = joined, found
+        found = run(end)
+        if len(found["segments"]) < len(before["segments"]):
+            tracks = dataclasses.replace(tracks, track=names[joined])
+        else:
+            found = before
+    out = _result(found, names, end, step, encoder, camera, share)
+    if zoomed:
+        out.gaps.append(Gap(int(out.frames[-1]) if len(out.frames) else 0, frames - 1, "zoom", 0))
+        out.status = "partial" if len(out.frames) else "failed"
+        out.reason = "; ".join(str(gap) for gap in out.gaps[-3:])
     out.shutter = shutter
     if shutter is not None:
         out.line_time = _line_time(found["segments"], shutter.line_time)

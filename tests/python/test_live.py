@@ -4,12 +4,14 @@ How exact a measurement is, is the subject of test_reconstruct.py; here its newe
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pipefish as pf
 from device import Device
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
@@ -84,6 +86,18 @@ def test_slip_darkness_and_a_break_are_told_once_and_where(objects, tmp_path):
     assert [t for t in told if "dark (lamp out?)" in t] == ["0.50 m: dark (lamp out?)"]
     (at,) = [float(t.split(" m:")[0]) for t in told if "slip" in t]
     assert at == pytest.approx(1.53, abs=0.06)
+
+
+def test_after_the_lens_zoomed_nothing_is_measured(drive, tmp_path):
+    """A window that begins behind the zoom does not know of it: its numbers would be wrong in silence."""
+    t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
+    pixels = np.where((t.frame > 24)[:, None], middle + 1.2 * (t.pixels - middle), t.pixels)
+    zoomed = dataclasses.replace(drive, tracks=pf.Tracks(t.frame, t.track, pixels))
+    course, told = fed(objects_of(zoomed), tmp_path / "a.mcap")
+    (at,) = [float(line.split(" m:")[0]) for line in told if "the lens zoomed" in line]
+    assert at == pytest.approx(1.2, abs=0.11)  # keyframe 24
+    assert course.summary()["to"] < 1.6 and course.summary()["d_mean"] == pytest.approx(0.3, rel=0.005)
+    assert "the lens zoomed" in course.progress()["why"]
 
 
 def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):

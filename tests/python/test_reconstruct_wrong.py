@@ -93,14 +93,45 @@ def test_a_tenth_of_wrong_observations_is_told_and_leaves_no_gap() -> None:
     assert right > 0.95 * wrong and right > 0.98 * flags
 
 
-@pytest.mark.parametrize("kind", ["mirrored", "zoomed", "one pixel"])
+def zoomed(drive: Drive, by: float, frames: int) -> pf.Tracks:
+    """Tracks of a drive whose lens zooms over so many frames from the twentieth on."""
+    t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
+    zoom = by ** np.clip((t.frame - 20) / frames, 0, 1)
+    return pf.Tracks(t.frame, t.track, middle + zoom[:, None] * (t.pixels - middle))
+
+
+@pytest.mark.parametrize(("by", "frames"), [(1.2, 1), (0.8, 4), (1.5, 4)])
+def test_what_was_seen_before_the_lens_zoomed_is_measured_and_nothing_behind_it(by: float, frames: int) -> None:
+    """From there on the profile does not hold, and diameters would be off by half of it: a step all at once, which no
+    pose explains, and a slow one, which poses and points take up with small residuals."""
+    drive = tube_drive(62, 2.0)
+    rec = pf.reconstruct(zoomed(drive, by, frames), drive.camera, drive.driven)
+    assert rec.status == "partial" and 18 <= rec.frames[-1] <= 21 and not rec.standing
+    assert (rec.gaps[-1].reason, rec.gaps[-1].first, rec.gaps[-1].last) == ("zoom", rec.frames[-1], 40)
+    assert "the lens zoomed" in rec.reason
+    r, t = drive.poses[0, :, :3], drive.poses[0, :, 3]
+    off = rec.points - (drive.points[rec.track] @ r.T + t)
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.004
+
+
+@pytest.mark.parametrize("seed", [71, 72])
+def test_a_lens_that_did_not_zoom_is_believed(seed: int) -> None:
+    """In a bend, with wrong observations, along tracks that all drift outwards by a tenth of a pixel a frame."""
+    drive = tube_drive(seed, 2.0, wrong=0.05, bend=0.3)
+    t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
+    out = t.pixels - middle
+    since = t.frame - t.frame[np.searchsorted(t.track, t.track)]
+    drifted = t.pixels + 0.1 * since[:, None] * out / np.linalg.norm(out, axis=1)[:, None]
+    rec = pf.reconstruct(pf.Tracks(t.frame, t.track, drifted), drive.camera, drive.driven)
+    assert not [g for g in rec.gaps if g.reason == "zoom"] and rec.frames[-1] == 40
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "one pixel"])
 def test_pictures_that_cannot_be_are_a_status_without_a_wrong_number(kind: str) -> None:
     drive = tube_drive(61, 2.0)
     t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
-    after = (t.frame > 20)[:, None]
     pixels = {
         "mirrored": t.pixels * [-1, 1] + [2 * middle[0], 0],
-        "zoomed": np.where(after, middle + 1.2 * (t.pixels - middle), t.pixels),
         "one pixel": np.tile(middle + 80.0, (len(t.frame), 1)),
     }[kind]
     rec = pf.reconstruct(pf.Tracks(t.frame, t.track, pixels), drive.camera, drive.driven)
@@ -110,8 +141,5 @@ def test_pictures_that_cannot_be_are_a_status_without_a_wrong_number(kind: str) 
         mirrored = drive.points[rec.track] * [-1, 1, 1]
         scale, turn, move = similarity(rec.points, mirrored)
         assert rec.status == "ok" and np.abs(scale * rec.points @ turn.T + move - mirrored).max() < 0.05
-    elif kind == "zoomed":
-        assert rec.status == "partial" and (rec.gaps[0].first, rec.gaps[0].last) == (20, 21)
-        assert rec.gaps[0].reason == "no_rigid_scene" and max(rec.sigma) > 1.4 * rec.sigma[0]
     else:
         assert rec.status == "failed" and rec.reason
