@@ -53,6 +53,7 @@ _LAZY = {
     "DenseWall": "pipefish.dense",
     "WallModel": "pipefish.wallmodel",
     "dense_wall": "pipefish.dense",
+    "find_cracks": "pipefish.dense_cracks",
     "predicted_seeds": "pipefish.wallmodel",
     "calibrate": "pipefish.calibration",
     "self_calibrate": "pipefish.selfcal",
