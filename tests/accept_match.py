@@ -1,4 +1,5 @@
-"""Matching over wide baselines: graf 1-3 to 1-6 against the homography of the wall, as `pipefish match` filters.
+"""Matching over wide baselines: graf 1-3 to 1-6 against the homography of the wall, as `pipefish match` filters; and
+fountain-P11's neighbours (accept_fountain.py).
 
 That homography is the wall's alone: matches on the strip below the kerb, another plane, count as wrong.
 
@@ -14,13 +15,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from accept_fountain import fountain_rows
 from accept_rows import Row, at_least, print_rows
 
 import pipefish as pf
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests/bench"))
-DATA = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data") / "homography/graf"
+DATA = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data")
 BOUNDS = {3: 0.9, 4: 0.8, 5: 0.7, 6: 0.7}  # of the matches within 3 pixels
 LEAST = 150_000  # matches of 1-3
 
@@ -29,7 +31,7 @@ def rows_of(view: int) -> list[Row]:
     """One pair: share within 3 pixels, and how many there are."""
     from match_views import load, mapped
 
-    one, two, h = load(DATA, view)
+    one, two, h = load(DATA / "homography/graf", view)
     grown = pf.match_quasi_dense(one, two)
     m = pf.filter_matches(grown, least=0, geometry="motion") if view == 3 else pf.filter_matches(grown)
     right = float(np.mean(np.linalg.norm(mapped(h, m.xy1) - m.xy2, axis=1) < 3)) if len(m) else 0.0
@@ -42,7 +44,9 @@ def rows_of(view: int) -> list[Row]:
 def main() -> None:
     """All pairs."""
     if DATA.is_dir():
-        print_rows([row for view in BOUNDS for row in rows_of(view)])
+        print_rows(
+            [*(row for view in BOUNDS for row in rows_of(view)), *fountain_rows(DATA / "multiview/fountain-P11")]
+        )
     else:
         print(f"no {DATA}: nothing is measured", file=sys.stderr)
         print_rows([])
