@@ -35,6 +35,7 @@ Floats = NDArray[np.float64]
 R = 0.2
 SIZE = 512
 CAMERA = pf.Camera(width=SIZE, height=SIZE, f_u=165.0, f_v=165.0, c_u=255.0, c_v=256.5, theta_max=1.75)
+WIDE = pf.Camera(width=SIZE, height=SIZE, f_u=139.0, f_v=139.0, c_u=255.0, c_v=256.5, theta_max=1.83)  # 104.9 degrees
 START, FRAMES, STEP = 0.2, 7, 0.055
 DEPOSIT = {"s": 0.42, "clock": 2.0, "height": 0.006, "length": 0.08, "extent": 0.5}
 
@@ -89,10 +90,10 @@ def pose(k: int) -> Floats:
 
 
 @cache
-def drawn(k: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+def drawn(k: int, camera: pf.Camera = CAMERA) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Of each pixel: paint, light (0 outside the circle), s, clock, metres from the rod."""
     v, u = np.mgrid[:SIZE, :SIZE]
-    rays, ok = CAMERA.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    rays, ok = camera.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(float))
     p = pose(k)
     centre, d = -p[:, :3].T @ p[:, 3], rays @ p[:, :3]
     ok &= np.hypot(d[:, 0], d[:, 1]) > 0.2
@@ -119,8 +120,8 @@ def with_noise(k: int, value: Floats) -> NDArray[np.uint8]:
     return np.rint(value + noise).clip(0, 255).astype(np.uint8).reshape(SIZE, SIZE)
 
 
-def render(k: int) -> NDArray[np.uint8]:
-    value, light, *_ = drawn(k)
+def render(k: int, camera: pf.Camera = CAMERA) -> NDArray[np.uint8]:
+    value, light, *_ = drawn(k, camera)
     return with_noise(k, value * light)
 
 
@@ -373,9 +374,9 @@ def test_rings_that_are_none_are_refused() -> None:
         pf.WallModel(np.repeat(rings()[:1], 3, axis=0))
 
 
-def truth(pixels: Floats, one: Floats, two: Floats) -> Floats:
+def truth(pixels: Floats, one: Floats, two: Floats, camera: pf.Camera = CAMERA) -> Floats:
     """Where pixels of a keyframe at pose `one` are at pose `two`, by the true wall."""
-    rays, _ = CAMERA.unproject(pixels)
+    rays, _ = camera.unproject(pixels)
     centre, d = -one[:, :3].T @ one[:, 3], rays @ one[:, :3]
     a, b = (d[:, :2] ** 2).sum(axis=1), d[:, :2] @ centre[:2]
     wall = np.full(len(d), R)
@@ -383,23 +384,27 @@ def truth(pixels: Floats, one: Floats, two: Floats) -> Floats:
         far = (-b + np.sqrt(b**2 - a * (centre[:2] @ centre[:2] - wall**2))) / a
         hit = centre + far[:, None] * d
         wall = radius(hit[:, 2], np.arctan2(hit[:, 0], -hit[:, 1]))
-    return CAMERA.project(hit @ two[:, :3].T + two[:, 3])[0]
+    return camera.project(hit @ two[:, :3].T + two[:, 3])[0]
 
 
-def test_raw_keyframes_match_from_seeds_that_the_tube_predicts(pictures: list[NDArray[np.uint8]]) -> None:
-    """As they come from the camera, up to 97 degrees from its axis; the tube is 3 % too wide."""
+def test_raw_keyframes_match_to_100_degrees_from_seeds_that_the_tube_predicts() -> None:
+    """As they come from a camera that sees to 105 degrees from its axis; the tube is 3 % too wide. Behind the camera,
+    where a point has Z < 0, they match as well as beside it: in each degree to 102, where the window reaches the rim."""
     one, two = POSES[1], POSES[3]
     grid = np.stack(np.meshgrid(np.arange(40, SIZE, 48), np.arange(40, SIZE, 48)), axis=-1).reshape(-1, 2)
-    seeds = predicted_seeds(pf.WallModel(rings(1.03 * R, start=0.0, end=1.5)), CAMERA, one, two, grid)
+    seeds = predicted_seeds(pf.WallModel(rings(1.03 * R, start=0.0, end=1.5)), WIDE, one, two, grid)
     assert len(seeds) > 30
     relative = two[:, :3] @ one[:, :3].T
     pose = np.column_stack([relative, two[:, 3] - relative @ one[:, 3]])
-    m = pf.match_quasi_dense(pictures[1], pictures[3], seeds, CAMERA, pose)
-    off = np.linalg.norm(m.xy2 - truth(m.xy1, one, two), axis=1)
-    theta = np.degrees(np.arccos(CAMERA.unproject(m.xy2)[0][:, 2]))
+    m = pf.match_quasi_dense(render(1, WIDE), render(3, WIDE), seeds, WIDE, pose)
+    off = np.linalg.norm(m.xy2 - truth(m.xy1, one, two, WIDE), axis=1)
+    off = np.nan_to_num(off, nan=np.inf)  # what the rim hides in the second
+    theta = np.degrees(np.arccos(WIDE.unproject(m.xy2)[0][:, 2]))
     assert len(m) > 30_000
     assert np.median(off) <= 0.15 and np.mean(off < 1) >= 0.97
-    assert (theta > 92).sum() > 500 and np.mean(off[theta > 92] < 1) >= 0.95
+    for degree in range(90, 102):
+        here = (theta >= degree) & (theta < degree + 1)
+        assert here.sum() > 500 and np.mean(off[here] < 1) >= 0.99, degree
 
 
 def test_predicted_seeds_are_exact_on_the_wall_that_they_assume() -> None:
