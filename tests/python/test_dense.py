@@ -389,7 +389,7 @@ def truth(pixels: Floats, one: Floats, two: Floats, camera: pf.Camera = CAMERA) 
 
 def test_raw_keyframes_match_to_100_degrees_from_seeds_that_the_tube_predicts() -> None:
     """As they come from a camera that sees to 105 degrees from its axis; the tube is 3 % too wide. Behind the camera,
-    where a point has Z < 0, they match as well as beside it: in each degree to 102, where the window reaches the rim."""
+    where a point has Z < 0, they match as well as beside it, in each degree to 102; then the window meets the rim."""
     one, two = POSES[1], POSES[3]
     grid = np.stack(np.meshgrid(np.arange(40, SIZE, 48), np.arange(40, SIZE, 48)), axis=-1).reshape(-1, 2)
     seeds = predicted_seeds(pf.WallModel(rings(1.03 * R, start=0.0, end=1.5)), WIDE, one, two, grid)
