@@ -50,6 +50,7 @@ _LAZY = {
     "roc": "pipefish.roc_curve",
     "filter_matches": "pipefish.matching_filters",
     "match_back": "pipefish.matching_filters",
+    "match_rivals": "pipefish.matching_filters",
     "DenseWall": "pipefish.dense",
     "WallModel": "pipefish.wallmodel",
     "dense_wall": "pipefish.dense",

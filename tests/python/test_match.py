@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish.cli import main
 from pipefish.matching_files import read_grey
+from pipefish.matching_filters import select
 
 Floats = NDArray[np.float64]
 Map = Callable[[Floats], Floats]
@@ -315,14 +317,10 @@ def spoiled(m: pf.Matches, share: float) -> tuple[pf.Matches, NDArray[np.bool_]]
     corner = (m.xy1 // 4).astype(int)
     wrong = rng.random((H // 4 + 1, W // 4 + 1))[corner[:, 1], corner[:, 0]] < share
     shift = rng.uniform(5, 30, (H // 4 + 1, W // 4 + 1, 2))[corner[:, 1], corner[:, 0]]
-    from dataclasses import replace
-
     to = np.clip(m.xy2 + wrong[:, None] * shift, 0, [W - 1, H - 1])
     _, first = np.unique(np.rint(to), axis=0, return_index=True)
     keep = np.zeros(len(m), bool)
     keep[first] = True
-    from pipefish.matching_filters import select
-
     return select(replace(m, xy2=to), keep), wrong[keep]
 
 
@@ -366,6 +364,44 @@ def test_what_is_off_the_plane_or_the_motion_goes(geometry: str) -> None:
         assert np.abs(kept.xy2[:, 1] - kept.xy1[:, 1]).max() <= 2.5  # lines of this motion are rows
         assert lower.sum() >= 0.8 * (~wrong & (m.xy1[:, 1] > 0.7 * H + 6)).sum()
     assert (~lower).sum() >= 0.9 * right.sum()
+
+
+def fence(xy: Floats) -> Floats:
+    """Left of the middle like nothing else, right of it bars 9 pixels apart, alike along x."""
+    bars = waves(np.stack([2 * np.cos(2 * np.pi * xy[..., 0] / 9), xy[..., 1] + 500], axis=-1), 3)
+    return np.where(xy[..., 0] < W / 2, waves(xy), bars)
+
+
+def test_what_could_as_well_be_elsewhere_on_its_epipolar_line_goes() -> None:
+    """Two planes under a motion along x; the right one repeats itself along x, all of it right but none of it sure."""
+    one, two = fence(grid()), np.where(grid()[..., 0] < W / 2, fence(grid() - [0.3, 0]), fence(grid() - [6.3, 0]))
+    one, two = one.astype(np.float32), two.astype(np.float32)
+    seeds = pf.Seeds(np.array([[50.0, 80.0], [150.0, 80.0]]), np.array([[50.3, 80.0], [156.3, 80.0]]))
+    m = pf.match_quasi_dense(one, two, seeds)
+    m = select(m, np.arange(len(m)) % 3 == 0)
+    sideways = np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]])
+    pinhole = pf.Camera(
+        width=W, height=H, f_u=200.0, f_v=200.0, c_u=99.5, c_v=79.5, theta_max=0.6, radial="perspective"
+    )
+    left, right = m.xy1[:, 0] < W / 2 - 30, m.xy1[:, 0] > W / 2 + 30
+    assert min(left.sum(), right.sum()) > 1300
+    for geometry in ((pinhole, sideways), ()):
+        ratio = pf.match_rivals(one, two, m, *geometry)
+        assert np.mean(ratio[left] < 0.9) > 0.97 and np.mean(ratio[right] >= 0.98) > 0.95
+    kept = pf.filter_matches(m, least=0, rivals=ratio)
+    assert np.mean(kept.xy1[:, 0] > W / 2 + 30) < 0.05 and (kept.xy1[:, 0] < W / 2 - 30).sum() > 0.97 * left.sum()
+    with pytest.raises(pf.ArgumentError, match="rivals: shape"):
+        pf.filter_matches(m, rivals=ratio[1:])
+
+
+def test_rivals_are_looked_for_along_the_curve_of_a_fisheye() -> None:
+    """The plane's texture is like itself nowhere: few have a rival, on 1 thread or 3."""
+    one, two = rendered(np.eye(3, 4)), rendered(POSE)
+    m = pf.match_quasi_dense(one, two, fisheye_seed(), FISHEYE, POSE)
+    m = select(m, np.arange(len(m)) % 4 == 0)
+    ratio = pf.match_rivals(one, two, m, FISHEYE, POSE)
+    assert len(m) > 2000 and np.mean(ratio < 0.98) > 0.99 and np.median(ratio) > 0.1
+    assert np.array_equal(ratio, pf.match_rivals(one, two, m, FISHEYE, POSE, threads=3))
 
 
 def test_matches_that_nothing_holds_together_come_to_nothing() -> None:
