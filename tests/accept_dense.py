@@ -1,7 +1,8 @@
 """A simulated DN400 through pipefishd, the emulated cable, `reconstruct` and `dense`, cell by cell beside the truth.
 
-The drive is 0.9 m past a deposit of 3 mm. Poses are the reconstruction's; the map is laid onto the truth by one rigid
-motion, which the camera centres and directions tell, so that the error of scale stays in.
+The drive is 0.9 m past a deposit of 3 mm and three cracks, of 2, 1 and 0.7 mm. Poses are the reconstruction's; the map
+is laid onto the truth by one rigid motion, which the camera centres and directions tell, so that the error of scale
+stays in.
 
     python tests/accept_dense.py
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import redirect_stdout
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +25,22 @@ from accept_rows import at_least, at_most, kept, print_rows
 
 from pipefish.cli import main as pipefish
 from pipefish.demo import find_programs, survey_over_the_line
+from pipefish.dense_files import strips_of
 from pipefish.simulate import Scene
 from pipefish.wall import Wall, read_wall
 
 NAME = "dense-dn400"
+CRACKS = [
+    {"path": [{"s": 0.75, "phi": 0.5}, {"s": 1.15, "phi": 0.7}], "width": 0.002, "meander": 0.006, "seed": 51},
+    {"path": [{"s": 0.9, "phi": -0.8}, {"s": 0.94, "phi": -2.0}], "width": 0.001, "meander": 0.004, "seed": 52},
+    {"path": [{"s": 0.8, "phi": 1.6}, {"s": 1.1, "phi": 2.2}], "width": 0.0007, "meander": 0.004, "seed": 53},
+]
 DEPOSIT = {"s": 0.95, "clock": 3.14, "length": 0.06, "extent": 0.3, "height": 0.003}
 SCENE: dict[str, Any] = {
     "diameter": 0.4,
     "pieces": [{"length": 2.4}],
     "deposits": [DEPOSIT],
+    "cracks": CRACKS,
     "texture": {"seed": 45},
     "sensor": {"seed": 45},
     "motion": {"seed": 45, "frames": 80, "speed": 0.25, "ramp": 0.4},
@@ -93,6 +102,7 @@ def figures() -> dict[str, float]:
         "p95_mm": 1000 * float(np.percentile(np.abs(error), 95)),
         "without_mean_p95_sigmas": float(np.percentile(np.abs(same_scale) / sigma, 95)),
         **deposit(folder / "map/dense.json"),
+        **cracks(folder, scene, turn, shift),
     }
 
 
@@ -101,6 +111,39 @@ def deposit(path: Path) -> dict[str, float]:
     inwards = [r for r in json.loads(path.read_text())["regions"] if r["kind"] == "inwards"]
     first = inwards[0] if inwards else {"height": 0.0, "sigma": 1.0}
     return {"deposit_mm": 1000 * abs(first["height"]), "deposit_sigmas": abs(first["height"]) / first["sigma"]}
+
+
+def cracks(folder: Path, scene: Scene, turn: np.ndarray, shift: np.ndarray) -> dict[str, float]:
+    """How many of the cracks were found (half of their way or more), how far the paths are from the true ones (median
+    of the worst, millimetres), the worst error of a length, and how many others were told."""
+    strips = strips_of(read_wall(folder / "out").pieces)
+    truth = [e["path"] for e in scene.events() if e["kind"] == "crack"]
+    true = [np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(np.array(path, float))]) for path in truth]
+    radius = scene.spec["diameter"] / 2
+    found: dict[int, list[tuple[float, float]]] = {k: [] for k in range(len(true))}
+    others = 0
+    for c in json.loads((folder / "map/dense.json").read_text())["cracks"]:
+        strip = strips[c["piece"]]
+        chainage, clock = np.array(c["path"]).T
+        points = strip.wall.points(strip.sign * (chainage - strip.origin), clock) @ turn.T + shift
+        place = scene.locate(points)
+        off = []
+        for path in true:
+            around = (place[:, 2][:, None] - path[:, 1] + np.pi) % (2 * np.pi) - np.pi
+            off.append(np.hypot(place[:, 0][:, None] - path[:, 0], radius * around).min(axis=1))
+        nearest = int(np.argmin([np.median(o) for o in off]))
+        if np.median(off[nearest]) < 0.005:
+            found[nearest].append((c["length"], float(np.median(off[nearest]))))
+        else:
+            others += 1
+    lengths = [np.hypot(*(np.diff(p, axis=0) * [1, radius]).T).sum() for p in true]
+    share = [sum(a for a, _ in found[k]) / lengths[k] for k in found]
+    return {
+        "cracks_found": float(sum(s >= 0.5 for s in share)),
+        "cracks_off_mm": 1000 * max((o for of in found.values() for _, o in of), default=0.0),
+        "cracks_length_share": float(min(share)),
+        "cracks_other": float(others),
+    }
 
 
 def main() -> int:
@@ -112,6 +155,9 @@ def main() -> int:
             at_most("dense.dn400_p95_mm", f["p95_mm"], 3.0),
             at_least("dense.dn400_deposit_sigmas", f["deposit_sigmas"], 3.0),
             at_least("dense.dn400_cells", f["cells"], 10000),
+            at_least("dense.dn400_cracks_found", f["cracks_found"], 3),
+            at_most("dense.dn400_cracks_off_mm", f["cracks_off_mm"], 3.0),
+            at_most("dense.dn400_cracks_other", f["cracks_other"], 0),
         ]
     )
     print({k: round(v, 3) for k, v in f.items()}, file=sys.stderr)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from accept_rows import Row, figure, print_rows
+from accept_rows import Row, figure, kept, print_rows
 from PIL import Image
 
 import pipefish as pf
@@ -28,6 +28,7 @@ from pipefish.recognition_files import draw_roc, draw_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("PIPEFISH_DATA") or ROOT.parent / "shared" / "data") / "objects"
+KEPT = ROOT / "build/accept/recognise"  # rows of a set that was measured, should the other be interrupted
 REAL = ("004_sugar_box", "006_mustard_bottle")
 
 
@@ -204,9 +205,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", type=Path, help="folder for ROC curves and scenes with contours")
     args = parser.parse_args()
-    rows = measure(simulated(), args.pictures)
+    rows = kept(KEPT, "simulated", lambda: measure(simulated(), args.pictures))
     if DATA.is_dir():
-        rows += measure(real(), args.pictures)
+        rows += kept(KEPT, "real", lambda: measure(real(), args.pictures))
     else:
         print(f"no {DATA}: the real set is left out", file=sys.stderr)
     print_rows(rows)

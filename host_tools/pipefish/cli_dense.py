@@ -13,7 +13,9 @@ from pipefish.errors import ArgumentError, PipefishError
 def run_dense(args: argparse.Namespace) -> Result:
     """Measures the wall of a reconstructed survey densely."""
     from pipefish.dense import DenseWall, dense_wall
+    from pipefish.dense_cracks import find_cracks
     from pipefish.dense_files import Strip, strips_of, write_dense
+    from pipefish.dense_findings import finding_parts, findings_of, fingerprint
     from pipefish.measured_texts import length_text
     from pipefish.progress import Progress
     from pipefish.wall import read_wall
@@ -35,7 +37,16 @@ def run_dense(args: argparse.Namespace) -> Result:
                     scale=args.scale,
                     raw=args.raw,
                     threads=args.threads,
-                    tell=lambda done, n=n: bar.update(round(100 * (n + done))),
+                    tell=lambda done, n=n: bar.update(round(100 * (n + 0.8 * done))),
+                )
+                found.cracks.extend(
+                    find_cracks(
+                        found,
+                        measured.picture,
+                        measured.camera,
+                        measured.poses,
+                        tell=lambda done, n=n: bar.update(round(100 * (n + 0.8 + 0.2 * done)), "cracks"),
+                    )
                 )
             except ArgumentError as error:
                 problem = error
@@ -44,7 +55,8 @@ def run_dense(args: argparse.Namespace) -> Result:
             mapped.append(strip)
         if not maps:
             raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
-        document, files = write_dense(Path(args.output), maps, mapped, measured.unit, measured.document["summary"])
+        summary, made = measured.document["summary"], fingerprint(Path(args.measured))
+        document, files = write_dense(Path(args.output), maps, mapped, measured.unit, summary, made)
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
     rows: list[tuple[str, object]] = [
@@ -62,22 +74,12 @@ def run_dense(args: argparse.Namespace) -> Result:
     ]
     if document["scale_sigma"]:
         rows.append(("scale", f"+- {196 * document['scale_sigma']:.2g} % (95 %) of every radius, in common"))
-    for r in document["regions"][:20]:
-        rows.append(
-            (
-                r["kind"],
-                f"{length_text(abs(r['height']), unit)} +- {length_text(1.96 * r['sigma'], unit)} (95 %) at "
-                f"{r['chainage']:.3f}, {r['clock_text']}, {length_text(r['length'], unit)} long",
-            )
-        )
-    for r in document["steps"][:20]:
-        rows.append(
-            (
-                "step",
-                f"{length_text(r['step'], unit)} +- {length_text(1.96 * r['sigma'], unit)} (95 %) towards "
-                f"{r['clock_text']} at {r['chainage']:.3f}, radius {length_text(r['widening'], unit)} wider",
-            )
-        )
+    found_there = findings_of(document)
+    for e in found_there[:40]:
+        at = f"at {length_text(e['chainage'], unit, metres=True)}, {e['clock_text']} o'clock"
+        rows.append((e["kind"], ", ".join([at, *finding_parts(e, unit)])))
+    if len(found_there) > 40:
+        rows.append(("and", f"{len(found_there) - 40} more findings"))
     return document, table([*rows, *(("written", f) for f in files)])
 
 
@@ -89,7 +91,7 @@ def add_dense(commands: Any) -> None:
         run_dense,
         "Measure the wall of a reconstructed survey densely: keyframes are unrolled onto the fitted tube and matched; "
         "writes a map of how far the wall is from the tube with a sigma for each cell, as tables, arrays, a picture "
-        "and a point cloud, and what stands in or out of it.",
+        "and a point cloud, and what stands in or out of it, steps of joints and cracks.",
         "pipefish reconstruct survey.mcap -o out/ && pipefish dense out/ -o out/dense/",
     )
     p.add_argument("measured", metavar="DIR", help="of pipefish reconstruct")

@@ -8,7 +8,7 @@ from typing import Any
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError
 
-FILTERS = ("consistent", "both-ways", "plane", "motion", "none")
+FILTERS = ("consistent", "both-ways", "plane", "motion", "unique", "none")
 MODES = ("adaptive", "constant", "translation")  # matching.MODES, whose import costs time here
 
 
@@ -17,7 +17,7 @@ def run_match(args: argparse.Namespace) -> Result:
     from pipefish.camera import Camera
     from pipefish.matching import match_quasi_dense
     from pipefish.matching_files import read_grey, read_pose, read_seeds, statistics, write_matches
-    from pipefish.matching_filters import filter_matches, match_back
+    from pipefish.matching_filters import filter_matches, match_back, match_rivals
 
     if bool(args.profile) != bool(args.pose):
         raise ArgumentError("--profile and --pose: the epipolar geometry needs both")
@@ -31,14 +31,9 @@ def run_match(args: argparse.Namespace) -> Result:
     if "none" in filters and len(filters) > 1:
         raise ArgumentError("--filter: none, or others, not both")
     options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}
-    m = match_quasi_dense(
-        one,
-        two,
-        read_seeds(args.seeds) if args.seeds else None,
-        cameras[0] if cameras and len(cameras) == 1 else cameras,
-        read_pose(args.pose) if args.pose else None,
-        **options,
-    )
+    pair = cameras[0] if cameras and len(cameras) == 1 else cameras
+    geometry = pair, read_pose(args.pose) if args.pose else None
+    m = match_quasi_dense(one, two, read_seeds(args.seeds) if args.seeds else None, *geometry, **options)
     grown = len(m)
     if filters != {"none"}:
         m = filter_matches(
@@ -46,6 +41,7 @@ def run_match(args: argparse.Namespace) -> Result:
             least=None if "consistent" in filters else 0,
             back=match_back(one, two, m, **options) if "both-ways" in filters else None,
             geometry=next(iter(filters & {"plane", "motion"}), None),
+            rivals=match_rivals(one, two, m, *geometry, threads=args.threads) if "unique" in filters else None,
         )
     files = write_matches(args.output, one, two, m)
     document = statistics(m) | {"files": files}
@@ -104,7 +100,8 @@ def add_match(commands: Any) -> None:
         action="append",
         choices=FILTERS,
         help="keep only matches that fit their neighbours and are no small islands (consistent), that the reverse "
-        "direction confirms (both-ways), or that fit the one plane or rigid motion that most agree with (pinhole "
-        "pictures); may be repeated; none: all that grew [consistent]",
+        "direction confirms (both-ways), that fit the one plane or rigid motion that most agree with (pinhole "
+        "pictures), or that are the only place on their epipolar line which looks like it (unique: by --pose, else by "
+        "the rigid motion that most agree with); may be repeated; none: all that grew [consistent]",
     )
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

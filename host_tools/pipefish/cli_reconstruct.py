@@ -129,6 +129,7 @@ def add_reconstruct(commands: Any) -> None:
         "reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm)",
     )
     p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
     p.add_argument("--title", help="of the page [the survey's name]")
 
 
@@ -273,6 +274,7 @@ def run_report(args: argparse.Namespace) -> Result:
             limits=args.limit,
             title=args.title,
             survey=Path(args.survey) if args.survey else None,
+            dense=Path(args.dense) if args.dense else None,
             tell=lambda done, word: bar.update(round(100 * done), word),
         )
     document = {"file": str(out), "bytes": out.stat().st_size, "limits": verdicts}

@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipefish import _engine
 from pipefish.camera import Camera
 from pipefish.dense_regions import find_regions
 from pipefish.dense_steps import find_steps
+from pipefish.dense_unroll import THETA_LEAST, Unroller, View, box_sum, keyframe_picture
 from pipefish.errors import ArgumentError
-from pipefish.matching import Seeds, grey, match_quasi_dense
+from pipefish.matching import Seeds, match_quasi_dense
 from pipefish.wallmodel import Floats, WallModel, predicted_seeds, seen_on_wall
 
 Rays = tuple[Floats, Floats]  # origins and directions of unit length, (K,3) each
 
-THETA_LEAST = math.radians(30)  # nearer to the axis a pixel covers four times as much of the wall as beside the camera
-RIM_PX = 6.0  # inside the image circle's rim
 CELLS = 100  # of the map, to a diameter
 BASE = (0.2, 0.7)  # travel between the two keyframes of a pair, diameters
 STRIDE = 0.12  # between keyframes that begin pairs, diameters
@@ -63,6 +61,7 @@ class DenseWall:
     scatter            what the pairs' own scatter multiplied the sigmas of theory by
     regions            connected cells that are off the tube by over 3 sigma: see `find_regions`
     steps              where the pipe steps aside or changes its width at once: see `find_steps`
+    cracks             lines that wander over the wall: see `find_cracks`, which looks for them
     """
 
     wall: WallModel
@@ -77,6 +76,7 @@ class DenseWall:
     pairs_used: int
     regions: list[dict[str, float]] = field(default_factory=list)
     steps: list[dict[str, float]] = field(default_factory=list)
+    cracks: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def points(self) -> Floats:
@@ -88,101 +88,6 @@ class DenseWall:
         """Share of the cells that are measured, of those that two pairs or more have in view."""
         seen = self.looks >= 2
         return float(np.isfinite(self.deviation)[seen].mean()) if seen.any() else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """A keyframe unrolled: picture rows are cells along s from `row` on; `pad` columns are repeated at either end."""
-
-    row: int
-    picture: NDArray[np.float32]
-    even: NDArray[np.float32]  # the picture without the lamp's falloff
-    sound: NDArray[np.bool_]
-    image: NDArray[np.float32]
-    centre: Floats
-    pose: Floats
-
-
-class _Unroller:
-    """Unrolls keyframes onto one grid of square cells, a pixel beside the camera each."""
-
-    pad = 24
-
-    def __init__(self, camera: Camera, wall: WallModel, scale: float) -> None:
-        self.camera, self.wall = camera, wall
-        self.columns = max(64, round(2 * math.pi * camera.f_u / scale))
-        self.cell = 2 * math.pi * wall.mean_radius / self.columns
-        self.theta_most = min(camera.theta_max, math.radians(110))
-
-    def clock(self, column: Any) -> Floats:
-        return (np.asarray(column, float) - self.pad + 0.5) * 2 * np.pi / self.columns
-
-    def s(self, row: Any) -> Floats:
-        return (np.asarray(row, float) + 0.5) * self.cell
-
-    def rows(self, pose: Floats) -> tuple[int, int]:
-        """The rows of cells that a keyframe sees, from and to; few or none beside the wall."""
-        centre = -pose[:, :3].T @ pose[:, 3]
-        s = float(self.wall.locate(centre[None])[0][0])
-        rho, last = self.wall.mean_radius, int(self.wall.length / self.cell)
-        ahead = float(self.wall.frames([s])[1][0] @ pose[2, :3])  # below 0: the camera looks back
-        ends = sorted(s + math.copysign(rho, ahead) / math.tan(t) for t in (self.theta_most, THETA_LEAST))
-        first, end = (min(max(round(e / self.cell), 0), last) for e in ends)
-        return first, end
-
-    def view(self, image: NDArray[np.float32], pose: Floats) -> _View:
-        """A keyframe that sees some of the wall, unrolled."""
-        first, end = self.rows(pose)
-        rows, columns = np.arange(first, end), np.arange(self.columns + 2 * self.pad)
-        pixels, sound = self._pixels(rows, columns, pose)
-        values = _engine.sample_image(image, pixels.reshape(-1, 2)).reshape(sound.shape)
-        sound &= np.isfinite(values)
-        picture = np.where(sound, values, 0).astype(np.float32)
-        return _View(first, picture, _even(picture, sound), sound, image, -pose[:, :3].T @ pose[:, 3], pose)
-
-    def _pixels(self, rows: Any, columns: Any, pose: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Where cells are in the picture: every 4th is projected, the others lie between (0.003 px off at most)."""
-        step = 4
-        r = np.arange(rows[0], rows[-1] + step, step)
-        c = np.arange(0, columns[-1] + step, step)
-        s, clock = np.meshgrid(self.s(r), self.clock(c), indexing="ij")
-        points = self.wall.points(s.ravel(), clock.ravel())
-        seen = points @ pose[:, :3].T + pose[:, 3]
-        pixels, ok = self.camera.project(seen)
-        theta = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
-        ok &= (theta >= THETA_LEAST) & (theta <= self.theta_most)
-        ok &= self.camera.in_image(pixels)
-        fine = _between(np.where(ok[:, None], pixels, np.nan).reshape(*s.shape, 2), len(rows), len(columns), step)
-        return np.nan_to_num(fine, nan=-1.0), np.isfinite(fine[..., 0])
-
-
-def _between(coarse: Floats, rows: int, columns: int, step: int) -> Floats:
-    """Bilinear between the places of a grid `step` apart: (rows, columns, k)."""
-    i, j = np.arange(rows), np.arange(columns)
-    t, u = (i % step / step)[:, None, None], (j % step / step)[None, :, None]
-    across = lambda g: (1 - u) * g[:, j // step] + u * g[:, np.minimum(j // step + 1, g.shape[1] - 1)]  # noqa: E731
-    top, bottom = coarse[i // step], coarse[np.minimum(i // step + 1, len(coarse) - 1)]
-    return (1 - t) * across(top) + t * across(bottom)
-
-
-def _box(values: Floats, radius: int) -> Floats:
-    """Sums over (2 radius + 1)^2 cells, less of them at the rim."""
-    for axis in (0, 1):
-        n = values.shape[axis]
-        sums = np.concatenate([np.zeros_like(np.take(values, [0], axis)), np.cumsum(values, axis, dtype=float)], axis)
-        k = np.arange(n)
-        values = np.take(sums, np.minimum(k + radius + 1, n), axis) - np.take(sums, np.maximum(k - radius, 0), axis)
-    return values
-
-
-def _even(picture: NDArray[np.float32], sound: NDArray[np.bool_], radius: int = 15) -> NDArray[np.float32]:
-    """The picture with the lamp's falloff taken out: less its local mean, over its local deviation, 0..1."""
-    count = np.maximum(_box(sound.astype(float), radius), 1)
-    mean = _box(picture.astype(float), radius) / count  # 0 where not sound
-    square = _box(picture.astype(float) ** 2, radius) / count
-    deviation = np.sqrt(np.maximum(square - mean**2, 0)) + 0.01  # 2.5 grey levels: noise is not made texture
-    value = np.where(sound, 0.5 + 0.15 * (picture - mean) / deviation, 0.5)
-    return np.clip(value, 0, 1).astype(np.float32)
 
 
 def _seeds(one: NDArray[np.float32], two: NDArray[np.float32], sound: NDArray[np.bool_], reach: int) -> Seeds:
@@ -217,7 +122,7 @@ def _seeds(one: NDArray[np.float32], two: NDArray[np.float32], sound: NDArray[np
     return Seeds(at, at + shift[good])
 
 
-def _match(one: _View, two: _View, cell: float, every: int) -> tuple[Floats, Floats] | None:
+def _match(one: View, two: View, cell: float, every: int) -> tuple[Floats, Floats] | None:
     """Cells (K,2) column, row of the grid in either view, where both show the wall; of the matches, every n-th along
     and around. cell: side of one."""
     first, end = max(one.row, two.row), min(one.row + len(one.picture), two.row + len(two.picture))
@@ -225,7 +130,7 @@ def _match(one: _View, two: _View, cell: float, every: int) -> tuple[Floats, Flo
         return None
     part = [slice(first - v.row, end - v.row) for v in (one, two)]
     sound = one.sound[part[0]] & two.sound[part[1]]
-    whole = _box(sound.astype(float), 6) >= 13 * 13 - 0.5
+    whole = box_sum(sound.astype(float), 6) >= 13 * 13 - 0.5
     pictures = [v.even[p] for v, p in zip((one, two), part, strict=True)]
     reach = SEARCH_S + round(WRONG_RADIUS * float(np.linalg.norm(two.centre - one.centre)) / cell)
     seeds = _seeds(pictures[0], pictures[1], whole, reach)
@@ -234,13 +139,13 @@ def _match(one: _View, two: _View, cell: float, every: int) -> tuple[Floats, Flo
     m = match_quasi_dense(*pictures, seeds, mode="translation", radius=WINDOW // 2, zncc_min=0.75)
     x, y = m.xy1.astype(int).T
     x2, y2 = np.rint(m.xy2).astype(int).T
-    inside = (x >= _Unroller.pad) & (x < one.picture.shape[1] - _Unroller.pad)
+    inside = (x >= Unroller.pad) & (x < one.picture.shape[1] - Unroller.pad)
     near = (np.abs(m.xy2 - m.xy1) <= [2 * SEARCH_CLOCK, SEARCH_S + reach]).all(axis=1)
     keep = inside & near & whole[y, x] & whole[y2, x2] & (x % every == 0) & (y % every == 0)
     return m.xy1[keep] + [0, first], m.xy2[keep] + [0, first]
 
 
-def _rays(unroller: _Unroller, view: _View, cells: Floats) -> Rays:
+def _rays(unroller: Unroller, view: View, cells: Floats) -> Rays:
     """Origins and directions (K,3), of unit length, of what is at cells: rays through the tube's own points."""
     target = unroller.wall.points(unroller.s(cells[:, 1]), unroller.clock(cells[:, 0]))
     origin = np.broadcast_to(view.centre, target.shape)
@@ -251,7 +156,7 @@ def _rays(unroller: _Unroller, view: _View, cells: Floats) -> Rays:
     return origin, ray / np.linalg.norm(ray, axis=1, keepdims=True)
 
 
-def _unrolled_rays(unroller: _Unroller, one: _View, two: _View, every: int) -> tuple[Rays, Rays] | None:
+def _unrolled_rays(unroller: Unroller, one: View, two: View, every: int) -> tuple[Rays, Rays] | None:
     """Rays of what matches in the unrolled pictures, each n-th cell along and around."""
     cells = _match(one, two, unroller.cell, every)
     if cells is None:
@@ -259,7 +164,7 @@ def _unrolled_rays(unroller: _Unroller, one: _View, two: _View, every: int) -> t
     return _rays(unroller, one, cells[0]), _rays(unroller, two, cells[1])
 
 
-def _raw_rays(unroller: _Unroller, one: _View, two: _View) -> tuple[Rays, Rays] | None:
+def _raw_rays(unroller: Unroller, one: View, two: View) -> tuple[Rays, Rays] | None:
     """Rays of what matches in the keyframes as they are, from seeds that the wall predicts."""
     camera = unroller.camera
     seeds = predicted_seeds(unroller.wall, camera, one.pose, two.pose, _pixel_grid(camera, RAW_STEP))
@@ -286,7 +191,7 @@ def _pixel_grid(camera: Camera, step: int) -> Floats:
     return np.stack(grid, axis=-1).reshape(-1, 2).astype(float)
 
 
-def _bulge(unroller: _Unroller, one: _View, two: _View, pixels: Floats) -> Floats:
+def _bulge(unroller: Unroller, one: View, two: View, pixels: Floats) -> Floats:
     """(K,2): how far a match fitted by an affine map lies off in view two, because over its window the true map is
     not affine: half the map's Laplacian times the window's variance. NaN where the wall does not tell."""
     camera, step = unroller.camera, RAW_BEND_STEP
@@ -300,7 +205,7 @@ def _bulge(unroller: _Unroller, one: _View, two: _View, pixels: Floats) -> Float
     return 0.5 * laplacian[row, column] * WINDOW_VARIANCE
 
 
-def _triangulated(unroller: _Unroller, rays: tuple[Rays, Rays]) -> tuple[Floats, ...]:
+def _triangulated(unroller: Unroller, rays: tuple[Rays, Rays]) -> tuple[Floats, ...]:
     """s, clock, deviation, its sigma, each (K,), of matches whose rays meet."""
     wall, pixel = unroller.wall, 1 / unroller.camera.f_u
     (o1, d1), (o2, d2) = rays
@@ -376,7 +281,7 @@ def _fused(
     return out, error, pairs, scatter
 
 
-def _pairs(unroller: _Unroller, poses: Floats) -> list[tuple[int, int]]:
+def _pairs(unroller: Unroller, poses: Floats) -> list[tuple[int, int]]:
     """Keyframes 0.12 diameters apart, each with later ones that are 0.2 to 0.7 diameters further on."""
     seen = [k for k, pose in enumerate(poses) if np.diff(unroller.rows(pose))[0] >= 64]
     centres = np.array([-poses[k, :, :3].T @ poses[k, :, 3] for k in seen]).reshape(-1, 3)
@@ -430,7 +335,7 @@ def dense_wall(
     if not (math.isfinite(scale) and 0.5 <= scale <= 8):
         raise ArgumentError(f"scale: {scale} is not within 0.5 to 8")
     diameter = 2 * wall.mean_radius
-    unroller = _Unroller(camera, wall, scale)
+    unroller = Unroller(camera, wall, scale)
     if not 0 <= calibration_px <= 10:
         raise ArgumentError(f"calibration_px: {calibration_px} is not within 0 to 10")
     size = max(diameter / CELLS, ACROSS * unroller.cell) if cell is None else cell
@@ -440,18 +345,14 @@ def dense_wall(
     share = 1 / (2 * RAW_RADIUS + 1) ** 2 if raw else every**2 / WINDOW**2
     rows, columns = max(1, round(wall.length / size)), max(8, round(math.pi * diameter / size))
 
-    def seen(k: int) -> _View:
-        picture = grey(images(k), f"keyframe {k}")
-        if picture.shape != (camera.height, camera.width):
-            size = f"{picture.shape[1]}x{picture.shape[0]}"
-            raise ArgumentError(f"keyframe {k}: {size} is not the camera's {camera.width}x{camera.height}")
-        return unroller.view(picture, pose_list[k])
+    def seen(k: int) -> View:
+        return unroller.view(keyframe_picture(images, camera, k), pose_list[k])
 
     pairs = _pairs(unroller, pose_list)
     if not pairs:
         raise ArgumentError("poses: no two keyframes see the same wall from 0.2 to 0.7 diameters apart")
     light, lit = np.zeros(rows * columns), np.zeros(rows * columns)
-    views: dict[int, _View] = {}
+    views: dict[int, View] = {}
     looks = np.zeros(rows * columns, int)
     parts = []
 
@@ -500,7 +401,7 @@ def dense_wall(
     return found
 
 
-def _cells_of(unroller: _Unroller, first: int, sound: NDArray[np.bool_], rows: int, columns: int) -> tuple[Any, Any]:
+def _cells_of(unroller: Unroller, first: int, sound: NDArray[np.bool_], rows: int, columns: int) -> tuple[Any, Any]:
     """Places (n,2) of what is sound in unrolled rows from `first` on, and the map's cell of each."""
     inner = slice(unroller.pad, unroller.pad + unroller.columns)
     y, x = np.nonzero(sound[:, inner])
@@ -508,7 +409,7 @@ def _cells_of(unroller: _Unroller, first: int, sound: NDArray[np.bool_], rows: i
     return (y, x + unroller.pad), row * columns + ((x + 0.5) / unroller.columns * columns).astype(int)
 
 
-def _add_light(unroller: _Unroller, view: _View, light: Floats, lit: Floats, rows: int, columns: int) -> None:
+def _add_light(unroller: Unroller, view: View, light: Floats, lit: Floats, rows: int, columns: int) -> None:
     """Adds a view's brightness, and one for each cell that it sees, to the map's sums."""
     place, key = _cells_of(unroller, view.row, view.sound, rows, columns)
     count = np.bincount(key, minlength=rows * columns)
@@ -518,7 +419,7 @@ def _add_light(unroller: _Unroller, view: _View, light: Floats, lit: Floats, row
     lit[seen] += 1
 
 
-def _in_view(unroller: _Unroller, one: _View, two: _View, rows: int, columns: int) -> NDArray[np.int64]:
+def _in_view(unroller: Unroller, one: View, two: View, rows: int, columns: int) -> NDArray[np.int64]:
     """One for each cell of the map that both keyframes see."""
     first, end = max(one.row, two.row), min(one.row + len(one.picture), two.row + len(two.picture))
     if end <= first:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.dense import DenseWall
+from pipefish.dense_findings import FORMAT, VERSION, findings_of, findings_table
 from pipefish.files import write_atomically
 from pipefish.measured_files import plain
 from pipefish.measured_texts import clock_text
 from pipefish.wall import Piece
 from pipefish.wallmodel import Floats, WallModel
 
-FORMAT, VERSION = "pipefish-dense", 1
 MAP_WIDTH = 3000  # pixels at most; cells are drawn up to 3 x 3
 
 
@@ -52,7 +52,7 @@ def _table(first: str, along: Floats, clock: Floats, values: Floats) -> bytes:
 
 def map_picture(found: DenseWall, chainage: Floats, unit: str) -> NDArray[np.uint8]:
     """(H,W,3): the deviation in colours above, the unrolled pipe below, chainage to the right, clock downwards from
-    twelve o'clock; regions framed, steps marked."""
+    twelve o'clock; regions framed, steps marked, cracks drawn over."""
     from PIL import Image, ImageDraw, ImageFont
 
     rows, columns = found.deviation.shape
@@ -84,6 +84,8 @@ def map_picture(found: DenseWall, chainage: Floats, unit: str) -> NDArray[np.uin
             draw.text((x, y0 + height + 6), f"{s:g}", "black", font, anchor="ma")
         for r in found.regions:
             _frame(draw, found, r, zoom, left, y0)
+        for r in found.cracks:
+            _trace(draw, found, r, zoom, left, y0)
         for r in found.steps:
             x = left + zoom * rows * r["s"] / found.wall.length
             for y in (y0 - 4, y0 + height - 8):
@@ -117,6 +119,19 @@ def _frame(draw: Any, found: DenseWall, region: dict[str, float], zoom: int, lef
     draw.rectangle([(x[0] - 3, max(y[0], top) - 3), (x[1] + 3, min(y[1], top + height) + 3)], outline=(220, 30, 140))
 
 
+def _trace(draw: Any, found: DenseWall, crack: dict[str, Any], zoom: int, left: int, top: int) -> None:
+    """A crack's path, once on either side of where the picture is cut."""
+    rows, columns = found.deviation.shape
+    path = np.array(crack["path"])
+    x = left + zoom * rows * path[:, 0] / found.wall.length
+    turns = path[:, 1] / (2 * math.pi)
+    for k in range(math.floor(turns.min()), math.floor(turns.max()) + 1):
+        inside = (turns >= k) & (turns <= k + 1)
+        points = list(zip(x[inside], top + zoom * columns * (turns[inside] - k), strict=True))
+        if len(points) > 1:
+            draw.line(points, fill=(220, 30, 140), width=1)
+
+
 def cloud(found: DenseWall, unit: str) -> bytes:
     """The measured cells as a PLY file: place, deviation and sigma, grey level, colour by deviation."""
     good = np.isfinite(found.deviation)
@@ -143,8 +158,10 @@ def radius_sigmas(summary: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: dict[str, Any]) -> dict[str, Any]:
-    """The document of dense.json; summary: that of reconstruction.json."""
+def document_of(
+    maps: list[DenseWall], strips: list[Strip], unit: str, summary: dict[str, Any], reconstruction: str = ""
+) -> dict[str, Any]:
+    """The document of dense.json; summary: that of reconstruction.json; reconstruction: its fingerprint."""
     regions = []
     for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
         for r in found.regions:
@@ -162,12 +179,19 @@ def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: 
             place = {"piece": n, "chainage": strip.origin + strip.sign * r["s"]}
             found_there = {"clock": clock, "widening": strip.sign * r["widening"], "clock_text": clock_text(clock)}
             steps.append(place | r | found_there)
+    cracks = []
+    for n, (found, strip) in enumerate(zip(maps, strips, strict=True)):
+        for r in found.cracks:
+            path = [[strip.origin + strip.sign * s, clock] for s, clock in r["path"]]
+            place = {"piece": n, "chainage": strip.origin + strip.sign * r["s"]}
+            cracks.append(place | r | {"path": path, "clock_text": clock_text(r["clock"])})
     values = np.concatenate([f.deviation[np.isfinite(f.deviation)] for f in maps])
     sigmas = np.concatenate([f.sigma[np.isfinite(f.deviation)] for f in maps])
     return plain(
         {
             "format": FORMAT,
             "version": VERSION,
+            "reconstruction": reconstruction,
             "unit": unit,
             "cells": sum(f.deviation.size for f in maps),
             "measured": len(values),
@@ -179,15 +203,21 @@ def document_of(maps: list[DenseWall], strips: list[Strip], unit: str, summary: 
             **radius_sigmas(summary),
             "regions": regions,
             "steps": steps,
+            "cracks": sorted(cracks, key=lambda c: -c["length"]),
         }
     )
 
 
 def write_dense(
-    folder: Path, maps: list[DenseWall], strips: list[Strip], unit: str, summary: dict[str, Any]
+    folder: Path,
+    maps: list[DenseWall],
+    strips: list[Strip],
+    unit: str,
+    summary: dict[str, Any],
+    reconstruction: str = "",
 ) -> tuple[dict[str, Any], list[str]]:
-    """Writes dense.json, and of each piece dense.npz, deviation.csv, sigma.csv, dense.png, dense.ply (from the second
-    piece on with its number). Returns the document and the paths. Raises OSError."""
+    """Writes dense.json, findings.csv, and of each piece dense.npz, deviation.csv, sigma.csv, dense.png, dense.ply
+    (from the second piece on with its number). Returns the document and the paths. Raises OSError."""
     from PIL import Image
 
     factor, length = (1000.0, "mm") if unit == "metre" else (1.0, "diameters")
@@ -213,7 +243,8 @@ def write_dense(
         contents[f"sigma{end}.csv"] = _table(corner, chainage, found.clock, factor * found.sigma)
         contents[f"dense{end}.png"] = picture.getvalue()
         contents[f"dense{end}.ply"] = cloud(found, unit)
-    document = document_of(maps, strips, unit, summary)
+    document = document_of(maps, strips, unit, summary, reconstruction)
+    contents["findings.csv"] = findings_table(findings_of(document))
     document["files"] = [*contents, "dense.json"]
     contents["dense.json"] = json.dumps(document).encode()  # last: what is there is whole
     folder.mkdir(parents=True, exist_ok=True)

@@ -153,7 +153,7 @@ def _given_seeds(seeds: Any) -> Seeds:
     return Seeds(xy1, xy2, affine)
 
 
-def _geometry(cameras: Any, relative_pose: Any) -> tuple[Any, Any, Floats | None]:
+def epipolar_geometry(cameras: Any, relative_pose: Any) -> tuple[Any, Any, Floats | None]:
     """The two profiles of the C core and cam2_from_cam1, or three None."""
     if cameras is None and relative_pose is None:
         return None, None, None
@@ -230,7 +230,7 @@ def match_quasi_dense(
     if threads < 1:
         raise ArgumentError(f"threads: {threads} is not at least 1")
     options.threads = threads
-    profiles = _geometry(cameras, relative_pose)
+    profiles = epipolar_geometry(cameras, relative_pose)
     if turn == "epipolar" and profiles[2] is None:
         raise ArgumentError("turn: 'epipolar' needs cameras and relative_pose")
     for k, camera in enumerate(profiles[:2]):

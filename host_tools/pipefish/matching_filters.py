@@ -1,5 +1,6 @@
 """What may be taken away from quasi-dense matches afterwards: matches that contradict their neighbours, small islands,
-those that the reverse direction does not confirm, and those off one plane or one rigid motion.
+those that the reverse direction does not confirm, those off one plane or one rigid motion, and those that could as well
+be elsewhere on their epipolar line.
 
 The plane and the motion are found from the matches themselves: cells of 8 x 8 pixels, each with an affine map fitted
 robustly, count once each (after Lhuillier and Quan 2005), so that dense clutter does not outvote the rest."""
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipefish import _engine
 from pipefish.errors import ArgumentError
-from pipefish.matching import Matches, Seeds, match_quasi_dense
+from pipefish.matching import RADIUS, Matches, Seeds, epipolar_geometry, grey, match_quasi_dense
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,6 +26,7 @@ NEIGHBOURS = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (1, -1))  # rows, columns;
 TRIALS, JUDGED = 300, 800
 ISLAND = 2000
 PX = {"plane": 2.0, "motion": 1.0}
+RIVAL = 0.98  # of a match's correlation
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +254,7 @@ def filter_matches(
     back: Matches | None = None,
     geometry: str | None = None,
     px: float | None = None,
+    rivals: Any = None,
 ) -> Matches:
     """The matches that stand up to what is asked.
 
@@ -260,8 +264,14 @@ def filter_matches(
     back       matches of the same images the other way round: what they do not confirm is left out
     geometry   "plane" or "motion": what is off the dominant one by more than `px` [2, 1] pixels is left out (all of it
                where there is none); parts of the scene that move or lie otherwise are lost too
+    rivals     (K,) of match_rivals: matches with 0.98 or more are left out
 
     Raises ArgumentError."""
+    if rivals is not None:
+        found = np.asarray(rivals, float)
+        if found.shape != (len(m),):
+            raise ArgumentError(f"rivals: shape {found.shape} is not ({len(m)},)")
+        m = select(m, ~(found >= RIVAL))
     if least is None:
         least = max(30, min(np.prod(m.shape1), np.prod(m.shape2)) // ISLAND)
     if least < 0:
@@ -272,8 +282,8 @@ def filter_matches(
         m = select(m, confirmed(m, back))
     if geometry is not None:
         bound = PX.get(geometry, 1.0) if px is None else px
-        found = dominant_geometry(m, geometry, bound)
-        m = select(m, np.zeros(len(m), bool) if found is None else found.error < bound)
+        agreed = dominant_geometry(m, geometry, bound)
+        m = select(m, np.zeros(len(m), bool) if agreed is None else agreed.error < bound)
     status = m.status if len(m) or m.status != "ok" else "nothing left"
     return replace(m, status=status)
 
@@ -281,3 +291,40 @@ def filter_matches(
 def match_back(image1: Any, image2: Any, m: Matches, **options: Any) -> Matches:
     """The same images matched the other way round, from the same seeds; options as match_quasi_dense takes them."""
     return match_quasi_dense(image2, image1, swapped(m.seeds), **options)
+
+
+def match_rivals(
+    image1: Any,
+    image2: Any,
+    m: Matches,
+    cameras: Any = None,
+    relative_pose: Any = None,
+    *,
+    radius: int = RADIUS["adaptive"],
+    threads: int = 1,
+) -> Floats:
+    """(K,): the best correlation of each match's surroundings 3 to 20 pixels (of the coarser image) away along its
+    epipolar line or, with cameras, curve, over its own; 0 where nothing there can be compared. Near 1 the match could
+    as well be there: repeated texture, or texture that runs along the line.
+
+    cameras, relative_pose   as match_quasi_dense takes them; without, the motion that most of the matches agree with
+                             (pinhole pictures: dominant_geometry)
+    radius                   of the correlation window, 2 to 7
+
+    Raises ArgumentError, also where no motion is given and none is found."""
+    one, two = grey(image1, "image1"), grey(image2, "image2")
+    if (m.shape1, m.shape2) != (one.shape, two.shape):
+        raise ArgumentError("m: not of images of this size")
+    if not 2 <= radius <= 7:
+        raise ArgumentError(f"radius: {radius} is not within 2 to 7")
+    if threads < 1:
+        raise ArgumentError(f"threads: {threads} is not at least 1")
+    profiles = epipolar_geometry(cameras, relative_pose)
+    fundamental = None
+    if profiles[2] is None:
+        agreed = dominant_geometry(m, "motion", PX["motion"])
+        if agreed is None:
+            raise ArgumentError("relative_pose: none is given, and no one motion fits the matches")
+        fundamental = np.ascontiguousarray(agreed.matrix)
+    arrays = (np.ascontiguousarray(v, float) for v in (m.xy1, m.xy2, m.affine, m.zncc))
+    return _engine.match_rivals(one, two, *arrays, radius, threads, *profiles, fundamental)

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from pipefish.dense_findings import finding_parts
 from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
 from pipefish.measured_texts import LIMITS, Z95, clock_text, column, length_text, scale_texts, size_parts, verdict
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
+from pipefish.report_dense import DensePart, dense_part
 from pipefish.report_wall import WallPicture, wall_picture
 from pipefish.unroll import Tell
 
@@ -21,9 +23,10 @@ from pipefish.unroll import Tell
 class Report(Charts):
     """Collects the parts of the page. Use `write_report`."""
 
-    def __init__(self, folder: Path, limits: list[tuple[str, float]], picture: WallPicture) -> None:
+    def __init__(self, folder: Path, limits: list[tuple[str, float]], picture: WallPicture, dense: DensePart) -> None:
         super().__init__(folder)
         self.picture = picture
+        self.dense = dense
         self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
 
     # ---- texts
@@ -116,19 +119,22 @@ class Report(Charts):
         return rows
 
     def events_html(self) -> str:
-        """The table of findings."""
+        """The table of findings, those of the dense map among them."""
         rows = []
-        for e in self.document["events"]:
+        events = [(e, False) for e in self.document["events"]] + [(e, True) for e in self.dense.findings]
+        # What has no place stands last.
+        events.sort(key=lambda e: (e[0]["chainage"] is None, e[0]["chainage"] or 0.0))
+        for e, by_map in events:
             at = length_text(e["chainage"], self.unit, metres=True) if e["chainage"] is not None else "unknown"
             if e.get("s_sigma") is not None:
                 at = at.replace(" ", f" ± {Z95 * e['s_sigma']:.2f} ", 1)
             clock = clock_text(e["clock"]) if e.get("clock") is not None else ""
-            size = "; ".join(size_parts(e, self.unit))
-            cells = (e["kind"].replace("_", " "), at, clock, size)
+            size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
+            cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
             rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
         if not rows:
             return "<p class='muted'>Nothing departs from a smooth pipe, and all of it was measured.</p>"
-        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %"))
+        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
         table = f"<table class='list'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         return f"<div class='wide'>{table}</div>"
 
@@ -214,6 +220,7 @@ class Report(Charts):
             "profile": chart_html(diameter) + chart_html(ovality),
             "events": self.events_html(),
             "wall": self.picture.html,
+            "dense": self.dense.html,
             "tube": chart_html(tube),
             "line": "".join(map(chart_html, line)),
             "quality": "".join(map(chart_html, quality)),
@@ -242,14 +249,17 @@ def write_report(
     limits: list[tuple[str, float]] | None = None,
     title: str | None = None,
     survey: Path | None = None,
+    dense: Path | None = None,
     tell: Tell | None = None,
 ) -> list[dict[str, Any]]:
     """Writes the page about a folder of `pipefish reconstruct`; returns the verdicts on the limits (name of LIMITS,
     bound in per cent or millimetres). survey: the file with the pictures [where it was when it was measured]; where it
-    is not, the page says so. Raises PipefishError, OSError."""
+    is not, the page says so. dense: folder of `pipefish dense` [`folder`/dense, where there is one]. Raises
+    PipefishError, OSError."""
     for name, _ in limits or []:
         if name not in LIMITS:
             raise PipefishError(f"limit {name}: not one of {', '.join(LIMITS)}")
-    report = Report(folder, limits or [], wall_picture(folder, survey, tell))
+    by_map = dense_part(folder, dense)
+    report = Report(folder, limits or [], wall_picture(folder, survey, tell, by_map.findings), by_map)
     write_atomically(out, report.render(title).encode())
     return report.verdicts

@@ -6,7 +6,7 @@ import html
 import io
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,11 @@ class WallPicture:
     data: dict[str, Any] | None
 
 
-def wall_picture(folder: Path, survey: Path | None, tell: Tell | None) -> WallPicture:
-    """The wall of a folder of `pipefish reconstruct`. Raises FormatError for one that is broken, and PipefishError for
+def wall_picture(
+    folder: Path, survey: Path | None, tell: Tell | None, findings: Sequence[dict[str, Any]] = ()
+) -> WallPicture:
+    """The wall of a folder of `pipefish reconstruct`, with `findings` (as dense_findings tells them) marked besides the
+    tube's own. Raises FormatError for one that is broken, and PipefishError for
     a `survey` that is named but not there; a survey that is merely not where it was, the section tells."""
     try:
         wall = read_wall(folder, survey)
@@ -67,7 +70,7 @@ def wall_picture(folder: Path, survey: Path | None, tell: Tell | None) -> WallPi
     data = {"start": unroller.start, "cell": unroller.cell, "columns": unroller.columns, "rows": unroller.rows}
     data |= {"cut": unroller.cut, "signs": unroller.signs, "unit": "m" if wall.unit == "metre" else "diameters"}
     data |= {"runs": runs, "frames": frames}
-    return WallPicture(_section(unroller, images), data)
+    return WallPicture(_section(unroller, images, findings), data)
 
 
 def _runs(view: np.ndarray) -> Iterable[tuple[int, Any]]:
@@ -91,25 +94,42 @@ def _keyframes(wall: Wall, views: np.ndarray) -> tuple[dict[int, int], list[dict
     return dict(zip(views.tolist(), nearest.tolist(), strict=True)), frames
 
 
-def _marks(unroller: Unroller) -> Iterable[str]:
-    """Findings, where they are on the picture: a circle, or a line for what goes around the pipe."""
-    for event in unroller.wall.document["events"]:
+def _marks(unroller: Unroller, findings: Sequence[dict[str, Any]]) -> Iterable[str]:
+    """Findings, where they are on the picture: a circle, a line for what goes around the pipe, a crack's path."""
+    for event in [*unroller.wall.document["events"], *findings]:
         if event["kind"] in ("not_measured", "bend") or event["chainage"] is None:
             continue
         x = 100 * (event["chainage"] - unroller.start) / (unroller.columns * unroller.cell)
         if not 0 <= x <= 100:
             continue
         word = html.escape(event["kind"])
-        if event["kind"] == "joint" or event.get("clock") is None:
+        if event["kind"] in ("joint", "step") or event.get("clock") is None:
             yield f"<span class='wall-mark ring' style='left:{x:.3f}%'><b>{word}</b></span>"
             continue
         signs = [s["clock_sign"] for s in unroller.signs if s["stretch"] == event.get("stretch")]
-        y = 100 * ((unroller.cut - event["clock"]) * (signs or [1])[0] / (2 * math.pi) % 1)
+        sign = (signs or [unroller.signs[0]["clock_sign"]])[0]
+        y = 100 * ((unroller.cut - event["clock"]) * sign / (2 * math.pi) % 1)
         place = f"left:{x:.3f}%;top:{y:.2f}%"
-        yield f"<span class='wall-mark' style='{place}'><b>{word} {clock_text(event['clock'])}</b></span>"
+        bare = " bare" if event["kind"] == "crack" else ""
+        yield f"<span class='wall-mark{bare}' style='{place}'><b>{word} {clock_text(event['clock'])}</b></span>"
+    paths = "".join(_path(unroller, e) for e in findings if e["kind"] == "crack")
+    if paths:
+        box = "viewBox='0 0 100 100' preserveAspectRatio='none' aria-hidden='true'"
+        yield f"<svg class='wall-paths' {box}>{paths}</svg>"
 
 
-def _section(unroller: Unroller, images: list[str]) -> str:
+def _path(unroller: Unroller, crack: dict[str, Any]) -> str:
+    """A crack's path in hundredths of the picture, begun anew where it crosses the cut."""
+    chainage, clock = np.array(crack["path"], float).T
+    x = 100 * (chainage - unroller.start) / (unroller.columns * unroller.cell)
+    y = (unroller.cut - clock) * unroller.signs[0]["clock_sign"] / (2 * math.pi) % 1
+    way = "".join(
+        f"{'M' if k == 0 or abs(y[k] - y[k - 1]) > 0.5 else 'L'}{x[k]:.3f} {100 * y[k]:.2f}" for k in range(len(x))
+    )
+    return f"<path d='{way}'/>"
+
+
+def _section(unroller: Unroller, images: list[str], findings: Sequence[dict[str, Any]]) -> str:
     wall = unroller.wall
     scale = f"{1000 * unroller.cell:g} mm" if wall.unit == "metre" else f"{unroller.cell:g} diameters"
     sign = unroller.signs[0]["clock_sign"]
@@ -123,7 +143,8 @@ def _section(unroller: Unroller, images: list[str]) -> str:
     return (
         f"<p class='note'>{html.escape(text)}</p>"
         "<div class='wall-scroll'><div class='wall-strip' id='wall-strip' tabindex='0' role='img' "
-        f"aria-label='Unrolled wall; arrow keys move along the pipe'>{''.join(images)}{''.join(_marks(unroller))}"
+        f"aria-label='Unrolled wall; arrow keys move along the pipe'>{''.join(images)}"
+        f"{''.join(_marks(unroller, findings))}"
         "<span id='wall-cursor'></span></div></div>"
         f"<div class='wall-under' style='{shape}'><img id='wall-view' src='data:,' alt='Keyframe beside this place'>"
         "<output id='wall-text'></output></div>"

@@ -14,23 +14,91 @@ from PIL import Image
 
 from browser import ask_page
 from pipefish.cli import main
+from pipefish.dense import DenseWall
+from pipefish.dense_files import strips_of, write_dense
+from pipefish.dense_findings import fingerprint
+from pipefish.wall import read_wall
 from rendered_survey import MARKS
 from test_page import Outline, data_of
 
 
 @pytest.fixture(scope="module")
 def page(measured, tmp_path_factory) -> Path:
-    """The report."""
-    out = tmp_path_factory.mktemp("report") / "report.html"
-    assert main(["report", str(measured / "out"), "-o", str(out), "--limit", "ovality=5", "--json"]) == 0
+    """The report, with a dense map beside the measured wall."""
+    folder = shutil.copytree(measured / "out", tmp_path_factory.mktemp("report") / "out")
+    with_map(folder)
+    out = folder.parent / "report.html"
+    assert main(["report", str(folder), "-o", str(out), "--limit", "ovality=5", "--json"]) == 0
     return out
+
+
+CRACK = {
+    **{"s": 0.3, "clock": 6.2, "sigma": 0.0002, "length": 0.2, "length_sigma": 0.003, "width": 0.001},
+    **{"width_sigma": 0.0001, "extent_s": 0.2, "extent_clock": 0.3, "direction": "along", "views": 3.0},
+    **{"offset": 0.002, "offset_sigma": 0.0003, "path": [[0.2, 6.05], [0.3, 6.2], [0.4, 6.35]]},
+}
+DEPOSIT = {"s": 0.5, "clock": 3.1, "length": 0.04, "extent": 0.3, "height": -0.004, "sigma": 0.0005}
+STEP = {"s": 0.6, "step": 0.003, "clock": 1.57, "widening": -0.001, "sigma": 0.0002}
+
+
+def with_map(folder: Path) -> None:
+    """Writes folder/dense: a flat map of the first piece on which a crack, a deposit and a step were found."""
+    wall = read_wall(folder)
+    strip = strips_of(wall.pieces)[0]
+    flat = np.zeros((150, 200))
+    found = DenseWall(
+        wall=strip.wall,
+        s=(np.arange(150) + 0.5) * strip.wall.length / 150,
+        clock=(np.arange(200) + 0.5) * np.pi / 100,
+        deviation=flat,
+        sigma=flat + 0.0003,
+        pairs=np.full(flat.shape, 2),
+        looks=np.full(flat.shape, 2),
+        brightness=flat + 0.5,
+        scatter=1.0,
+        pairs_used=9,
+        regions=[DEPOSIT | {"area": 0.001, "volume": -2e-6}],
+        steps=[STEP],
+        cracks=[CRACK],
+    )
+    write_dense(folder / "dense", [found], [strip], wall.unit, wall.document["summary"], fingerprint(folder))
+
+
+def test_what_the_dense_map_found_is_told_and_shown(page):
+    text = page.read_text()
+    cells = re.findall(r"<tr><td>(\w+)</td><td>([\d.]+) m</td><td>(\d+:\d\d)</td><td>([^<]*)</td><td>dense", text)
+    kinds = {kind: (float(at), clock, size) for kind, at, clock, size in cells}
+    assert set(kinds) == {"crack", "deposit", "step"}
+    assert kinds["deposit"][1] == "5:55" and "height 4.0 ± 1.0 mm" in kinds["deposit"][2]
+    assert "step 3.0 ± 0.4 mm" in kinds["step"][2] and "radius narrower by 1.0 mm" in kinds["step"][2]
+    assert "length 200.0 ± 5.9 mm" in kinds["crack"][2] and "edges offset by 2.0 ± 0.6 mm" in kinds["crack"][2]
+    assert kinds["step"][0] - kinds["crack"][0] == pytest.approx(0.3, abs=0.011)
+    (path,) = re.findall(r"<path d='(.*?)'/>", text)
+    assert path.count("M") == 2, "it crosses twelve o'clock, where the picture is cut"
+    (shown,) = [i for i in Outline(text).images if (i["alt"] or "").startswith("Deviation")]
+    assert Image.open(io.BytesIO(base64.b64decode(shown["src"].split(",")[1]))).width == int(shown["width"])
+
+
+def test_a_map_of_another_reconstruction_is_left_out_or_refused(page, tmp_path, capsys):
+    folder = shutil.copytree(page.parent / "out", tmp_path / "out")
+    text = (folder / "reconstruction.json").read_text().replace("survey.mcap", "gone.mcap")
+    (folder / "reconstruction.json").write_text(text)
+    out = tmp_path / "r.html"
+    assert main(["report", str(folder), "-o", str(out)]) == 0
+    assert "is a map of another reconstruction" in out.read_text() and "<td>dense map" not in out.read_text()
+    capsys.readouterr()
+    assert main(["report", str(folder), "-o", str(out), "--dense", str(folder / "dense")]) == 1
+    assert "another reconstruction" in capsys.readouterr().err
+    (folder / "dense/dense.json").write_text("{}")
+    assert main(["report", str(folder), "-o", str(out)]) == 1
+    assert "dense.json: format: not 'pipefish-dense'" in capsys.readouterr().err
 
 
 def test_the_page_holds_the_wall_and_the_keyframes_that_show_it(page):
     text = page.read_text()
     outline, wall = Outline(text), data_of(text)["wall"]
     assert not outline.open and all(a.startswith("data:") for a in outline.addresses)
-    parts = [i for i in outline.images if i["src"].startswith("data:image/webp")]
+    parts = [i for i in outline.images if i["src"].startswith("data:image/webp") and not i["alt"]]
     pictures = [Image.open(io.BytesIO(base64.b64decode(p["src"].split(",")[1]))) for p in parts]
     assert [p.size for p in pictures] == [(int(p["width"]), int(p["height"])) for p in parts]
     assert sum(p.width for p in pictures) == wall["columns"] and pictures[0].height == wall["rows"]

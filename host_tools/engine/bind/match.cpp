@@ -1,5 +1,7 @@
 // Quasi-dense matching for Python: _engine.find_seeds, _engine.grow_matches. pipefish/matching.py is what people use.
 #include "bind/arrays.hpp"
+#include "bind/matches.hpp"
+#include "match/rivals.hpp"
 #include "match/seeds.hpp"
 #include "pipefish/profile.h"
 
@@ -20,9 +22,8 @@ namespace
 {
 
 using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Rows2 = nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-using Maps = nb::ndarray<const double, nb::shape<-1, 2, 2>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using Square = nb::ndarray<const double, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 
 // Borrows the array: cv::Mat is not const-correct, ScaleStack does not write level 0.
 Image view(const Picture &image)
@@ -76,6 +77,38 @@ nb::dict to_python(const Growth &g)
     return out;
 }
 
+std::optional<Epipolar> geometry_of(const pf_profile *camera_1, const pf_profile *camera_2,
+                                    const std::optional<Pose> &pose)
+{
+    using Rows = Eigen::Matrix<double, 3, 4, Eigen::RowMajor>;
+    if (!camera_1 || !camera_2 || !pose)
+        return std::nullopt;
+    return Epipolar(camera_1->camera, camera_2->camera, Eigen::Map<const Rows>(pose->data()));
+}
+
+// By the cameras where they are given, by the fundamental matrix else.
+Array<double> match_rivals(const Picture &first, const Picture &second, const std::vector<Match> &matches,
+                           const Reach &reach, const std::optional<Epipolar> &epipolar,
+                           const std::optional<Square> &fundamental)
+{
+    LineAt line_at;
+    if (epipolar) {
+        line_at = [&](const Eigen::Vector2d &x, const Eigen::Vector2d &x_2) { return epipolar->at(x, x_2); };
+    } else {
+        const Eigen::Matrix3d f =
+            Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(fundamental.value().data());
+        line_at = [f](const Eigen::Vector2d &x, const Eigen::Vector2d &x_2) { return line_of(f, x, x_2); };
+    }
+    std::vector<double> found;
+    {
+        const nb::gil_scoped_release release;
+        const ScaleStack one(view(first)), two(view(second));
+        found = rivals(one, two, matches, line_at, reach);
+    }
+    const size_t n = found.size();
+    return to_numpy(std::move(found), {n});
+}
+
 Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at, const Rows2 &centre, const Maps &maps,
                     const Options &options, const pf_profile *camera_1, const pf_profile *camera_2,
                     const std::optional<Pose> &pose)
@@ -85,11 +118,7 @@ Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at
         seeds[k] = {{at(k, 0), at(k, 1)}, {centre(k, 0), centre(k, 1)}, {}};
         seeds[k].a << maps(k, 0, 0), maps(k, 0, 1), maps(k, 1, 0), maps(k, 1, 1);
     }
-    std::optional<Epipolar> epipolar;
-    if (camera_1 && camera_2 && pose) {
-        using Rows = Eigen::Matrix<double, 3, 4, Eigen::RowMajor>;
-        epipolar.emplace(camera_1->camera, camera_2->camera, Eigen::Map<const Rows>(pose->data()));
-    }
+    const std::optional<Epipolar> epipolar = geometry_of(camera_1, camera_2, pose);
     const nb::gil_scoped_release release;
     const ScaleStack one(view(first)), two(view(second));
     return grow(one, two, seeds, options, epipolar ? &*epipolar : nullptr);
@@ -159,6 +188,22 @@ void bind_match(nb::module_ &m)
         nb::arg("threads"), "Two (H,W) float32 of 0..1 -> (S,8): x1, y1, x2, y2, the map row by row.");
     m.def("sample_image", &sample_image, nb::arg("image"), nb::arg("xy"),
           "(H,W) float32, (N,2) pixels -> (N,) float32 by cubic splines, NaN within two pixels of the rim.");
+    m.def(
+        "match_rivals",
+        [](const Picture &first, const Picture &second, const Rows2 &xy1, const Rows2 &xy2, const Maps &affine,
+           const Values &zncc, int radius, int threads, const pf_profile *camera_1, const pf_profile *camera_2,
+           const std::optional<Pose> &pose, const std::optional<Square> &fundamental) {
+            Reach reach;
+            reach.radius = radius;
+            reach.threads = threads;
+            return match_rivals(first, second, matches_of(xy1, xy2, affine, zncc), reach,
+                                geometry_of(camera_1, camera_2, pose), fundamental);
+        },
+        nb::arg("image1"), nb::arg("image2"), nb::arg("xy1"), nb::arg("xy2"), nb::arg("affine"), nb::arg("zncc"),
+        nb::arg("radius"), nb::arg("threads"), nb::arg("camera1").none(), nb::arg("camera2").none(),
+        nb::arg("relative_pose").none(), nb::arg("fundamental").none(),
+        "Two (H,W) float32 of 0..1, matches -> (K,): the best correlation elsewhere on the epipolar curve, over "
+        "theirs.");
     m.def(
         "grow_matches",
         [](const Picture &first, const Picture &second, const Rows2 &at, const Rows2 &centre, const Maps &maps,

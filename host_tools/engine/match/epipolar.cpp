@@ -26,6 +26,12 @@ Eigen::Matrix2f EpipolarLine::corrected(const Eigen::Matrix2f &a) const
     return (before - n_2 * off / there).cast<float>();
 }
 
+EpipolarLine line_of(const Eigen::Matrix3d &f, const Eigen::Vector2d &x, const Eigen::Vector2d &x_2)
+{
+    const Eigen::Vector3d line_2 = f * x.homogeneous(), line = f.transpose() * x_2.homogeneous();
+    return {x_2.homogeneous().dot(line_2), line.head<2>(), line_2.head<2>()};
+}
+
 Epipolar::Epipolar(const pf_camera &first, const pf_camera &second, const Eigen::Matrix<double, 3, 4> &cam2_from_cam1)
     : first_(first), second_(second)
 {

@@ -24,6 +24,9 @@ struct EpipolarLine {
     Eigen::Matrix2f corrected(const Eigen::Matrix2f &a) const;
 };
 
+// The same of a fundamental matrix: x_2^T f x = 0.
+EpipolarLine line_of(const Eigen::Matrix3d &f, const Eigen::Vector2d &x, const Eigen::Vector2d &x_2);
+
 class Epipolar
 {
 public:
