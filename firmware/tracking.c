@@ -57,20 +57,26 @@ static void forget_motion(pf_tracking *p)
         pf_predictor_assume(&p->predictor, (int32_t)lround(c->encoder.metres_per_count / radius * 1073741824.0 / 8));
 }
 
-/* The camera in integers and its table of rays. */
+/* The camera in integers and its table of rays. Where the diameter is known, it sees the wall from its centre: a pupil
+ * that moves by 3 mm would make all bearings move as on a wall that is none. */
 static bool open_camera(pf_tracking *p, char *error, size_t n)
 {
     const pf_daemon *d = p->daemon;
+    const double radius = d->config.survey.nominal_diameter_mm / 2e3;
     if (!d->has_profile)
         return true;
-    size_t size = pf_camera_fixed_workspace_size(&d->profile.camera);
+    pf_camera camera = d->profile.camera;
+    if (radius > 0 && pf_camera_in_tube(&d->profile.camera, radius, &camera) != PF_OK)
+        pf_log(PF_LOG_WARNING,
+               "tracking: the moving pupil of the profile's lens is too much for a pipe of %g mm: left out",
+               d->config.survey.nominal_diameter_mm);
+    size_t size = pf_camera_fixed_workspace_size(&camera);
     if (size == 0) {
         (void)snprintf(error, n, "the profile's lens is beyond the range of fixed point");
         return false;
     }
     p->camera_workspace = aligned_alloc(16, (size + 15) / 16 * 16);
-    if (p->camera_workspace != NULL &&
-        pf_camera_fixed_init(&p->camera, &d->profile.camera, p->camera_workspace, size) == PF_OK) {
+    if (p->camera_workspace != NULL && pf_camera_fixed_init(&p->camera, &camera, p->camera_workspace, size) == PF_OK) {
         uint32_t step = pf_camera_rays_step(p->camera);
         size = pf_camera_rays_workspace_size(p->camera, step);
         p->bearing_workspace = aligned_alloc(16, (size + 15) / 16 * 16);

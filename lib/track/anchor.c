@@ -26,8 +26,11 @@
 #define SEARCH_STEP  (2 << 16)
 #define EXCESS_MOST  (16 << 8)
 #define COV_MOST     ((int64_t)1 << 40)
-#define LEAST_VAR    512  /* of a template: less is nothing */
-#define RELIEF_LEAST 4096 /* of a companion's square: so the ratios below stay below 2^26 */
+#define LEAST_VAR    512 /* of a template: less is nothing */
+#define TURNED_LEAST 8
+/* For the normal matrix, which is made once for all that comes: steps are then neither much too long nor too short. */
+#define TURNED_HALF  128
+#define RELIEF_LEAST 8192 /* of a companion's square: so the ratios below stay below 2^26 */
 
 static int32_t magnitude(int32_t v)
 {
@@ -113,11 +116,15 @@ typedef struct pf_relief {
 } pf_relief;
 
 /* Takes the template (`st` its product with the companion, `var` and `jt` its sums, off the plane) out of it. What
- * holds it back, a quarter of its square, is that as a rule there is little of it. */
-static void pare_relief(const pf_anchor *anchor, int64_t st, int64_t var, const int64_t jt[6], pf_relief *out)
+ * holds it back is half its square over that of how far the light has turned: until it has, nothing comes up, and a fit
+ * with the companion in it would only be the less certain. */
+static void pare_relief(const pf_anchor *anchor, int32_t turned_q8, int64_t st, int64_t var, const int64_t jt[6],
+                        pf_relief *out)
 {
+    const int64_t turned = turned_q8 > TURNED_LEAST ? turned_q8 : TURNED_LEAST;
     out->ratio_q16 = st * 65536 / (var > LEAST_VAR ? var : LEAST_VAR);
-    out->square = anchor->relief_square - ((st * out->ratio_q16) >> 16) + anchor->relief_square / 4 + RELIEF_LEAST;
+    out->square = anchor->relief_square - ((st * out->ratio_q16) >> 16) +
+                  (int64_t)anchor->relief_square * 32768 / (turned * turned) + RELIEF_LEAST;
     for (int32_t i = 0; i < 6; i++)
         out->j[i] = anchor->relief_j[i] - ((jt[i] * out->ratio_q16) >> 16);
 }
@@ -134,7 +141,7 @@ static void without_relief(const pf_klt *klt, const pf_anchor *anchor, const int
 {
     pf_relief relief;
     const int64_t st = PF_KERNEL(relief)(image, klt->t, klt->window, klt->groups) - relief_part(klt, anchor, s->t);
-    pare_relief(anchor, st, var, s->jt, &relief);
+    pare_relief(anchor, TURNED_HALF, st, var, s->jt, &relief);
     for (int32_t a = 0; a < 6; a++)
         for (int32_t b = a; b < 6; b++) {
             s->h[a][b] -= (relief.j[a] * (relief.j[b] * 256 / relief.square)) >> 8;
@@ -270,7 +277,8 @@ static void take_reference(pf_klt *klt, const pf_anchor *anchor, const uint8_t *
         return;
     out->relief.image = (const int8_t *)(pixels + pf_relief_at((uint32_t)klt->window));
     const int64_t st = PF_KERNEL(relief)(out->relief.image, klt->t, klt->window, klt->groups);
-    pare_relief(anchor, st - relief_part(klt, anchor, s.c), out->var, out->b, &out->relief);
+    pare_relief(anchor, out->has_warp ? bow.turned_q8 : 0, st - relief_part(klt, anchor, s.c), out->var, out->b,
+                &out->relief);
 }
 
 static void right_hand_side(pf_klt *klt, const pf_anchor *anchor, const pf_reference *t, pf_rhs *out)

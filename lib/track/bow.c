@@ -8,16 +8,19 @@
 #define UNIT  ((int64_t)1 << 30)
 #define LEAP  ((int64_t)16 << 24) /* of the cotangent */
 #define LEAN  (1 << 14)           /* Q16: a warp that shrinks an area to a quarter has no inverse of use */
-#define FAR   8                   /* half windows: a place of the patch is never farther from its middle */
+#define BLUNT ((int64_t)1 << 21)  /* of the cotangent: an eighth, nearer to square light does not turn much */
+#define TURN  512
+#define FAR   8 /* half windows: a place of the patch is never farther from its middle */
 
 static int64_t sine_of(const pf_ray_q30 *v)
 {
     return pf_isqrt64((uint64_t)((int64_t)v->x * v->x + (int64_t)v->y * v->y));
 }
 
-/* What takes the patch's rays on: `turn` about the axis (cosine and sine, Q30) and a fall of the cotangent, Q24. */
+/* What takes the patch's rays on: `turn` about the axis (cosine and sine, Q30) and a fall of the cotangent, Q24; and
+ * what pf_bow.turned_q8 is. */
 typedef struct pf_way {
-    int64_t cosine, sine, fall;
+    int64_t cosine, sine, fall, turned;
 } pf_way;
 
 static bool way_between(const pf_ray_q30 *a, const pf_ray_q30 *b, pf_way *way)
@@ -25,7 +28,9 @@ static bool way_between(const pf_ray_q30 *a, const pf_ray_q30 *b, pf_way *way)
     const int64_t ra = sine_of(a), rb = sine_of(b);
     if (ra < STEEP || rb < STEEP)
         return false;
-    way->fall = a->z * ((int64_t)1 << 24) / ra - b->z * ((int64_t)1 << 24) / rb;
+    const int64_t cot = a->z * ((int64_t)1 << 24) / ra, size = cot < 0 ? -cot : cot, base = size > BLUNT ? size : BLUNT;
+    way->fall = cot - b->z * ((int64_t)1 << 24) / rb;
+    way->turned = (way->fall < 0 ? -way->fall : way->fall) * 256 / (base * base >> 24);
     way->cosine = ((int64_t)a->x * b->x + (int64_t)a->y * b->y) / ra * UNIT / rb;
     way->sine = ((int64_t)a->x * b->y - (int64_t)a->y * b->x) / ra * UNIT / rb;
     return way->fall < LEAP && way->fall > -LEAP;
@@ -83,7 +88,7 @@ bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t 
 {
     const pf_ray_q30 there = lens->ray(lens->rays, to);
     pf_point_q16 p[PLACES];
-    pf_way way = {0, 0, 0};
+    pf_way way = {0, 0, 0, 0};
     for (int32_t k = 0; k < PLACES; k++) {
         const pf_point_q16 pixel = {(x + place[k][0] * half) * 65536, (y + place[k][1] * half) * 65536};
         const pf_ray_q30 ray = lens->ray(lens->rays, pixel);
@@ -91,5 +96,6 @@ bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t 
             !follow_ray(lens, &way, &ray, &p[k]))
             return false;
     }
+    bow->turned_q8 = way.turned > TURN ? TURN : (int32_t)way.turned;
     return bend_of(p, half, bow);
 }

@@ -132,6 +132,10 @@ void pf_anchor_covariance(const pf_anchor *anchor, uint32_t noise_q8, int32_t ga
 typedef struct pf_bow {
     int32_t c[6];
     int32_t warp[4]; /* the affine part a itself, Q16.16, row-major */
+    /* How far the light has turned, Q8, at most 2: the fall of the cotangent over its square. Slopes shine with the
+     * cotangent; by the fall over it they fade, and what has not faded is that much more than they were, once more over
+     * it. */
+    int32_t turned_q8;
 } pf_bow;
 
 /* The bow of the patch around the whole pixel (x, y) once it is seen around `to`, the tube along the optical axis, the

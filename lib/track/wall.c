@@ -33,7 +33,8 @@
 #define OFTEN    3          /* times the median: where the tube is none, all walk off */
 #define AGED     ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
 #define LIGHT    (ONE * 18 / 10000)  /* of a fall: the median of 0.27 % */
-#define BESIDE   7u                  /* neighbours of whom it is asked whether they walk off alike */
+#define GLANCE   4
+#define BESIDE   7u /* neighbours of whom it is asked whether they walk off alike */
 
 typedef struct pf_pair {
     int64_t c, s, cot;                /* of the ray before: azimuth and cotangent */
@@ -437,6 +438,27 @@ static uint32_t part_of_light(pf_wall *wall)
                                                            : 32768u;
 }
 
+/* The same for the k-th track, Q16. As the light comes to stand square on the wall it does more: from a cotangent of a
+ * half to none the odds that it was the light rise to GLANCE + 1 times as much. Measured against the truth, what is
+ * best taken back is 0.5 inside 60 degrees, 0.65 to 75, 0.75 to 82 and 0.8 beyond, on brick, clay and plastic alike. */
+static int64_t part_of(const pf_wall *wall, uint32_t k)
+{
+    const pf_ray_q30 *v = &wall->ray[k];
+    const int64_t sine = sine_of(v), z = v->z < 0 ? -(int64_t)v->z : v->z, p = wall->light_q16;
+    const int64_t cot = z < sine / 2 ? z * 65536 / sine : 32768;
+    const int64_t odds = 65536 + GLANCE * (65536 - 2 * cot);
+    return p * odds / (65536 + ((p * (odds - 65536)) >> 16));
+}
+
+/* How far, Q16 px, the k-th track has walked off by `walked` of its cotangent and its azimuth, less what is taken back
+ * of it. */
+static uint32_t stray_of(const pf_wall *wall, uint32_t k, const int64_t walked[2], pf_ray_project project,
+                         const void *camera)
+{
+    const int64_t length = length_of(way_of(wall, k, walked, project, camera));
+    return (uint32_t)(length * (65536 - part_of(wall, k)) >> 16);
+}
+
 uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                        pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray)
 {
@@ -451,10 +473,9 @@ uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *
         }
     wall->n = kept;
     wall->light_q16 = part_of_light(wall);
-    const uint64_t left = 65536u - wall->light_q16;
     for (uint32_t k = 0; k < kept; k++) {
         const int64_t walked[2] = {wall->off[3u * k], wall->off[3u * k + 1u]};
-        wall->value[k] = (uint32_t)(length_of(way_of(wall, k, walked, project, camera)) * left >> 16);
+        wall->value[k] = stray_of(wall, k, walked, project, camera);
     }
     const uint64_t median = kept ? pf_value_of_rank(wall->value, kept, kept / 2u) : 0;
     const uint64_t most = most_q16 > OFTEN * median ? most_q16 : OFTEN * median;
@@ -463,7 +484,7 @@ uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *
         if (wall->value[k] <= most)
             continue;
         walked_alone(wall, k, walked);
-        if (length_of(way_of(wall, k, walked, project, camera)) * left >> 16 > most)
+        if (stray_of(wall, k, walked, project, camera) > most)
             astray[found++] = wall->pair[k];
     }
     return found;
@@ -479,7 +500,8 @@ void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_pr
             continue;
         walked_alone(wall, k, walked);
         const pf_point_q16 way = way_of(wall, k, walked, project, camera);
-        tracks[j].pos.x -= (int32_t)((int64_t)way.x * wall->light_q16 / 65536);
-        tracks[j].pos.y -= (int32_t)((int64_t)way.y * wall->light_q16 / 65536);
+        const int64_t part = part_of(wall, k);
+        tracks[j].pos.x = pf_clamp_i64(tracks[j].pos.x - way.x * part / 65536, INT32_MAX);
+        tracks[j].pos.y = pf_clamp_i64(tracks[j].pos.y - way.y * part / 65536, INT32_MAX);
     }
 }

@@ -76,6 +76,22 @@ static void test_a_bow_is_the_quadratic_part_of_the_motion(void)
     }
 }
 
+/* Proves: the light has turned by the fall of the cotangent over its square, at most by 2, however square it stood. */
+static void test_the_light_turns_as_the_cotangent_falls(void)
+{
+    const pf_track_lens lens = pf_track_lens_of(table, camera);
+    for (int32_t r = 30; r < 90; r += 2)
+        for (int32_t s = 30; s < 90; s += 5) {
+            const pf_ray_q30 a = lens.ray(lens.rays, (pf_point_q16){(TUBE_W / 2 + r) << 16, (TUBE_H / 2) << 16}),
+                             b = lens.ray(lens.rays, (pf_point_q16){(TUBE_W / 2 + s) << 16, (TUBE_H / 2) << 16});
+            const double from = a.z / hypot(a.x, a.y), to = b.z / hypot(b.x, b.y), base = fmax(fabs(from), 0.125);
+            pf_bow bow;
+            if (pf_bow_between(&lens, 7, TUBE_W / 2 + r, TUBE_H / 2,
+                               (pf_point_q16){(TUBE_W / 2 + s) << 16, (TUBE_H / 2) << 16}, &bow))
+                TEST_ASSERT_DOUBLE_WITHIN(1.1, fmin(512, 256 * fabs(from - to) / (base * base)), bow.turned_q8);
+        }
+}
+
 /* Proves: where the lens tells nothing (near the axis, beyond its field) there is no bow. */
 static void test_there_is_no_bow_where_the_lens_tells_nothing(void)
 {
@@ -142,6 +158,7 @@ int main(void)
     tube_make();
     UNITY_BEGIN();
     RUN_TEST(test_a_bow_is_the_quadratic_part_of_the_motion);
+    RUN_TEST(test_the_light_turns_as_the_cotangent_falls);
     RUN_TEST(test_there_is_no_bow_where_the_lens_tells_nothing);
     RUN_TEST(test_tracks_that_know_the_lens_do_not_drift);
     return UNITY_END();

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xAB50B074u
+#define GOLDEN 0x6C567C3Au
 
 void setUp(void) {}
 void tearDown(void) {}

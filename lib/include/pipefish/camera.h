@@ -114,6 +114,15 @@ pf_status pf_camera_project(const pf_camera *camera, const double xyz[3], double
 pf_status pf_camera_unproject(const pf_camera *camera, const double uv[2], double ray[3], double origin[3],
                               double *d_ray_d_uv);
 
+/* The central camera that sees the wall of a straight round tube of this radius (metres, to 1e3), driven along by the
+ * optical axis, where `camera` does: with a pupil that moves by millimetres, rays on a wall 0.1 m away do not meet in
+ * the centre, and bearings alone would move as on a wall up to a hundredth nearer or farther. Its radial polynomial is
+ * fitted, to some 0.01 px for ordinary lenses; terms beyond the symmetric ones are taken as they are. A central camera
+ * is copied. `camera` is checked; so is what comes out.
+ * Returns PF_OK, or with *central untouched PF_ERR_ARGUMENT (radius) or PF_ERR_UNSUPPORTED: no polynomial is within 0.1
+ * px, or it is not one-to-one. */
+pf_status pf_camera_in_tube(const pf_camera *camera, double radius, pf_camera *central);
+
 /* Whether a pixel lies on the sensor (-0.5 <= u <= width - 0.5, v likewise) and inside the image circle. NaN: false. */
 bool pf_camera_in_image(const pf_camera *camera, const double uv[2]);
 

@@ -268,8 +268,9 @@ uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *
                        pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray);
 
 /* The places of a keyframe: of what each of tracks[n], a copy of the table last checked, has walked off and its seven
- * nearest neighbours have not, takes back the part that is the light's doing by the median of all, at most half. What
- * they walk off alike is the wall's own shape and stays. The tracker goes on from where it found them. Cost: 20 n^2
+ * nearest neighbours have not, takes back the part that is the light's doing by the median of all, at most half, and
+ * from 63 degrees off the axis on up to five sixths: there the light comes to stand square on the wall. What they walk
+ * off alike is the wall's own shape and stays. The tracker goes on from where it found them. Cost: 20 n^2
  * instructions. */
 void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_project project, const void *camera);
 
