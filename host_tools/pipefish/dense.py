@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from pipefish.camera import Camera
 from pipefish.dense_regions import ellipses, find_regions
 from pipefish.dense_steps import find_steps
-from pipefish.dense_unroll import THETA_LEAST, Unroller, View, box_sum
+from pipefish.dense_unroll import THETA_LEAST, Unroller, View, box_sum, keyframe_picture
 from pipefish.errors import ArgumentError
-from pipefish.matching import Seeds, grey, match_quasi_dense
+from pipefish.matching import Seeds, match_quasi_dense
 from pipefish.wallmodel import Floats, WallModel, predicted_seeds, seen_on_wall
 
 Rays = tuple[Floats, Floats]  # origins and directions of unit length, (K,3) each
@@ -348,11 +348,7 @@ def dense_wall(
     rows, columns = max(1, round(wall.length / size)), max(8, round(math.pi * diameter / size))
 
     def seen(k: int) -> View:
-        picture = grey(images(k), f"keyframe {k}")
-        if picture.shape != (camera.height, camera.width):
-            size = f"{picture.shape[1]}x{picture.shape[0]}"
-            raise ArgumentError(f"keyframe {k}: {size} is not the camera's {camera.width}x{camera.height}")
-        return unroller.view(picture, pose_list[k])
+        return unroller.view(keyframe_picture(images, camera, k), pose_list[k])
 
     pairs = _pairs(unroller, pose_list)
     if not pairs:

@@ -7,6 +7,7 @@ import heapq
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from pipefish.camera import Camera
 from pipefish.dense_lines import HALF, Dark, dark_lines
-from pipefish.dense_unroll import Unroller
+from pipefish.dense_regions import wrapped_box
+from pipefish.dense_unroll import Unroller, keyframe_picture
 from pipefish.errors import ArgumentError
-from pipefish.matching import grey
 from pipefish.wallmodel import Floats
 
 if TYPE_CHECKING:
@@ -64,13 +65,10 @@ def find_cracks(
         raise ArgumentError(f"poses: shape {pose_list.shape} is not (n,3,4), or not finite")
     unroller = Unroller(camera, found.wall, 1.0, theta_least=THETA_LEAST, relief=_relief(found))
     views = _spread(unroller, pose_list)
-
-    def picture(k: int) -> NDArray[np.float32]:
-        return grey(images(k), f"keyframe {k}")
-
-    dark = dark_lines(unroller, picture, pose_list, views, tell or (lambda done: None))
+    pictures = partial(keyframe_picture, images, camera)
+    dark = dark_lines(unroller, pictures, pose_list, views, tell or (lambda done: None))
     dark = without_rings(dark, unroller.columns)
-    lines = [line for line in _lines(dark, unroller) if len(line) > 2]
+    lines = [line for line in chains(dark, unroller) if len(line) > 2]
     lines = without_masonry(lines, dark, unroller)
     cracks = [_record(found, unroller, dark, line) for line in lines]
     return sorted(cracks, key=lambda c: -c["length"])
@@ -80,7 +78,7 @@ def _relief(found: DenseWall) -> Callable[[Floats, Floats], Floats]:
     """How far outside the tube the measured wall is at places: the map, smoothed over 3 x 3 cells, bilinear; 0 where
     nothing is known near."""
     known = np.isfinite(found.deviation)
-    total, weight = (_wrapped(np.where(known, v, 0.0)) for v in (found.deviation, 1.0))
+    total, weight = (wrapped_box(np.where(known, v, 0.0)) for v in (found.deviation, 1.0))
     value = total / np.maximum(weight, 1)
     rows, columns = value.shape
 
@@ -95,13 +93,6 @@ def _relief(found: DenseWall) -> Callable[[Floats, Floats], Floats]:
         )
 
     return at
-
-
-def _wrapped(values: Floats) -> Floats:
-    """Sums over 3 x 3 cells; columns go around."""
-    around = values + np.roll(values, 1, axis=1) + np.roll(values, -1, axis=1)
-    padded = np.pad(around, ((1, 1), (0, 0)))
-    return padded[:-2] + padded[1:-1] + padded[2:]
 
 
 def _spread(unroller: Unroller, poses: Floats) -> list[int]:
@@ -189,7 +180,7 @@ def _edges(dark: Dark, columns: int) -> tuple[NDArray[np.int64], Floats]:
     return np.concatenate(pairs), np.concatenate(sizes)
 
 
-def _lines(dark: Dark, unroller: Unroller) -> list[NDArray[np.int64]]:
+def chains(dark: Dark, unroller: Unroller) -> list[NDArray[np.int64]]:
     """Each a chain of cells, from one end to the other: the longest way through what hangs together, then the longest
     of what branches off."""
     if not len(dark):

@@ -25,9 +25,9 @@ def find_regions(found: DenseWall) -> list[dict[str, float]]:
     area; volume."""
     measured = np.isfinite(found.deviation)
     weight = np.where(measured, np.nan_to_num(found.sigma, nan=1.0) ** -2.0, 0)
-    total = _wrapped_box(weight)
+    total = wrapped_box(weight)
     local = np.where(measured, found.deviation, 0) - ellipses(found)
-    mean = _wrapped_box(weight * local) / np.maximum(total, 1e-30)
+    mean = wrapped_box(weight * local) / np.maximum(total, 1e-30)
     sigma = np.nan_to_num(found.sigma, nan=np.inf)  # neighbours share keyframes: their mean is hardly better than one
     off = measured & (np.abs(mean) > REGION_SIGMA * sigma) & (np.abs(mean) > found.wall.mean_radius / 250)
     out = []
@@ -84,7 +84,7 @@ def ellipses(found: DenseWall) -> Floats:
     return fitted
 
 
-def _wrapped_box(values: Floats) -> Floats:
+def wrapped_box(values: Floats) -> Floats:
     """Sums over 3 x 3 cells; columns go around."""
     around = values + np.roll(values, 1, axis=1) + np.roll(values, -1, axis=1)
     padded = np.pad(around, ((1, 1), (0, 0)))

@@ -12,9 +12,20 @@ from numpy.typing import NDArray
 
 from pipefish import _engine
 from pipefish.camera import Camera
+from pipefish.errors import ArgumentError
+from pipefish.matching import grey
 from pipefish.wallmodel import Floats, WallModel
 
 THETA_LEAST = math.radians(30)  # nearer to the axis a pixel covers four times as much of the wall as beside the camera
+
+
+def keyframe_picture(images: Callable[[int], Any], camera: Camera, k: int) -> NDArray[np.float32]:
+    """Keyframe k, (H,W) of 0..1, which must be as large as the camera's. Raises ArgumentError."""
+    picture = grey(images(k), f"keyframe {k}")
+    if picture.shape != (camera.height, camera.width):
+        size = f"{picture.shape[1]}x{picture.shape[0]}"
+        raise ArgumentError(f"keyframe {k}: {size} is not the camera's {camera.width}x{camera.height}")
+    return picture
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,9 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_columns
 from pipefish.dense import CALIBRATION_PX, DenseWall, _tube_sigma
+from pipefish.dense_cracks import chains, without_masonry, without_rings
 from pipefish.dense_files import Strip, document_of, strips_of
+from pipefish.dense_lines import Dark
 from pipefish.dense_regions import find_regions
 from pipefish.dense_steps import find_steps
 from pipefish.measured_files import RING
@@ -239,6 +242,36 @@ def test_a_crack_is_found_where_it_is_and_a_rod_off_the_wall_is_none(cracks: lis
     assert abs(c["offset"]) < 4 * c["offset_sigma"]
 
 
+def test_joints_and_mortar_are_no_cracks() -> None:
+    """Of dark cells: a tilted ring goes, what crosses it stays; between bricks lines along the courses and stairs go,
+    while a line that wanders stays."""
+    columns, cell = 1000, 0.001
+    unroller = SimpleNamespace(columns=columns, cell=cell, wall=SimpleNamespace(mean_radius=columns * cell / 2 / np.pi))
+
+    def dark(x: Floats, y: Floats, turn: Floats) -> Dark:
+        one = np.ones(len(x))
+        return Dark(x, y, turn, one, 0.1 * one, 3 * one, 3 * one, 0.3 * one, 0.05 * one)
+
+    x = np.arange(0, 1000.0)
+    tilted = 400 + 12 * np.cos(2 * np.pi * x / columns)
+    y = np.arange(250.0, 550)
+    wander = 500 + 0.3 * (y - 250) + 6 * (np.abs((y / 10) % 2 - 1) - 0.5)
+    turn = np.full(len(y), np.pi / 2 - 0.3)
+    both = dark(np.r_[x, wander], np.r_[tilted, y], np.r_[0 * x, turn])
+    kept = without_rings(both, columns)
+    assert len(kept) < 310 and (np.abs(kept.x - 500) < 120).all() and len(kept) > 280
+    courses = [(np.full(300, 40.0 + 60 * k), y, np.full(300, np.pi / 2)) for k in range(5)]
+    stair = (np.r_[np.full(80, 700.0), np.arange(700.0, 760), np.full(90, 760.0)],
+             np.r_[y[:80], np.full(60, 330.0), y[80:170]],
+             np.r_[np.full(80, np.pi / 2), np.zeros(60), np.full(90, np.pi / 2)])  # fmt: skip
+    wall = dark(*(np.concatenate(v) for v in zip(*courses, stair, (wander, y, turn), strict=True)))
+    lines = chains(wall, unroller)
+    left = without_masonry(lines, wall, unroller)
+    assert len(lines) == 7 and len(left) == 1 and np.abs(wall.x[left[0]] - 545).max() < 60
+    only = dark(*courses[0])
+    assert len(without_masonry(chains(only, unroller), only, unroller)) == 1, "one straight line is no masonry"
+
+
 def test_a_cracks_edges_that_are_offset_are_told(found: DenseWall, cracks: list[dict[str, Any]]) -> None:
     """The map where the wall beyond the crack, by clock, stands 1 mm further out."""
     s, clock = np.meshgrid(found.s + 0.1, found.clock, indexing="ij")
@@ -378,6 +411,13 @@ def test_wrong_arguments_are_named(change: dict, what: str, pictures: list[NDArr
     arguments = {"images": pictures.__getitem__, "camera": CAMERA, "poses": POSES, "wall": pf.WallModel(rings())}
     with pytest.raises(pf.ArgumentError, match=what):
         pf.dense_wall(**arguments | change)
+
+
+def test_cracks_are_looked_for_in_keyframes_of_the_camera_only(found: DenseWall) -> None:
+    with pytest.raises(pf.ArgumentError, match="poses: shape"):
+        pf.find_cracks(found, damaged, CAMERA, POSES[0])
+    with pytest.raises(pf.ArgumentError, match="keyframe 0: 64x64 is not the camera's 512x512"):
+        pf.find_cracks(found, lambda k: np.zeros((64, 64), np.uint8), CAMERA, POSES)
 
 
 def test_rings_that_are_none_are_refused() -> None:

@@ -3,25 +3,24 @@ the true epipolar line; and how much of the textured common area those cover.
 
 The data have no depth here. The common area is therefore taken from all the pairs together: matches that agree with
 the true motion to a pixel are triangulated with it, which gives depths in both of a pair's pictures; a picture's
-depths, from the pairs with both its neighbours, are continued into holes from what is nearest. A pixel of the first
-picture is common where its point lies within the second, 8 pixels from the rim, and behind nothing of the first
+depths, from the pairs with both its neighbours, are continued into holes by means of what is around. A pixel of the
+first picture is common where its point lies within the second, 8 pixels from the rim, and behind nothing of the first
 picture that lands within a pixel of it and is nearer by 2 %. Textured: a step of 0.01 of full scale to one of the four
-neighbours, as the growth asks. The photographs are made a third as large, 1024 x 682."""
+neighbours, as the growth asks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from accept_rows import Row, at_least
 from numpy.typing import NDArray
 from PIL import Image
 
 import pipefish as pf
 
 Floats = NDArray[np.float64]
-SIZE = (1024, 682)
 PICTURES = range(2, 8)
 RIM, NEARER = 8, 0.98
 
@@ -73,17 +72,20 @@ def depths(points: Floats, xy: Floats, p: Floats, shape: tuple[int, int]) -> Flo
 
 
 def filled(depth: Floats) -> Floats:
-    """Holes take the mean of their known neighbours, from their rims inwards."""
-    out = depth.copy()
-    while np.isnan(out).any():
-        padded = np.pad(out, 1, constant_values=np.nan)
-        around = np.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
-        count = np.isfinite(around).sum(axis=0)
-        new = np.isnan(out) & (count > 0)
-        if not new.any():
-            raise SystemExit("no depth at all")
-        out[new] = np.nansum(around, axis=0)[new] / count[new]
-    return out
+    """Holes take the mean of the least square around (2 x 2, 4 x 4, ..) in which something is known."""
+    hole = np.isnan(depth)
+    if not hole.any():
+        return depth
+    if hole.all():
+        raise ValueError("no depth at all")
+    rows, columns = (-(-n // 2) for n in depth.shape)
+    known = np.zeros((2, 2 * rows, 2 * columns))
+    known[0, : depth.shape[0], : depth.shape[1]] = np.where(hole, 0, depth)
+    known[1, : depth.shape[0], : depth.shape[1]] = ~hole
+    total, count = known.reshape(2, rows, 2, columns, 2).sum(axis=(2, 4))
+    coarse = filled(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    fine = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[: depth.shape[0], : depth.shape[1]]
+    return np.where(hole, fine, depth)
 
 
 def textured(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -113,13 +115,14 @@ def common(depth: Floats, k1: Floats, p1: Floats, k2: Floats, p2: Floats) -> NDA
     return (inside & (front[v, u] >= NEARER * z)).reshape(rows, columns)
 
 
-def figures(folder: Path) -> list[dict[str, float]]:
-    """Of each pair: matches, share within 2 pixels of the line, coverage of the textured common area."""
-    views = {n: photograph(folder, n, SIZE) for n in PICTURES}
-    shape = views[PICTURES[0]][0].shape
-    parts: dict[int, list[Floats]] = {n: [] for n in PICTURES}
+def figures(folder: Path, size: tuple[int, int], pictures: Sequence[int] = PICTURES) -> list[dict[str, float]]:
+    """Of each pair of neighbours, made as large as `size` (width, height): matches, share within 2 pixels of the line,
+    coverage of the textured common area by those, and what share of the first picture that area is."""
+    views = {n: photograph(folder, n, size) for n in pictures}
+    shape = views[pictures[0]][0].shape
+    parts: dict[int, list[Floats]] = {n: [] for n in pictures}
     matches, near = {}, {}
-    for a, b in pairwise(PICTURES):
+    for a, b in pairwise(pictures):
         (one, *geometry1), (two, *geometry2) = views[a], views[b]
         m = matches[a] = pf.match_quasi_dense(one, two)
         near[a] = line_distance(m, *geometry1, *geometry2)
@@ -128,7 +131,7 @@ def figures(folder: Path) -> list[dict[str, float]]:
         parts[a].append(depths(points, m.xy1[good], geometry1[1], shape))
         parts[b].append(depths(points, m.xy2[good], geometry2[1], shape))
     out = []
-    for a, b in pairwise(PICTURES):
+    for a, b in pairwise(pictures):
         (one, *geometry1), (_, *geometry2) = views[a], views[b]
         known = np.isfinite(parts[a])
         depth = np.where(known.any(axis=0), np.nansum(parts[a], axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
@@ -139,12 +142,3 @@ def figures(folder: Path) -> list[dict[str, float]]:
         out.append({"pair": a, "matches": len(matches[a]), "within_2px": float(np.mean(near[a] < 2))})
         out[-1] |= {"shared": float(shared.mean()), "coverage": float(covered.sum() / shared.sum())}
     return out
-
-
-def fountain_rows(folder: Path) -> list[Row]:
-    """The worst pair."""
-    found = figures(folder)
-    return [
-        at_least("match.fountain_within_2px", min(f["within_2px"] for f in found), 0.95),
-        at_least("match.fountain_coverage", min(f["coverage"] for f in found), 0.7),
-    ]
