@@ -9,14 +9,14 @@ import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipefish.camera import Camera
-from pipefish.dense_regions import find_regions
+from pipefish.dense_regions import ellipses, find_regions
 from pipefish.dense_steps import find_steps
 from pipefish.dense_unroll import THETA_LEAST, Unroller, View, box_sum, keyframe_picture
 from pipefish.errors import ArgumentError
@@ -59,6 +59,7 @@ class DenseWall:
     brightness         0..1, of the unrolled pictures; NaN where none sees the cell
     points             (rows, columns, 3) of the cells' middles, moved by their deviation; NaN where not measured
     scatter            what the pairs' own scatter multiplied the sigmas of theory by
+    tube_sigma         in every sigma: how far the tube and the poses are off that no scatter tells, see `_tube_sigma`
     regions            connected cells that are off the tube by over 3 sigma: see `find_regions`
     steps              where the pipe steps aside or changes its width at once: see `find_steps`
     cracks             lines that wander over the wall: see `find_cracks`, which looks for them
@@ -74,6 +75,7 @@ class DenseWall:
     brightness: Floats
     scatter: float
     pairs_used: int
+    tube_sigma: float = 0.0
     regions: list[dict[str, float]] = field(default_factory=list)
     steps: list[dict[str, float]] = field(default_factory=list)
     cracks: list[dict[str, Any]] = field(default_factory=list)
@@ -397,8 +399,18 @@ def dense_wall(
         pairs_used=len(parts),
     )
     found.steps.extend(find_steps(found))
-    found.regions.extend(find_regions(found))
-    return found
+    found.regions.extend(find_regions(found))  # which are off their own surroundings, not off the tube
+    tube_sigma = _tube_sigma(found)
+    return replace(found, sigma=np.hypot(found.sigma, tube_sigma), tube_sigma=tube_sigma)
+
+
+def _tube_sigma(found: DenseWall) -> float:
+    """The mean, shift and ellipse that the map shows over half a diameter along, median of the cells as a sigma. A tube
+    that is right leaves none: they are what it and the poses are off by, alike for neighbours and for all pairs, so
+    that no scatter tells it. By the median, for what is not a smooth tube (steps, a bend's ends) is there to be
+    shown."""
+    measured = np.isfinite(found.deviation)
+    return float(np.median(np.abs(ellipses(found)[measured])) / 0.6745) if measured.any() else 0.0
 
 
 def _cells_of(unroller: Unroller, first: int, sound: NDArray[np.bool_], rows: int, columns: int) -> tuple[Any, Any]:

@@ -132,12 +132,13 @@ def _trace(draw: Any, found: DenseWall, crack: dict[str, Any], zoom: int, left: 
             draw.line(points, fill=(220, 30, 140), width=1)
 
 
-def cloud(found: DenseWall, unit: str) -> bytes:
-    """The measured cells as a PLY file: place, deviation and sigma, grey level, colour by deviation."""
+def cloud(found: DenseWall, unit: str, sigma_radius: Floats) -> bytes:
+    """The measured cells as a PLY file: place, deviation and sigma, that of the radius, grey level, colour by
+    deviation."""
     good = np.isfinite(found.deviation)
     span = found.wall.mean_radius / 50
     columns = dict(zip("xyz", found.points[good].T, strict=True))
-    columns |= {"deviation": found.deviation[good], "sigma": found.sigma[good]}
+    columns |= {"deviation": found.deviation[good], "sigma": found.sigma[good], "sigma_radius": sigma_radius[good]}
     columns = {name: v.astype(np.float32) for name, v in columns.items()}
     columns["pairs"] = found.pairs[good].astype(np.uint8)
     columns["brightness"] = (255 * np.nan_to_num(found.brightness[good])).astype(np.uint8)
@@ -146,7 +147,8 @@ def cloud(found: DenseWall, unit: str) -> bytes:
 
 
 def radius_sigmas(summary: dict[str, Any]) -> dict[str, Any]:
-    """What the radii of all cells have in common and their sigmas do not hold, from the summary of reconstruction.json:
+    """What the radii of all cells have in common and the sigmas of deviations do not hold, from the summary of
+    reconstruction.json:
     radius_sigma    repeatability of the fitted tube, of one place
     scale_sigma     relative: the scale and the camera; None where neither is known
     """
@@ -156,6 +158,16 @@ def radius_sigmas(summary: dict[str, Any]) -> dict[str, Any]:
         "radius_sigma": 0.5 * station if station is not None else None,
         "scale_sigma": shared["relative"] if shared and not prior else None,
     }
+
+
+def radius_sigma_of(found: DenseWall, summary: dict[str, Any]) -> Floats:
+    """(rows, columns): sigma of a cell's distance from the axis: its own, and what radius_sigmas tells of all; NaN
+    where that tells nothing."""
+    shared = radius_sigmas(summary)
+    if shared["radius_sigma"] is None and shared["scale_sigma"] is None:
+        return np.full_like(found.sigma, np.nan)
+    of_scale = (shared["scale_sigma"] or 0.0) * found.wall.mean_radius
+    return np.sqrt(found.sigma**2 + (shared["radius_sigma"] or 0.0) ** 2 + of_scale**2)
 
 
 def document_of(
@@ -227,6 +239,7 @@ def write_dense(
         chainage = strip.origin + strip.sign * found.s
         packed, picture = io.BytesIO(), io.BytesIO()
         arrays = {"deviation": found.deviation, "sigma": found.sigma, "pairs": found.pairs}
+        arrays["sigma_radius"] = radius_sigma_of(found, summary)
         np.savez_compressed(
             packed,
             chainage=chainage,
@@ -242,7 +255,7 @@ def write_dense(
         contents[f"deviation{end}.csv"] = _table(corner, chainage, found.clock, factor * found.deviation)
         contents[f"sigma{end}.csv"] = _table(corner, chainage, found.clock, factor * found.sigma)
         contents[f"dense{end}.png"] = picture.getvalue()
-        contents[f"dense{end}.ply"] = cloud(found, unit)
+        contents[f"dense{end}.ply"] = cloud(found, unit, arrays["sigma_radius"])
     document = document_of(maps, strips, unit, summary, reconstruction)
     contents["findings.csv"] = findings_table(findings_of(document))
     document["files"] = [*contents, "dense.json"]

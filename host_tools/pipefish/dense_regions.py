@@ -26,7 +26,7 @@ def find_regions(found: DenseWall) -> list[dict[str, float]]:
     measured = np.isfinite(found.deviation)
     weight = np.where(measured, np.nan_to_num(found.sigma, nan=1.0) ** -2.0, 0)
     total = wrapped_box(weight)
-    local = np.where(measured, found.deviation, 0) - _ellipses(found)
+    local = np.where(measured, found.deviation, 0) - ellipses(found)
     mean = wrapped_box(weight * local) / np.maximum(total, 1e-30)
     sigma = np.nan_to_num(found.sigma, nan=np.inf)  # neighbours share keyframes: their mean is hardly better than one
     off = measured & (np.abs(mean) > REGION_SIGMA * sigma) & (np.abs(mean) > found.wall.mean_radius / 250)
@@ -58,7 +58,7 @@ def find_regions(found: DenseWall) -> list[dict[str, float]]:
     return sorted(out, key=lambda r: -abs(r["volume"]))
 
 
-def _ellipses(found: DenseWall) -> Floats:
+def ellipses(found: DenseWall) -> Floats:
     """(rows, columns): mean, shift and ellipse through the cells a quarter diameter to either side, robustly, but not
     beyond a step of the pipe."""
     angle = np.outer([1, 1, 2, 2], found.clock) - np.array([[0], [np.pi / 2], [0], [np.pi / 2]])

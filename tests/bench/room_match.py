@@ -1,10 +1,10 @@
 """match.narrow and match.graf13: seconds of quasi-dense matching, matches and their accuracy, beside OpenCV's.
 
-The rival is cv2.stereo.QuasiDenseStereo of opencv-contrib, which Debian's Python has. Processor time of one thread,
-seeds included, least of two runs in turns. graf 1-3's truth is a homography, that of the wall: only matches on the wall
-are judged (above the kerb, for both sides alike); all are counted in match.graf13_matches. In
-match.graf13_motion*, those off the dominant rigid motion are filtered out, its time included, and all that are left are
-judged.
+The rival is cv2.stereo.QuasiDenseStereo of opencv-contrib, which Debian's Python has. Processor time of the whole
+process, one thread on either side, seeds included, least of two runs in turns. graf 1-3's truth is a homography, that
+of the wall: only matches on the wall are judged (above the kerb, for both sides alike); all are counted in
+match.graf13_matches. In match.graf13_motion*, those off the dominant rigid motion are filtered out, its time included,
+and all that are left are judged.
 """
 
 import os
@@ -83,11 +83,11 @@ def ours(one: np.ndarray, two: np.ndarray, mode: str, motion: bool = False) -> t
     from pipefish.matching import match_quasi_dense
     from pipefish.matching_filters import filter_matches
 
-    start = time.thread_time()
+    start = time.process_time()
     m = match_quasi_dense(one, two, mode=mode)
     if motion:
         m = filter_matches(m, least=0, geometry="motion")
-    return time.thread_time() - start, m.xy1, m.xy2
+    return time.process_time() - start, m.xy1, m.xy2
 
 
 def figures(name: str, got: tuple, peer: tuple | None, error: Truth, bound: float) -> list[dict]:
