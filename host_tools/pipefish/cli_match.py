@@ -39,7 +39,7 @@ def run_match(args: argparse.Namespace) -> Result:
         m = filter_matches(
             m,
             least=None if "consistent" in filters else 0,
-            back=match_back(one, two, m, **options) if "both-ways" in filters else None,
+            back=match_back(one, two, m, *geometry, **options) if "both-ways" in filters else None,
             geometry=next(iter(filters & {"plane", "motion"}), None),
             rivals=match_rivals(one, two, m, *geometry, threads=args.threads) if "unique" in filters else None,
         )

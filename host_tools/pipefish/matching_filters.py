@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipefish import _engine
+from pipefish.camera import Camera
 from pipefish.errors import ArgumentError
 from pipefish.matching import RADIUS, Matches, Seeds, epipolar_geometry, grey, match_quasi_dense
 
@@ -288,9 +289,16 @@ def filter_matches(
     return replace(m, status=status)
 
 
-def match_back(image1: Any, image2: Any, m: Matches, **options: Any) -> Matches:
-    """The same images matched the other way round, from the same seeds; options as match_quasi_dense takes them."""
-    return match_quasi_dense(image2, image1, swapped(m.seeds), **options)
+def match_back(
+    image1: Any, image2: Any, m: Matches, cameras: Any = None, relative_pose: Any = None, **options: Any
+) -> Matches:
+    """The same images matched the other way round, from the same seeds; cameras, relative_pose (cam2_from_cam1) and
+    options as match_quasi_dense takes them for image1 and image2. Raises ArgumentError."""
+    pose = epipolar_geometry(cameras, relative_pose)[2]
+    if pose is not None:
+        pose = np.column_stack([pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]])
+        cameras = cameras if isinstance(cameras, Camera) else tuple(cameras)[::-1]
+    return match_quasi_dense(image2, image1, swapped(m.seeds), cameras, pose, **options)
 
 
 def match_rivals(

@@ -1,0 +1,94 @@
+"""Quasi-dense matching: the way back and what it confirms, geometry, seeds of either contrast, odd arguments."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import pipefish as pf
+from pipefish.cli import main
+from pipefish.matching_files import read_grey
+from pipefish.matching_filters import confirmed
+from test_match import (
+    FISHEYE,
+    POSE,
+    H,
+    W,
+    affine,
+    errors,
+    fisheye_seed,
+    fisheye_truth,
+    one_seed,
+    pair,
+    rendered,
+    spoiled,
+)
+
+A = np.array([[0.9, -0.2], [0.25, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def turned() -> tuple:
+    """An affine pair of pictures, its map, and its matches."""
+    there, back = affine(A)
+    one, two = pair(back)
+    return one, two, there, pf.match_quasi_dense(one, two, one_seed(there, A))
+
+
+# ---- the way back
+
+
+def test_the_way_back_confirms_what_is_right_and_nothing_else(turned: tuple) -> None:
+    one, two, there, m = turned
+    m, wrong = spoiled(m, 0.2)
+    held = confirmed(m, pf.match_back(one, two, m))
+    assert wrong.sum() > 1000
+    assert held[~wrong].mean() >= 0.95 and held[wrong].mean() <= 0.005
+    kept = pf.filter_matches(m, least=0, back=pf.match_back(one, two, m))
+    assert len(kept) == held.sum() and np.mean(errors(kept, there) < 1) >= 0.995
+
+
+def test_the_way_back_has_the_cameras_and_the_motion_the_other_way_round() -> None:
+    """The second picture by another camera: half the size of the first one's."""
+    one, large = rendered(np.eye(3, 4)), rendered(POSE)
+    two = large.reshape(H // 2, 2, W // 2, 2).mean(axis=(1, 3))  # its pixel x is at 2 x + 0.5 of the large one
+    small = pf.Camera(width=W // 2, height=H // 2, f_u=35.0, f_v=35.0, c_u=49.5, c_v=39.5, theta_max=2.0)
+    seed = fisheye_seed()
+    seeds = pf.Seeds(seed.xy1, (seed.xy2 - 0.5) / 2, seed.affine / 2)
+    geometry = (FISHEYE, small), POSE
+    m = pf.match_quasi_dense(one, two, seeds, *geometry)
+    assert len(m) > 2000
+    assert np.mean(np.linalg.norm(2 * m.xy2 + 0.5 - fisheye_truth(m.xy1), axis=1) < 1) >= 0.99
+    back = pf.match_back(one, two, m, *geometry)
+    assert len(back) >= 0.9 * len(m)
+    assert len(pf.filter_matches(m, least=0, back=back)) >= 0.9 * len(m)
+    with pytest.raises(pf.ArgumentError, match="needs both"):
+        pf.match_back(one, two, m, FISHEYE)
+
+
+def test_the_command_confirms_both_ways_with_the_motion(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for name, pose in (("a.png", np.eye(3, 4)), ("b.png", POSE)):
+        Image.fromarray((255 * rendered(pose)).astype(np.uint8)).save(tmp_path / name)
+    FISHEYE.save(tmp_path / "camera.json")
+    np.savetxt(tmp_path / "pose.txt", POSE)
+    seed = fisheye_seed()
+    row = np.concatenate([seed.xy1[0], seed.xy2[0], seed.affine[0].ravel()])
+    np.savetxt(tmp_path / "seeds.txt", row[None])
+    arguments = ["match", *(str(tmp_path / n) for n in ("a.png", "b.png")), "-o", str(tmp_path / "out"), "--json"]
+    arguments += ["--profile", str(tmp_path / "camera.json"), "--pose", str(tmp_path / "pose.txt")]
+    arguments += ["--seeds", str(tmp_path / "seeds.txt")]
+    found = {}
+    for name in ("none", "both-ways"):
+        assert main([*arguments, "--filter", name]) == 0
+        found[name] = json.loads(capsys.readouterr().out)["matches"]
+    xy = np.load(tmp_path / "out/matches.npz")
+    one, two = (read_grey(tmp_path / name) for name in ("a.png", "b.png"))
+    m = pf.match_quasi_dense(one, two, seed, FISHEYE, POSE)
+    ways = [confirmed(m, pf.match_back(one, two, m, *g)).sum() for g in ((FISHEYE, POSE), ())]
+    assert found["both-ways"] == ways[0] != ways[1]  # the way back is held to the motion too
+    assert 0.9 * found["none"] <= found["both-ways"] < found["none"]
+    assert np.mean(np.linalg.norm(xy["xy2"] - fisheye_truth(xy["xy1"]), axis=1) < 1) >= 0.995
