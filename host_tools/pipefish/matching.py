@@ -49,10 +49,11 @@ class Matches:
     zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1
     parent   (K,) the match each grew from, -1 for a seed
     seed     (K,) the seed each comes from, an index into `seeds`
-    status   "ok", "no seeds" (none found, or none that fits its surroundings) or "no growth" (no seed came to 200
-             matches: the images probably have nothing in common)
-    counts   what became of candidates: tried, low_zncc, taken (its place was), off_line (the epipolar line), at_border
-             (found at the rim of the search: more than a fifth of the matches means that maps are wrong), seeds_used
+    status   "ok", "no seeds" (none found, or none that fits its surroundings), "no growth" (no seed came to 200
+             matches: the images probably have nothing in common) or "nothing left" (by filter_matches)
+    counts   of the growth, which filters leave as they are: grown (matches), seeds_used, at_border (matches found at
+             the rim of the search: more than a fifth of the grown means that maps are wrong); and what became of
+             candidates: tried, low_zncc, taken (its place was), off_line (the epipolar line)
     """
 
     xy1: Floats
@@ -241,6 +242,7 @@ def match_quasi_dense(
     )
     grown = _engine.grow_matches(one, two, start.xy1, start.xy2, start.affine, options, *profiles)
     arrays = {name: grown.pop(name) for name in ("xy1", "xy2", "affine", "zncc", "parent", "seed")}
+    grown["grown"] = len(arrays["xy1"])
     status = "ok"
     if not grown["seeds_used"]:
         status = "no seeds"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ from PIL import Image
 
 import pipefish as pf
 from pipefish.cli import main
-from pipefish.matching_files import read_grey
-from pipefish.matching_filters import confirmed
+from pipefish.matching_files import read_grey, statistics
+from pipefish.matching_filters import confirmed, select
 from test_match import (
     FISHEYE,
     POSE,
@@ -92,3 +93,14 @@ def test_the_command_confirms_both_ways_with_the_motion(tmp_path: Path, capsys: 
     assert found["both-ways"] == ways[0] != ways[1]  # the way back is held to the motion too
     assert 0.9 * found["none"] <= found["both-ways"] < found["none"]
     assert np.mean(np.linalg.norm(xy["xy2"] - fisheye_truth(xy["xy1"]), axis=1) < 1) >= 0.995
+
+
+# ---- what is said of matches
+
+
+def test_a_filter_does_not_change_the_share_found_at_the_rim(turned: tuple) -> None:
+    m = turned[3]
+    assert m.counts["grown"] == len(m)
+    m = replace(m, counts=m.counts | {"at_border": len(m) // 4})
+    few = select(m, np.arange(len(m)) % 10 == 0)
+    assert statistics(few)["at_border_share"] == statistics(m)["at_border_share"] == pytest.approx(0.25, abs=0.01)
