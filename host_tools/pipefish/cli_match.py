@@ -28,6 +28,8 @@ def run_match(args: argparse.Namespace) -> Result:
     filters = set(args.filter or ["consistent"])
     if {"plane", "motion"} <= filters:
         raise ArgumentError("--filter: plane or motion, not both")
+    if filters & {"plane", "motion"} and any(camera.radial != "perspective" for camera in cameras or ()):
+        raise ArgumentError("--filter: plane and motion are of pinhole pictures, the --profile is of none")
     if "none" in filters and len(filters) > 1:
         raise ArgumentError("--filter: none, or others, not both")
     options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,9 @@ def grey(image: ArrayLike, name: str) -> NDArray[np.float32]:
 def find_seeds(image1: ArrayLike, image2: ArrayLike, most: int = 1000, affine: bool = True, threads: int = 1) -> Seeds:
     """Seeds from affine-covariant regions of both images (SIFT's points with and without adapted shapes, and maximally
     stable extremal regions), matched by descriptors. Many may be wrong. most: regions an image; affine=False: circles
-    only, faster. Large images are halved first, until they are of 800,000 pixels: the growth fits seeds anew."""
+    only, faster. Large images are halved first, until they are of 800,000 pixels: the growth fits seeds anew. Raises
+    ArgumentError."""
+    most, threads = whole("most", most, 1, 10**6), whole("threads", threads, 1)
     one, two = grey(image1, "image1"), grey(image2, "image2")
     times = 0
     while one.size > SEED_PIXELS or two.size > SEED_PIXELS:
@@ -134,6 +137,19 @@ def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return out
 
 
+def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """A whole number from `least` to `most`. Raises ArgumentError that names `name`."""
+    try:
+        number = index(value)
+    except TypeError:
+        raise ArgumentError(f"{name}: {value!r} is not a whole number") from None
+    if number < least:
+        raise ArgumentError(f"{name}: {number} is not at least {least}")
+    if most is not None and number > most:
+        raise ArgumentError(f"{name}: {number} is more than {most}")
+    return number
+
+
 def _given_seeds(seeds: Any) -> Seeds:
     """Seeds from Seeds, (xy1, xy2), (xy1, xy2, affine), or (S,4) rows x1 y1 x2 y2."""
     if isinstance(seeds, Seeds):
@@ -160,8 +176,8 @@ def epipolar_geometry(cameras: Any, relative_pose: Any) -> tuple[Any, Any, Float
         return None, None, None
     if cameras is None or relative_pose is None:
         raise ArgumentError("cameras and relative_pose: the epipolar geometry needs both")
-    pair = (cameras, cameras) if isinstance(cameras, Camera) else tuple(cameras)
-    if len(pair) != 2 or not all(isinstance(c, Camera) for c in pair):
+    pair = (cameras, cameras) if isinstance(cameras, Camera) else cameras
+    if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(c, Camera) for c in pair):
         raise ArgumentError("cameras: a Camera, or two of them")
     if any(c.pupil_e1 for c in pair):
         raise ArgumentError("cameras: pupil_e1: the epipolar geometry is that of central cameras")
@@ -221,16 +237,17 @@ def match_quasi_dense(
     options.mode = _choice("mode", mode, MODES, _engine.MatchMode)
     options.adaptation = _choice("adaptation", adaptation, ADAPTATIONS, _engine.MatchAdaptation)
     options.turn = _choice("turn", turn, TURNS, _engine.MatchTurn)
-    options.radius = RADIUS[mode] if radius is None else radius
-    limits = {"radius": (2, 7), "zncc_min": (0.3, 0.99), "texture": (0, 1), "epipolar_px": (1e-3, 1e3)}
-    for name, value in (("zncc_min", zncc_min), ("texture", texture), ("epipolar_px", epipolar_px)):
-        setattr(options, name, value)
-    for name, (low, high) in limits.items():
-        if not low <= getattr(options, name) <= high:
-            raise ArgumentError(f"{name}: {getattr(options, name)} is not within {low} to {high}")
-    if threads < 1:
-        raise ArgumentError(f"threads: {threads} is not at least 1")
-    options.threads = threads
+    options.radius = RADIUS[mode] if radius is None else whole("radius", radius, 2, 7)
+    limits = {"zncc_min": (zncc_min, 0.3, 0.99), "texture": (texture, 0, 1), "epipolar_px": (epipolar_px, 1e-3, 1e3)}
+    for name, (value, low, high) in limits.items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise ArgumentError(f"{name}: {value!r} is not a number") from None
+        if not low <= number <= high:
+            raise ArgumentError(f"{name}: {number} is not within {low} to {high}")
+        setattr(options, name, number)
+    options.threads = whole("threads", threads, 1)
     profiles = epipolar_geometry(cameras, relative_pose)
     if turn == "epipolar" and profiles[2] is None:
         raise ArgumentError("turn: 'epipolar' needs cameras and relative_pose")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipefish import _engine
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError
-from pipefish.matching import RADIUS, Matches, Seeds, epipolar_geometry, grey, match_quasi_dense
+from pipefish.matching import RADIUS, Matches, Seeds, epipolar_geometry, grey, match_quasi_dense, whole
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,6 +57,16 @@ def select(m: Matches, keep: Mask) -> Matches:
     parent = np.where(parent >= 0, number[np.maximum(parent, 0)], -1)
     arrays = {name: getattr(m, name)[keep] for name in ("xy1", "xy2", "affine", "zncc", "seed")}
     return replace(m, **arrays, parent=parent[keep])
+
+
+def _check(m: Matches) -> None:
+    """Raises ArgumentError for matches that are not within their images."""
+    for name, shape in (("xy1", m.shape1), ("xy2", m.shape2)):
+        xy = getattr(m, name)
+        if not ((xy >= -0.5) & (xy < np.array(shape[::-1]) - 0.5)).all():
+            raise ArgumentError(f"m: {name}: not all within its image")
+    if not np.isfinite(m.affine).all():
+        raise ArgumentError("m: affine: not finite")
 
 
 def swapped(seeds: Seeds) -> Seeds:
@@ -268,6 +278,7 @@ def filter_matches(
     rivals     (K,) of match_rivals: matches with 0.98 or more are left out
 
     Raises ArgumentError."""
+    _check(m)
     if rivals is not None:
         found = np.asarray(rivals, float)
         if found.shape != (len(m),):
@@ -275,9 +286,7 @@ def filter_matches(
         m = select(m, ~(found >= RIVAL))
     if least is None:
         least = max(30, min(np.prod(m.shape1), np.prod(m.shape2)) // ISLAND)
-    if least < 0:
-        raise ArgumentError(f"least: {least} is negative")
-    if least:
+    if whole("least", least, 0):
         m = select(m, consistent(m, least))
     if back is not None:
         m = select(m, confirmed(m, back))
@@ -323,10 +332,8 @@ def match_rivals(
     one, two = grey(image1, "image1"), grey(image2, "image2")
     if (m.shape1, m.shape2) != (one.shape, two.shape):
         raise ArgumentError("m: not of images of this size")
-    if not 2 <= radius <= 7:
-        raise ArgumentError(f"radius: {radius} is not within 2 to 7")
-    if threads < 1:
-        raise ArgumentError(f"threads: {threads} is not at least 1")
+    radius, threads = whole("radius", radius, 2, 7), whole("threads", threads, 1)
+    _check(m)
     profiles = epipolar_geometry(cameras, relative_pose)
     fundamental = None
     if profiles[2] is None:

@@ -104,3 +104,61 @@ def test_a_filter_does_not_change_the_share_found_at_the_rim(turned: tuple) -> N
     m = replace(m, counts=m.counts | {"at_border": len(m) // 4})
     few = select(m, np.arange(len(m)) % 10 == 0)
     assert statistics(few)["at_border_share"] == statistics(m)["at_border_share"] == pytest.approx(0.25, abs=0.01)
+
+
+# ---- arguments that are wrong are named
+
+PLAIN = np.zeros((64, 64), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"radius": 2.5}, "radius: 2.5 is not a whole number"),
+        ({"radius": 1}, "radius: 1 is not at least 2"),
+        ({"threads": 1.5}, "threads: 1.5"),
+        ({"threads": 0}, "threads: 0"),
+        ({"zncc_min": "high"}, "zncc_min: 'high' is not"),
+        ({"epipolar_px": [1, 2]}, "epipolar_px: .* is not a number"),
+        ({"cameras": 3, "relative_pose": POSE}, "cameras: a Camera, or two"),
+    ],
+)
+def test_matching_names_the_argument(options: dict, what: str) -> None:
+    with pytest.raises(pf.ArgumentError, match=what):
+        pf.match_quasi_dense(PLAIN, PLAIN, **options)
+
+
+@pytest.mark.parametrize(("options", "what"), [({"most": 0}, "most: 0"), ({"most": -1}, "most"), ({"threads": 0}, "t")])
+def test_finding_seeds_names_the_argument(options: dict, what: str) -> None:
+    with pytest.raises(pf.ArgumentError, match=what):
+        pf.find_seeds(PLAIN, PLAIN, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("xy1", np.nan), ("xy1", -50.0), ("xy2", 1e30), ("xy2", np.nan), ("affine", np.nan)]
+)
+def test_filters_name_what_is_wrong_with_matches(turned: tuple, name: str, value: float) -> None:
+    one, two, _, m = turned
+    changed = getattr(m, name).copy()
+    changed[::3] = value
+    broken = replace(m, **{name: changed})
+    for call in (lambda: pf.filter_matches(broken), lambda: pf.match_rivals(one, two, broken)):
+        with pytest.raises(pf.ArgumentError, match=name):
+            call()
+
+
+def test_filters_take_whole_numbers_only(turned: tuple) -> None:
+    for least in (30.5, -1):
+        with pytest.raises(pf.ArgumentError, match="least: "):
+            pf.filter_matches(turned[3], least=least)
+
+
+def test_the_command_refuses_a_plane_or_motion_of_a_fisheye(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    Image.fromarray(PLAIN).save(tmp_path / "a.png")
+    FISHEYE.save(tmp_path / "camera.json")
+    np.savetxt(tmp_path / "pose.txt", POSE)
+    arguments = ["match", str(tmp_path / "a.png"), str(tmp_path / "a.png"), "-o", str(tmp_path / "out")]
+    arguments += ["--profile", str(tmp_path / "camera.json"), "--pose", str(tmp_path / "pose.txt")]
+    for name in ("plane", "motion"):
+        assert main([*arguments, "--filter", name]) == 1
+        assert "--filter: plane and motion are of pinhole pictures" in capsys.readouterr().err
