@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 import pipefish as pf
 from pipefish.cli import main
 from pipefish.matching_files import read_grey, statistics
-from pipefish.matching_filters import confirmed, select
+from pipefish.matching_filters import confirmed, dominant_geometry, select
 from test_match import (
     FISHEYE,
     POSE,
@@ -93,6 +94,43 @@ def test_the_command_confirms_both_ways_with_the_motion(tmp_path: Path, capsys: 
     assert found["both-ways"] == ways[0] != ways[1]  # the way back is held to the motion too
     assert 0.9 * found["none"] <= found["both-ways"] < found["none"]
     assert np.mean(np.linalg.norm(xy["xy2"] - fisheye_truth(xy["xy1"]), axis=1) < 1) >= 0.995
+
+
+# ---- the motion that most agree with
+
+
+def cells_of_a_motion(share: float, seed: int) -> tuple[pf.Matches, NDArray[np.bool_]]:
+    """Matches of some 600 cells of points at random depths, seen by two pinhole cameras to 0.2 px; all but `share` of
+    the cells are elsewhere. And which are right."""
+    rng = np.random.default_rng(seed)
+    corner = 8.0 * np.stack(np.meshgrid(np.arange(32), np.arange(24)), axis=-1).reshape(-1, 2)
+    ray = np.column_stack([(corner + 3.5 - [128, 96]) / 256, np.ones(len(corner))])
+    c, s = np.cos(0.1), np.sin(0.1)
+    seen = ray * rng.uniform(3, 8, (len(ray), 1)) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + [0.3, 0.05, 0.1]
+    shift = 256 * seen[:, :2] / seen[:, 2:] + [128, 96] - (corner + 3.5) + rng.normal(0, 0.2, (len(ray), 2))
+    inside = (np.abs(corner + shift - [124, 92]) < [120, 88]).all(axis=1)
+    corner, shift = corner[inside], shift[inside]
+    right = rng.random(len(corner)) < share
+    shift = np.where(right[:, None], shift, rng.uniform(0, [248, 184], corner.shape) - corner)
+    inner = np.stack(np.meshgrid(np.arange(8), np.arange(8)), axis=-1).reshape(-1, 2)
+    xy1 = (corner[:, None] + inner).reshape(-1, 2)
+    xy2 = np.clip(xy1 + np.repeat(shift, 64, axis=0), 0, [255, 191])
+    n, none = len(xy1), np.empty((0, 2))
+    number = np.arange(n)
+    maps, good = np.tile(np.eye(2), (n, 1, 1)), np.ones(n)
+    m = pf.Matches(xy1, xy2, maps, good, number, number, pf.Seeds(none, none), "ok", (192, 256), (192, 256))
+    return m, np.repeat(right, 64)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motion_is_found_that_two_of_five_agree_with(seed: int) -> None:
+    m, right = cells_of_a_motion(0.4, seed)
+    found = dominant_geometry(m, "motion", 1.0)
+    assert found is not None and np.mean(found.error[right] < 1) > 0.9
+
+
+def test_no_motion_is_made_up_where_one_of_five_agrees() -> None:
+    assert dominant_geometry(cells_of_a_motion(0.2, 0)[0], "motion", 1.0) is None
 
 
 # ---- what is said of matches
