@@ -24,6 +24,7 @@ from test_match import (
     errors,
     fisheye_seed,
     fisheye_truth,
+    noisy,
     one_seed,
     pair,
     rendered,
@@ -94,6 +95,27 @@ def test_the_command_confirms_both_ways_with_the_motion(tmp_path: Path, capsys: 
     assert found["both-ways"] == ways[0] != ways[1]  # the way back is held to the motion too
     assert 0.9 * found["none"] <= found["both-ways"] < found["none"]
     assert np.mean(np.linalg.norm(xy["xy2"] - fisheye_truth(xy["xy1"]), axis=1) < 1) >= 0.995
+
+
+# ---- the epipolar line
+
+
+@pytest.mark.parametrize("px", [1.0, 0.25])
+def test_no_match_is_farther_from_its_line_than_asked(px: float) -> None:
+    """With noise, so that fits wander."""
+    one, two = noisy(rendered(np.eye(3, 4)), 1), noisy(rendered(POSE), 2)
+    m = pf.match_quasi_dense(one, two, fisheye_seed(), FISHEYE, POSE, epipolar_px=px)
+    t = POSE[:, 3]
+    e = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ POSE[:, :3]
+
+    def value(xy1: NDArray[np.float64], xy2: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.einsum("ki,ij,kj->k", FISHEYE.unproject(xy2)[0], e, FISHEYE.unproject(xy1)[0])
+
+    steps = 1e-3 * np.eye(2)
+    slopes = [value(m.xy1 + d, m.xy2) - value(m.xy1 - d, m.xy2) for d in steps]
+    slopes += [value(m.xy1, m.xy2 + d) - value(m.xy1, m.xy2 - d) for d in steps]
+    distance = np.abs(value(m.xy1, m.xy2)) / np.linalg.norm(slopes, axis=0) * 2e-3
+    assert len(m) > 8000 and distance.max() <= px * 1.001
 
 
 # ---- the motion that most agree with
@@ -183,6 +205,14 @@ def test_filters_name_what_is_wrong_with_matches(turned: tuple, name: str, value
     for call in (lambda: pf.filter_matches(broken), lambda: pf.match_rivals(one, two, broken)):
         with pytest.raises(pf.ArgumentError, match=name):
             call()
+
+
+def test_a_seed_far_outside_is_no_seed(turned: tuple) -> None:
+    """Not the pixel that is left of it in 32 bits."""
+    one, two, there, _ = turned
+    at = np.array([[100.0 + 2.0**32, 80.0]])
+    m = pf.match_quasi_dense(one, two, pf.Seeds(at, there(at), A[None]))
+    assert m.status == "no seeds"
 
 
 def test_filters_take_whole_numbers_only(turned: tuple) -> None:

@@ -263,6 +263,8 @@ private:
         std::vector<Match> ready(seeds.size());
         parallel_for(static_cast<int>(seeds.size()), options_.threads, [&](int k) {
             const Seed &s = seeds[static_cast<size_t>(k)];
+            if (!(s.at.cwiseAbs().maxCoeff() < 32768)) // an int holds it; what is outside the image goes below
+                return;
             Match &m = ready[static_cast<size_t>(k)];
             m.x = static_cast<int>(std::lround(s.at.x()));
             m.y = static_cast<int>(std::lround(s.at.y()));
@@ -295,7 +297,7 @@ private:
                 continue;
             const uint8_t *cell = cell_2(m.centre);
             const auto line = line_at(m.x, m.y, m.centre);
-            if (!cell || !*cell || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
+            if (!cell || !*cell || off(line))
                 continue;
             commit(m);
             out_.seeds_used++;
@@ -305,6 +307,11 @@ private:
     std::optional<EpipolarLine> line_at(int x, int y, const Eigen::Vector2f &centre) const
     {
         return epipolar_ ? epipolar_->at({x, y}, centre.cast<double>()) : std::nullopt;
+    }
+
+    bool off(const std::optional<EpipolarLine> &line) const
+    {
+        return epipolar_ && (!line || line->distance() > options_.epipolar_px);
     }
 
     // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once: all windows of
@@ -548,7 +555,7 @@ private:
             return;
         }
         const auto line = line_at(c.x, c.y, c.centre);
-        if (epipolar_ && (!line || line->distance() > options_.epipolar_px)) {
+        if (off(line)) {
             out_.off_line++;
             return;
         }
@@ -560,6 +567,10 @@ private:
         cell = cell_2(local.centre);
         if (!cell || !*cell || static_cast<double>(local.zncc) < options_.zncc_min) {
             out_.taken++;
+            return;
+        }
+        if (epipolar_ && off(line_at(c.x, c.y, local.centre))) { // the fit may leave the line by a pixel
+            out_.off_line++;
             return;
         }
         out_.at_border += c.at_border;
