@@ -169,7 +169,6 @@ void bind_match(nb::module_ &m)
         .def_rw("zncc_min", &Options::zncc_min)
         .def_rw("seed_zncc_min", &Options::seed_zncc_min)
         .def_rw("texture", &Options::texture)
-        .def_rw("sigma_min", &Options::sigma_min)
         .def_rw("epipolar_px", &Options::epipolar_px)
         .def_rw("refine_seeds", &Options::refine_seeds)
         .def_rw("threads", &Options::threads);

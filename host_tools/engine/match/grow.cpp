@@ -145,13 +145,6 @@ struct Window {
     }
 };
 
-// Where the maximum of a parabola through three values is, -0.5..0.5.
-float parabola(float left, float middle, float right)
-{
-    const float bend = left - 2 * middle + right;
-    return bend < 0 ? std::clamp(0.5F * (left - right) / bend, -0.5F, 0.5F) : 0.0F;
-}
-
 // Correlations at the 3 x 3 places around a prediction: the best, and the maximum near it.
 struct Peak {
     float zncc = -1;
@@ -169,9 +162,9 @@ struct Peak {
         at_border = bi != 1 || bj != 1;
         at = {static_cast<float>(bi - 1), static_cast<float>(bj - 1)};
         if (bi == 1 && z[bj][0] > -1 && z[bj][2] > -1)
-            at.x() = parabola(z[bj][0], z[bj][1], z[bj][2]);
+            at.x() = std::clamp(vertex(z[bj][0], z[bj][1], z[bj][2]), -0.5F, 0.5F);
         if (bj == 1 && z[0][bi] > -1 && z[2][bi] > -1)
-            at.y() = parabola(z[0][bi], z[1][bi], z[2][bi]);
+            at.y() = std::clamp(vertex(z[0][bi], z[1][bi], z[2][bi]), -0.5F, 0.5F);
     }
 };
 

@@ -1,6 +1,7 @@
 #include "match/region.hpp"
 
 #include "match/moments.hpp"
+#include "match/vec.hpp"
 #include "parallel.hpp"
 
 #include <Eigen/LU>
@@ -54,13 +55,6 @@ void normalise(const ScaleStack &stack, const Region &region, int half, Normalis
 bool within(const ScaleStack &stack, const Region &region)
 {
     return inside(stack.image(), region.at.cast<float>(), region.shape.cast<float>(), 1.0F);
-}
-
-double aspect(const Eigen::Matrix2d &m)
-{
-    const double sum = m.squaredNorm(), det = std::abs(m.determinant());
-    const double both = std::sqrt(std::max(0.0, sum * sum - 4 * det * det));
-    return std::sqrt((sum + both) / std::max(sum - both, 1e-300));
 }
 
 // Lindeberg's and Mikolajczyk's iteration: the shape in which the gradient's second moments are round. False when it
@@ -120,8 +114,8 @@ std::vector<double> orientations(const Normalised &p)
     for (size_t k = 0; k < bins; k++) {
         const double left = h[(k + bins - 1) % bins], right = h[(k + 1) % bins];
         if (h[k] >= 0.8 * most && h[k] > left && h[k] >= right) {
-            const double peak = 0.5 * (left - right) / (left - 2 * h[k] + right);
-            found.emplace_back(-h[k], (static_cast<double>(k) + 0.5 + peak) * 2 * std::numbers::pi / bins);
+            const double peak = static_cast<double>(k) + 0.5 + vertex(left, h[k], right);
+            found.emplace_back(-h[k], peak * 2 * std::numbers::pi / bins);
         }
     }
     std::sort(found.begin(), found.end());
