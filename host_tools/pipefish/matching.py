@@ -47,14 +47,16 @@ class Matches:
     xy1      (K,2) pixels of image 1, whole numbers
     xy2      (K,2) where they are in image 2, to a fraction of a pixel
     affine   (K,2,2) the map between the surroundings: xy1 + v corresponds to xy2 + affine @ v
-    zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1
+    zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1: of a window one pixel wider on
+             each side than `radius` says where map or place was fitted, of that of `radius` in mode "translation", of 15 x 15
+             pixels for a seed
     parent   (K,) the match each grew from, -1 for a seed
     seed     (K,) the seed each comes from, an index into `seeds`
     status   "ok", "no seeds" (none found, or none that fits its surroundings), "no growth" (no seed came to 200
              matches: the images probably have nothing in common) or "nothing left" (by filter_matches)
     counts   of the growth, which filters leave as they are: grown (matches), seeds_used, at_border (matches found at
              the rim of the search: more than a fifth of the grown means that maps are wrong); and what became of
-             candidates: tried, low_zncc, taken (its place was), off_line (the epipolar line)
+             candidates: tried, low_zncc (before or after the fit), taken (its place was), off_line (the epipolar line)
     """
 
     xy1: Floats
@@ -225,7 +227,7 @@ def match_quasi_dense(
     turn            what settles the rotation that moments leave open: "correlation" or "peak" of the histograms of
                     gradient directions, or "epipolar"
     radius          of the correlation window in pixels, 2 to 7 [adaptive 5, constant 3, translation 2]
-    zncc_min        least correlation of a match, 0.3 to 0.99
+    zncc_min        least correlation of a match, 0.3 to 0.99; below 0.8 matches keep their parent's map
     texture         least difference to a neighbouring pixel (of 1) where a match may be
     epipolar_px     largest distance from the epipolar line, pixels
     threads         do not change the result
