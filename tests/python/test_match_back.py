@@ -24,6 +24,7 @@ from test_match import (
     errors,
     fisheye_seed,
     fisheye_truth,
+    grid,
     noisy,
     one_seed,
     pair,
@@ -95,6 +96,40 @@ def test_the_command_confirms_both_ways_with_the_motion(tmp_path: Path, capsys: 
     assert found["both-ways"] == ways[0] != ways[1]  # the way back is held to the motion too
     assert 0.9 * found["none"] <= found["both-ways"] < found["none"]
     assert np.mean(np.linalg.norm(xy["xy2"] - fisheye_truth(xy["xy1"]), axis=1) < 1) >= 0.995
+
+
+# ---- seeds
+
+
+def test_seeds_do_not_depend_on_the_sign_of_contrast() -> None:
+    """Bright spots on a dark wall, among them few that are dark: a picture and its negative."""
+    rng = np.random.default_rng(4)
+    at, xy = rng.uniform(15, [305, 225], (160, 2)), grid(320, 240)
+    spot = [[2 + 3 * rng.random(), t] for t in np.where(np.arange(160) < 120, 1.0, -1.0)]
+    value = 0.45 + 0.02 * np.sin(xy[..., 0] / 7) * np.sin(xy[..., 1] / 9)
+    for (x, y), (size, sign) in zip(at, spot, strict=True):
+        u, v = (xy[..., 0] - x) / size, (xy[..., 1] - y) / size / rng.uniform(0.5, 1)
+        value += sign * rng.uniform(0.2, 0.45) / (1 + np.exp(np.minimum(8 * (np.hypot(u, v) - 1), 50)))
+    one = np.rint(255 * value.clip(0, 1)).astype(np.uint8)
+    two = np.ascontiguousarray(one[5:, 3:])
+    right = []
+    for first, second in ((one, two), (255 - one, 255 - two)):
+        seeds = pf.find_seeds(first, second, most=40)
+        right.append(int((np.abs(seeds.xy1 - seeds.xy2 - [3, 5]).max(axis=1) < 1.5).sum()))
+    assert min(right) >= 0.9 * max(right) and min(right) >= 30, right
+
+
+def test_the_hessians_blobs_add_right_seeds_with_their_maps() -> None:
+    a = 0.7 * np.array([[0.8, -0.5], [0.6, 0.9]])
+    there, back = affine(a)
+    one, two = pair(back)
+    counts = []
+    for hessian in (False, True):
+        seeds = pf.find_seeds(one, two, hessian=hessian)
+        good = np.linalg.norm(seeds.xy2 - there(seeds.xy1), axis=1) < 2
+        assert np.median(np.linalg.norm(seeds.affine[good] - a, axis=(1, 2))) <= 0.25
+        counts.append(good.sum())
+    assert counts[1] >= 1.3 * counts[0] > 20
 
 
 # ---- the epipolar line
