@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 
 CELL, CELL_LEAST, CELL_PX, CELL_SHARE = 8, 10, 0.7, 0.6
 NEIGHBOURS = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (1, -1))  # rows, columns; half of them, the others follow
-TRIALS, JUDGED, ROUGHLY, REFITTED = 300, 800, 100, 8  # samples at a time, cells that judge them
+TRIALS, JUDGED, ROUGHLY, REFITTED = 1000, 800, 100, 8  # samples at a time, cells that judge them
 TRIALS_MOST, MISSED = 30_000, 0.01
 ISLAND = 2000
 PX = {"plane": 2.0, "motion": 1.0}
@@ -227,7 +227,7 @@ def _best_sample(
 ) -> Floats:
     """The geometry of the best of random samples of `sample` of `count` cells, refitted to what agrees with it.
 
-    By the cost of errors up to `px`: all samples on 100 cells, the best eight of each 300, refitted once, on 800 cells.
+    By the cost of errors up to `px`: all samples on 100 cells, the best eight of each 1000, refitted once, on 800 cells.
     Until a sample without a wrong cell has been missed with a probability of 1 % only, by the share that agrees."""
     random = np.random.default_rng(1)
     judged = random.permutation(count)[:JUDGED]
