@@ -227,7 +227,7 @@ def _best_sample(
 ) -> Floats:
     """The geometry of the best of random samples of `sample` of `count` cells, refitted to what agrees with it.
 
-    By the cost of errors up to `px`: all samples on 100 cells, the best eight of each 1000, refitted once, on 800 cells.
+    By the cost of errors up to `px`: all samples on 100 cells, of each 1000 the best eight, refitted, on 800.
     Until a sample without a wrong cell has been missed with a probability of 1 % only, by the share that agrees."""
     random = np.random.default_rng(1)
     judged = random.permutation(count)[:JUDGED]
