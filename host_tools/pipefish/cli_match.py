@@ -28,6 +28,8 @@ def run_match(args: argparse.Namespace) -> Result:
     filters = set(args.filter or ["consistent"])
     if {"plane", "motion"} <= filters:
         raise ArgumentError("--filter: plane or motion, not both")
+    if filters & {"plane", "motion"} and any(camera.radial != "perspective" for camera in cameras or ()):
+        raise ArgumentError("--filter: plane and motion are of pinhole pictures, the --profile is of none")
     if "none" in filters and len(filters) > 1:
         raise ArgumentError("--filter: none, or others, not both")
     options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}
@@ -39,7 +41,7 @@ def run_match(args: argparse.Namespace) -> Result:
         m = filter_matches(
             m,
             least=None if "consistent" in filters else 0,
-            back=match_back(one, two, m, **options) if "both-ways" in filters else None,
+            back=match_back(one, two, m, *geometry, **options) if "both-ways" in filters else None,
             geometry=next(iter(filters & {"plane", "motion"}), None),
             rivals=match_rivals(one, two, m, *geometry, threads=args.threads) if "unique" in filters else None,
         )

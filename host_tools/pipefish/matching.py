@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -46,13 +47,16 @@ class Matches:
     xy1      (K,2) pixels of image 1, whole numbers
     xy2      (K,2) where they are in image 2, to a fraction of a pixel
     affine   (K,2,2) the map between the surroundings: xy1 + v corresponds to xy2 + affine @ v
-    zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1
+    zncc     (K,) zero-mean normalised cross-correlation of the surroundings, at most 1: of a window one pixel wider on
+             each side than `radius` says where map or place was fitted, of that of `radius` in mode "translation", of
+             15 x 15 pixels for a seed
     parent   (K,) the match each grew from, -1 for a seed
     seed     (K,) the seed each comes from, an index into `seeds`
-    status   "ok", "no seeds" (none found, or none that fits its surroundings) or "no growth" (no seed came to 200
-             matches: the images probably have nothing in common)
-    counts   what became of candidates: tried, low_zncc, taken (its place was), off_line (the epipolar line), at_border
-             (found at the rim of the search: more than a fifth of the matches means that maps are wrong), seeds_used
+    status   "ok", "no seeds" (none found, or none that fits its surroundings), "no growth" (no seed came to 200
+             matches: the images probably have nothing in common) or "nothing left" (by filter_matches)
+    counts   of the growth, which filters leave as they are: grown (matches), seeds_used, at_border (matches found at
+             the rim of the search: more than a fifth of the grown means that maps are wrong); and what became of
+             candidates: tried, low_zncc (before or after the fit), taken (its place was), off_line (the epipolar line)
     """
 
     xy1: Floats
@@ -101,15 +105,31 @@ def grey(image: ArrayLike, name: str) -> NDArray[np.float32]:
     return np.ascontiguousarray(value)
 
 
-def find_seeds(image1: ArrayLike, image2: ArrayLike, most: int = 1000, affine: bool = True, threads: int = 1) -> Seeds:
-    """Seeds from affine-covariant regions of both images (SIFT's points with and without adapted shapes, and maximally
-    stable extremal regions), matched by descriptors. Many may be wrong. most: regions an image; affine=False: circles
-    only, faster. Large images are halved first, until they are of 800,000 pixels: the growth fits seeds anew."""
+def find_seeds(
+    image1: ArrayLike,
+    image2: ArrayLike,
+    most: int = 1000,
+    affine: bool = True,
+    threads: int = 1,
+    *,
+    hessian: bool = False,
+) -> Seeds:
+    """Seeds from affine-covariant regions of both images, matched by descriptors: SIFT's points with and without
+    adapted shapes, and maximally stable extremal regions. Many may be wrong.
+
+    most      of SIFT's points an image, and half as many extremal regions
+    affine    False: circles only, faster
+    hessian   the maxima of the Hessian's determinant too, as many as SIFT's: half as many seeds again or more, in twice
+              the time, for pairs in which few are found
+
+    Large images are halved first, until they are of 800,000 pixels: the growth fits seeds anew. Raises ArgumentError.
+    """
+    most, threads = whole("most", most, 1, 10**6), whole("threads", threads, 1)
     one, two = grey(image1, "image1"), grey(image2, "image2")
     times = 0
     while one.size > SEED_PIXELS or two.size > SEED_PIXELS:
         one, two, times = halved(one), halved(two), times + 1
-    rows = _engine.find_seeds(one, two, most, affine, affine, threads)
+    rows = _engine.find_seeds(one, two, most, affine, bool(hessian), affine, threads)
     xy = rows[:, :4] * 2**times + (2**times - 1) / 2
     return Seeds(xy[:, :2].copy(), xy[:, 2:].copy(), rows[:, 4:].reshape(-1, 2, 2).copy())
 
@@ -131,6 +151,19 @@ def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     if not np.isfinite(out).all():
         raise ArgumentError(f"{name}: not finite")
     return out
+
+
+def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """A whole number from `least` to `most`. Raises ArgumentError that names `name`."""
+    try:
+        number = index(value)
+    except TypeError:
+        raise ArgumentError(f"{name}: {value!r} is not a whole number") from None
+    if number < least:
+        raise ArgumentError(f"{name}: {number} is not at least {least}")
+    if most is not None and number > most:
+        raise ArgumentError(f"{name}: {number} is more than {most}")
+    return number
 
 
 def _given_seeds(seeds: Any) -> Seeds:
@@ -159,8 +192,8 @@ def epipolar_geometry(cameras: Any, relative_pose: Any) -> tuple[Any, Any, Float
         return None, None, None
     if cameras is None or relative_pose is None:
         raise ArgumentError("cameras and relative_pose: the epipolar geometry needs both")
-    pair = (cameras, cameras) if isinstance(cameras, Camera) else tuple(cameras)
-    if len(pair) != 2 or not all(isinstance(c, Camera) for c in pair):
+    pair = (cameras, cameras) if isinstance(cameras, Camera) else cameras
+    if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(c, Camera) for c in pair):
         raise ArgumentError("cameras: a Camera, or two of them")
     if any(c.pupil_e1 for c in pair):
         raise ArgumentError("cameras: pupil_e1: the epipolar geometry is that of central cameras")
@@ -208,7 +241,7 @@ def match_quasi_dense(
     turn            what settles the rotation that moments leave open: "correlation" or "peak" of the histograms of
                     gradient directions, or "epipolar"
     radius          of the correlation window in pixels, 2 to 7 [adaptive 5, constant 3, translation 2]
-    zncc_min        least correlation of a match, 0.3 to 0.99
+    zncc_min        least correlation of a match, 0.3 to 0.99; below 0.8 matches keep their parent's map
     texture         least difference to a neighbouring pixel (of 1) where a match may be
     epipolar_px     largest distance from the epipolar line, pixels
     threads         do not change the result
@@ -220,16 +253,17 @@ def match_quasi_dense(
     options.mode = _choice("mode", mode, MODES, _engine.MatchMode)
     options.adaptation = _choice("adaptation", adaptation, ADAPTATIONS, _engine.MatchAdaptation)
     options.turn = _choice("turn", turn, TURNS, _engine.MatchTurn)
-    options.radius = RADIUS[mode] if radius is None else radius
-    limits = {"radius": (2, 7), "zncc_min": (0.3, 0.99), "texture": (0, 1), "epipolar_px": (1e-3, 1e3)}
-    for name, value in (("zncc_min", zncc_min), ("texture", texture), ("epipolar_px", epipolar_px)):
-        setattr(options, name, value)
-    for name, (low, high) in limits.items():
-        if not low <= getattr(options, name) <= high:
-            raise ArgumentError(f"{name}: {getattr(options, name)} is not within {low} to {high}")
-    if threads < 1:
-        raise ArgumentError(f"threads: {threads} is not at least 1")
-    options.threads = threads
+    options.radius = RADIUS[mode] if radius is None else whole("radius", radius, 2, 7)
+    limits = {"zncc_min": (zncc_min, 0.3, 0.99), "texture": (texture, 0, 1), "epipolar_px": (epipolar_px, 1e-3, 1e3)}
+    for name, (value, low, high) in limits.items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise ArgumentError(f"{name}: {value!r} is not a number") from None
+        if not low <= number <= high:
+            raise ArgumentError(f"{name}: {number} is not within {low} to {high}")
+        setattr(options, name, number)
+    options.threads = whole("threads", threads, 1)
     profiles = epipolar_geometry(cameras, relative_pose)
     if turn == "epipolar" and profiles[2] is None:
         raise ArgumentError("turn: 'epipolar' needs cameras and relative_pose")
@@ -241,6 +275,7 @@ def match_quasi_dense(
     )
     grown = _engine.grow_matches(one, two, start.xy1, start.xy2, start.affine, options, *profiles)
     arrays = {name: grown.pop(name) for name in ("xy1", "xy2", "affine", "zncc", "parent", "seed")}
+    grown["grown"] = len(arrays["xy1"])
     status = "ok"
     if not grown["seeds_used"]:
         status = "no seeds"

@@ -145,7 +145,7 @@ def statistics(m: Matches) -> dict[str, Any]:
         "seeds_that_grew": int((np.bincount(m.seed) > 1).sum()) if n else 0,
         "zncc": {k: float(np.percentile(m.zncc, q)) for k, q in spread.items()} if n else None,
         "scale": {k: float(np.percentile(scale, q)) for k, q in spread.items()} if n else None,
-        "at_border_share": m.counts["at_border"] / n if n else 0.0,
+        "at_border_share": m.counts["at_border"] / max(m.counts["grown"], 1),  # filters leave both as they are
         "counts": {k: int(v) for k, v in m.counts.items()},
     }
 

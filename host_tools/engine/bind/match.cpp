@@ -169,23 +169,24 @@ void bind_match(nb::module_ &m)
         .def_rw("zncc_min", &Options::zncc_min)
         .def_rw("seed_zncc_min", &Options::seed_zncc_min)
         .def_rw("texture", &Options::texture)
-        .def_rw("sigma_min", &Options::sigma_min)
         .def_rw("epipolar_px", &Options::epipolar_px)
         .def_rw("refine_seeds", &Options::refine_seeds)
         .def_rw("threads", &Options::threads);
     m.def(
         "find_seeds",
-        [](const Picture &first, const Picture &second, int most, bool adapt, bool extremal, int threads) {
+        [](const Picture &first, const Picture &second, int most, bool adapt, bool hessian, bool extremal,
+           int threads) {
             std::vector<Seed> seeds;
             {
                 const nb::gil_scoped_release release;
                 const ScaleStack one(view(first)), two(view(second));
-                seeds = find_seeds(one, two, {{most, adapt, extremal, threads}});
+                seeds = find_seeds(one, two, {{most, adapt, hessian, extremal, threads}});
             }
             return to_python(seeds);
         },
-        nb::arg("image1"), nb::arg("image2"), nb::arg("most"), nb::arg("adapt"), nb::arg("extremal"),
-        nb::arg("threads"), "Two (H,W) float32 of 0..1 -> (S,8): x1, y1, x2, y2, the map row by row.");
+        nb::arg("image1"), nb::arg("image2"), nb::arg("most"), nb::arg("adapt"), nb::arg("hessian"),
+        nb::arg("extremal"), nb::arg("threads"),
+        "Two (H,W) float32 of 0..1 -> (S,8): x1, y1, x2, y2, the map row by row.");
     m.def("sample_image", &sample_image, nb::arg("image"), nb::arg("xy"),
           "(H,W) float32, (N,2) pixels -> (N,) float32 by cubic splines, NaN within two pixels of the rim.");
     m.def(

@@ -16,11 +16,12 @@ namespace pipefish::match
 struct EpipolarLine {
     double error;           // f' . E f
     Eigen::Vector2d n, n_2; // its derivatives by the pixel of image 1 and of image 2
+    double twist;           // of the second derivative by both (2,2), its norm: what a pixel's error adds to either
 
     // Pixels between the pair and the nearest pair that agrees (Sampson's distance).
     double distance() const;
     // The closest map with A^T n' + n = 0, which holds on every smooth surface (differentiate the constraint along it);
-    // as it is where the lines say nothing (near the epipole).
+    // as it is where the lines say nothing: within 2 to 3 pixels of the epipole.
     Eigen::Matrix2f corrected(const Eigen::Matrix2f &a) const;
 };
 

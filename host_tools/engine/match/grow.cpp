@@ -1,16 +1,15 @@
 #include "match/grow.hpp"
 
+#include "match/grow_whole.hpp"
 #include "match/moments.hpp"
 #include "match/refine.hpp"
-#include "match/vec.hpp"
 #include "parallel.hpp"
 
 #include <Eigen/LU>
-#include <opencv2/imgproc.hpp>
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
+#include <optional>
 
 namespace pipefish::match
 {
@@ -18,8 +17,7 @@ namespace pipefish::match
 namespace
 {
 
-constexpr int kReach = 2;                                            // new matches within 5 x 5 pixels of their parent
-constexpr int kRadiusMost = 7;                                       // of the correlation window
+constexpr float kFitted = 0.8F; // least correlation of what is fitted: below, a step goes anywhere
 constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
 
 // Best first, in constant time: classes of correlation, and within a class last in first out, which keeps to one part
@@ -56,124 +54,29 @@ private:
     int top_ = -1;
 };
 
-struct Candidate {
-    int order; // of the neighbour: breaks ties
-    int x, y;
-    Eigen::Vector2f centre;
-    float zncc;
-    bool at_border;
-};
-
-// A window of image 1, mean removed, rows in whole Float4s that end in zeros: a product with any other window then is
-// the sum over the window only.
-struct Window {
-    int side = 0, vectors = 0;
-    alignas(16) float v[(2 * kRadiusMost + 1) * (2 * kRadiusMost + 2)];
-    float inverse_sigma = 0;
-
-    // `from`: top left; values `step` apart. False where flat.
-    bool take(const float *from, size_t stride, int step, int radius, double sigma_min)
-    {
-        side = 2 * radius + 1;
-        vectors = (side + 3) / 4;
-        float sum = 0;
-        for (int j = 0; j < side; j++)
-            for (int i = 0; i < side; i++)
-                sum += from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)];
-        const float mean = sum / static_cast<float>(side * side);
-        float squares = 0;
-        for (int j = 0; j < side; j++) {
-            float *row = v + j * 4 * vectors;
-            store(row + 4 * vectors - 4, Float4{});
-            for (int i = 0; i < side; i++) {
-                row[i] = from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)] - mean;
-                squares += row[i] * row[i];
-            }
-        }
-        const auto count = static_cast<float>(side * side);
-        inverse_sigma = 1 / std::sqrt(squares);
-        return squares >= static_cast<float>(sigma_min * sigma_min) * count;
-    }
-
-    // The same where mean and norm are known: no sums.
-    void take_known(const float *from, size_t stride, int radius, float mean, float inverse)
-    {
-        side = 2 * radius + 1;
-        vectors = (side + 3) / 4;
-        Float4 last = {};
-        for (int k = 0; k < side - 4 * (vectors - 1); k++)
-            last[k] = 1;
-        for (int j = 0; j < side; j++) {
-            const float *row = from + static_cast<size_t>(j) * stride;
-            float *to = v + j * 4 * vectors;
-            for (int k = 0; k + 1 < vectors; k++)
-                store(to + 4 * k, load(row + 4 * k) - mean);
-            store(to + 4 * vectors - 4, (load(row + 4 * vectors - 4) - mean) * last);
-        }
-        inverse_sigma = inverse;
-    }
-
-    // Sum of products with the window at `from` (values next to each other).
-    float dot(const float *from, size_t stride) const
-    {
-        switch (side) {
-        case 5:
-            return dot_of<5>(from, stride);
-        case 7:
-            return dot_of<7>(from, stride);
-        case 9:
-            return dot_of<9>(from, stride);
-        case 11:
-            return dot_of<11>(from, stride);
-        case 13:
-            return dot_of<13>(from, stride);
-        default:
-            return dot_of<15>(from, stride);
-        }
-    }
-
-    // The same for a side known beforehand: no loops left, and the window stays in registers from one place to the
-    // next.
-    template <int kSide> float dot_of(const float *from, size_t stride) const
-    {
-        constexpr int kVectors = (kSide + 3) / 4;
-        Float4 sum = {};
-        for (int j = 0; j < kSide; j++)
-            for (int k = 0; k < kVectors; k++)
-                sum += load(v + 4 * (j * kVectors + k)) * load(from + static_cast<size_t>(j) * stride + 4 * k);
-        return total(sum);
-    }
-};
-
-// Where the maximum of a parabola through three values is, -0.5..0.5.
-float parabola(float left, float middle, float right)
+// The window at `from` (top left), values `step` apart. False where flat.
+bool take(Window &window, const float *from, size_t stride, int step, int radius, double sigma_min)
 {
-    const float bend = left - 2 * middle + right;
-    return bend < 0 ? std::clamp(0.5F * (left - right) / bend, -0.5F, 0.5F) : 0.0F;
-}
-
-// Correlations at the 3 x 3 places around a prediction: the best, and the maximum near it.
-struct Peak {
-    float zncc = -1;
-    Eigen::Vector2f at = Eigen::Vector2f::Zero();
-    bool at_border = false;
-
-    explicit Peak(const float (&z)[3][3])
-    {
-        int bi = 1, bj = 1;
-        zncc = z[1][1];
-        for (int j = 0; j < 3; j++)
-            for (int i = 0; i < 3; i++)
-                if (z[j][i] > zncc)
-                    zncc = z[j][i], bi = i, bj = j;
-        at_border = bi != 1 || bj != 1;
-        at = {static_cast<float>(bi - 1), static_cast<float>(bj - 1)};
-        if (bi == 1 && z[bj][0] > -1 && z[bj][2] > -1)
-            at.x() = parabola(z[bj][0], z[bj][1], z[bj][2]);
-        if (bj == 1 && z[0][bi] > -1 && z[2][bi] > -1)
-            at.y() = parabola(z[0][bi], z[1][bi], z[2][bi]);
+    const int side = window.side = 2 * radius + 1;
+    const int vectors = window.vectors = (side + 3) / 4;
+    float sum = 0;
+    for (int j = 0; j < side; j++)
+        for (int i = 0; i < side; i++)
+            sum += from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)];
+    const float mean = sum / static_cast<float>(side * side);
+    float squares = 0;
+    for (int j = 0; j < side; j++) {
+        float *row = window.v + j * 4 * vectors;
+        store(row + 4 * vectors - 4, Float4{});
+        for (int i = 0; i < side; i++) {
+            row[i] = from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)] - mean;
+            squares += row[i] * row[i];
+        }
     }
-};
+    const auto count = static_cast<float>(side * side);
+    window.inverse_sigma = 1 / std::sqrt(squares);
+    return squares >= static_cast<float>(sigma_min * sigma_min) * count;
+}
 
 class Grower
 {
@@ -181,26 +84,23 @@ public:
     Grower(const ScaleStack &first, const ScaleStack &second, const Options &options, const Epipolar *epipolar)
         : first_(first), second_(second), options_(options), epipolar_(epipolar)
     {
-        free_1_ = textured(first.image(), options.texture);
-        free_2_ = textured(second.image(), options.texture);
-        if (options.mode == Mode::kTranslation) {
-            whole_1_ = statistics_of(first.image());
-            whole_2_ = statistics_of(second.image());
-            last_shift_ = cv::Mat1i(first.image().size(), INT32_MIN);
-        }
+        free_.first = textured(first.image(), options.texture);
+        free_.second = textured(second.image(), options.texture);
+        if (options.mode == Mode::kTranslation)
+            whole_.emplace(first.image(), second.image(), options, free_, out_);
     }
 
     Growth run(const std::vector<Seed> &seeds)
     {
         // Once for all: growing it would copy, and touch new pages of memory, twice over.
-        out_.matches.reserve(std::min(free_1_.total(), free_2_.total()));
+        out_.matches.reserve(std::min(free_.first.total(), free_.second.total()));
         plant(seeds);
         std::vector<Candidate> found;
         for (int id = queue_.pop(); id >= 0; id = queue_.pop()) {
             const Match parent = out_.matches[static_cast<size_t>(id)];
             found.clear();
-            if (options_.mode == Mode::kTranslation)
-                look_around_whole(parent, found);
+            if (whole_)
+                whole_->look_around(parent, found);
             else
                 look_around(parent, found);
             std::sort(found.begin(), found.end(), [](const Candidate &p, const Candidate &q) {
@@ -216,7 +116,7 @@ private:
     uint8_t *cell_2(const Eigen::Vector2f &at)
     {
         const auto x = static_cast<int>(std::lround(at.x())), y = static_cast<int>(std::lround(at.y()));
-        return x >= 0 && y >= 0 && x < free_2_.cols && y < free_2_.rows ? &free_2_(y, x) : nullptr;
+        return x >= 0 && y >= 0 && x < free_.second.cols && y < free_.second.rows ? &free_.second(y, x) : nullptr;
     }
 
     // Whether a place in image 2 is free among the nine where a search of steps `a` looks. The search may end up to
@@ -236,22 +136,13 @@ private:
 
     bool is_free(int x, int y) const
     {
-        return x >= 0 && y >= 0 && x < free_1_.cols && y < free_1_.rows && free_1_(y, x) != 0;
-    }
-
-    // Which of the 5 pixels from x - 2 on are free, a byte each: most rows around a match are not, at one look. Matches
-    // are never nearer to the rim than that.
-    uint64_t free_row(int x, int y) const
-    {
-        uint64_t bytes = 0;
-        std::memcpy(&bytes, free_1_[y] + x - kReach, 2 * kReach + 1);
-        return bytes;
+        return x >= 0 && y >= 0 && x < free_.first.cols && y < free_.first.rows && free_.first(y, x) != 0;
     }
 
     void commit(const Match &m)
     {
         const int id = static_cast<int>(out_.matches.size());
-        free_1_(m.y, m.x) = 0;
+        free_.first(m.y, m.x) = 0;
         *cell_2(m.centre) = 0;
         out_.matches.push_back(m);
         queue_.push(m.zncc, id);
@@ -263,6 +154,8 @@ private:
         std::vector<Match> ready(seeds.size());
         parallel_for(static_cast<int>(seeds.size()), options_.threads, [&](int k) {
             const Seed &s = seeds[static_cast<size_t>(k)];
+            if (!(s.at.cwiseAbs().maxCoeff() < 32768)) // an int holds it; what is outside the image goes below
+                return;
             Match &m = ready[static_cast<size_t>(k)];
             m.x = static_cast<int>(std::lround(s.at.x()));
             m.y = static_cast<int>(std::lround(s.at.y()));
@@ -295,7 +188,7 @@ private:
                 continue;
             const uint8_t *cell = cell_2(m.centre);
             const auto line = line_at(m.x, m.y, m.centre);
-            if (!cell || !*cell || (epipolar_ && (!line || line->distance() > options_.epipolar_px)))
+            if (!cell || !*cell || off(line))
                 continue;
             commit(m);
             out_.seeds_used++;
@@ -307,13 +200,18 @@ private:
         return epipolar_ ? epipolar_->at({x, y}, centre.cast<double>()) : std::nullopt;
     }
 
+    bool off(const std::optional<EpipolarLine> &line) const
+    {
+        return epipolar_ && (!line || line->distance() > options_.epipolar_px);
+    }
+
     // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once: all windows of
     // all neighbours are then windows of two small pictures. Where image 1 is the finer one, samples are `step` apart.
     void look_around(const Match &m, std::vector<Candidate> &found)
     {
         uint64_t free = 0;
         for (int dy = -kReach; dy <= kReach; dy++)
-            free |= free_row(m.x, m.y + dy);
+            free |= free_.row(m.x, m.y + dy);
         if (!free)
             return;
         const Sampling s = sampling_for(first_, second_, m.a);
@@ -422,7 +320,7 @@ private:
         }
         out_.tried++;
         Window window;
-        if (!window.take((*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))
+        if (!take(window, (*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))
             return;
         float z[3][3];
         for (int ej = -1; ej <= 1; ej++)
@@ -462,85 +360,11 @@ private:
         return sum;
     }
 
-    // ---- translation: windows of the images themselves, their means and deviations computed once
-
-    // Of each window: its mean, and 1 / (deviation x side), 0 where flat.
-    struct Statistics {
-        cv::Mat1f mean, inverse;
-    };
-
-    Statistics statistics_of(const Image &image) const
-    {
-        const int n = 2 * options_.radius + 1;
-        Statistics out;
-        cv::Mat1f squares;
-        cv::boxFilter(image, out.mean, CV_32F, {n, n});
-        cv::sqrBoxFilter(image, squares, CV_32F, {n, n});
-        out.inverse.create(image.size());
-        const auto floor = static_cast<float>(options_.sigma_min * options_.sigma_min);
-        for (int y = 0; y < image.rows; y++)
-            for (int x = 0; x < image.cols; x++) {
-                const float variance = squares(y, x) - out.mean(y, x) * out.mean(y, x);
-                out.inverse(y, x) = variance >= floor ? 1 / (std::sqrt(variance) * static_cast<float>(n)) : 0.0F;
-            }
-        return out;
-    }
-
-    void look_around_whole(const Match &m, std::vector<Candidate> &found)
-    {
-        const int tx = static_cast<int>(std::lround(m.centre.x())) - m.x,
-                  ty = static_cast<int>(std::lround(m.centre.y())) - m.y;
-        for (int dy = -kReach; dy <= kReach; dy++) {
-            if (!free_row(m.x, m.y + dy))
-                continue;
-            for (int dx = -kReach; dx <= kReach; dx++)
-                if (free_1_(m.y + dy, m.x + dx))
-                    try_whole(m.x + dx, m.y + dy, tx, ty, (dy + kReach) * (2 * kReach + 1) + dx + kReach, found);
-        }
-    }
-
-    void try_whole(int x, int y, int tx, int ty, int order, std::vector<Candidate> &found)
-    {
-        const int r = options_.radius, margin = r + 4, x_2 = x + tx, y_2 = y + ty;
-        const int shift = ty * 65536 + tx; // images have at most 16384 pixels a side
-        if (last_shift_(y, x) == shift)
-            return;
-        last_shift_(y, x) = shift;
-        if (x < margin || y < margin || x + margin >= free_1_.cols || y + margin >= free_1_.rows || x_2 < margin ||
-            y_2 < margin || x_2 + margin >= free_2_.cols || y_2 + margin >= free_2_.rows)
-            return;
-        const uint8_t *cell = free_2_[y_2] + x_2;
-        const ptrdiff_t row = free_2_.cols;
-        if (!(cell[-row - 1] | cell[-row] | cell[-row + 1] | cell[-1] | cell[0] | cell[1] | cell[row - 1] | cell[row] |
-              cell[row + 1])) {
-            out_.taken++;
-            return;
-        }
-        out_.tried++;
-        const Image &one = first_.image(), &two = second_.image();
-        if (whole_1_.inverse(y, x) == 0)
-            return;
-        Window window;
-        window.take_known(one[y - r] + x - r, one.step1(), r, whole_1_.mean(y, x), whole_1_.inverse(y, x));
-        float z[3][3];
-        for (int ej = -1; ej <= 1; ej++)
-            for (int ei = -1; ei <= 1; ei++)
-                z[ej + 1][ei + 1] = whole_2_.inverse(y_2 + ej, x_2 + ei) * window.inverse_sigma *
-                                    window.dot(two[y_2 + ej - r] + x_2 + ei - r, two.step1());
-        const Peak peak(z);
-        if (static_cast<double>(peak.zncc) < options_.zncc_min) {
-            out_.low_zncc++;
-            return;
-        }
-        found.push_back({order, x, y, Eigen::Vector2f(static_cast<float>(x_2), static_cast<float>(y_2)) + peak.at,
-                         peak.zncc, peak.at_border});
-    }
-
     // ---- taking a candidate
 
     void accept(const Candidate &c, const Match &parent, int id)
     {
-        if (!free_1_(c.y, c.x))
+        if (!free_.first(c.y, c.x))
             return;
         const uint8_t *cell = cell_2(c.centre);
         if (!cell || !*cell) {
@@ -548,61 +372,30 @@ private:
             return;
         }
         const auto line = line_at(c.x, c.y, c.centre);
-        if (epipolar_ && (!line || line->distance() > options_.epipolar_px)) {
+        if (off(line)) {
             out_.off_line++;
             return;
         }
         Local local{c.centre, parent.a, c.zncc};
-        if (options_.mode == Mode::kTranslation)
-            local.centre = nudged(c);
+        if (whole_)
+            local.centre = whole_->nudged(c);
         else if (!adapt(c, line ? &*line : nullptr, local) && c.at_border)
             return; // found at the rim of its search, and no fit confirms it
+        if (static_cast<double>(local.zncc) < options_.zncc_min) {
+            out_.low_zncc++;
+            return;
+        }
         cell = cell_2(local.centre);
-        if (!cell || !*cell || static_cast<double>(local.zncc) < options_.zncc_min) {
+        if (!cell || !*cell) {
             out_.taken++;
+            return;
+        }
+        if (epipolar_ && off(line_at(c.x, c.y, local.centre))) { // the fit may leave the line by a pixel
+            out_.off_line++;
             return;
         }
         out_.at_border += c.at_border;
         commit({c.x, c.y, local.centre, local.a, std::min(local.zncc, 1.0F), id, parent.seed}); // 1 but for rounding
-    }
-
-    // One Gauss-Newton step of the place alone, in whole windows with the mean gradient of both, gain and offset
-    // removed.
-    Eigen::Vector2f nudged(const Candidate &c) const
-    {
-        const int r = options_.radius;
-        const auto x_2 = static_cast<int>(std::lround(c.centre.x())), y_2 = static_cast<int>(std::lround(c.centre.y()));
-        const Image &one = first_.image(), &two = second_.image();
-        const float mean[2] = {whole_1_.mean(c.y, c.x), whole_2_.mean(y_2, x_2)};
-        const float inverse[2] = {whole_1_.inverse(c.y, c.x), whole_2_.inverse(y_2, x_2)};
-        Float4 sums[5] = {}; // xx, xy, yy, xe, ye
-        const int n = 2 * r + 1, full = n / 4 * 4;
-        Float4 last = {};
-        for (int k = 0; k < n - full; k++)
-            last[k] = 1;
-        for (int j = -r; j <= r; j++) {
-            const float *p = one[c.y + j] + c.x - r, *q = two[y_2 + j] + x_2 - r;
-            const size_t step = one.step1(), step_2 = two.step1();
-            for (int i = 0; i < n; i += 4) {
-                const Float4 gx = 0.25F * ((load(p + i + 1) - load(p + i - 1)) * inverse[0] +
-                                           (load(q + i + 1) - load(q + i - 1)) * inverse[1]);
-                const Float4 gy = 0.25F * ((load(p + i + step) - load(p + i - step)) * inverse[0] +
-                                           (load(q + i + step_2) - load(q + i - step_2)) * inverse[1]);
-                const Float4 e = (load(p + i) - mean[0]) * inverse[0] - (load(q + i) - mean[1]) * inverse[1];
-                const Float4 x = i < full ? gx : gx * last, y = i < full ? gy : gy * last;
-                sums[0] += x * gx;
-                sums[1] += x * gy;
-                sums[2] += y * gy;
-                sums[3] += x * e;
-                sums[4] += y * e;
-            }
-        }
-        const float xx = total(sums[0]), xy = total(sums[1]), yy = total(sums[2]), xe = total(sums[3]),
-                    ye = total(sums[4]);
-        const float ridge = 1e-3F * (xx + yy), det = (xx + ridge) * (yy + ridge) - xy * xy;
-        const Eigen::Vector2f t = Eigen::Vector2f((yy + ridge) * xe - xy * ye, (xx + ridge) * ye - xy * xe) / det;
-        const Eigen::Vector2f whole(static_cast<float>(x_2), static_cast<float>(y_2));
-        return t.cwiseAbs().maxCoeff() <= 0.75F ? Eigen::Vector2f(whole + t) : c.centre;
     }
 
     // Whether a fit was taken.
@@ -615,7 +408,7 @@ private:
             adapt_by_moments(first_, second_, c.x, c.y, options_, line, local);
         const bool fitted =
             options_.adaptation == Adaptation::kIntensity ||
-            (c.zncc >= 0.8F && refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local));
+            (c.zncc >= kFitted && refine(first_, second_, c.x, c.y, r + 1, options_.sigma_min, 1.0F, 0.4F, local));
         if (line) {
             Local held = local;
             held.a = line->corrected(local.a);
@@ -630,14 +423,10 @@ private:
     const ScaleStack &first_, &second_;
     const Options &options_;
     const Epipolar *epipolar_;
-    cv::Mat1b free_1_,
-        free_2_; // where a match may be: textured, and without one yet. Bytes: they are all over the cache
-    Statistics whole_1_, whole_2_;
-    // Of each pixel of image 1, the shift it was last tried with and failed: it would fail again, as windows stay the
-    // same and what is taken stays taken. Saves a third of the work.
-    cv::Mat1i last_shift_;
+    Free free_;
     Queue queue_;
     Growth out_;
+    std::optional<WholeSearch> whole_; // for translation
     std::vector<float> block_;
     size_t stride_ = 0;
     bool known_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};

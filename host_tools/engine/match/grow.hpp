@@ -36,7 +36,7 @@ struct Options {
     Adaptation adaptation = Adaptation::kFit;
     Turn turn = Turn::kCorrelation;
     int radius = 5;        // of the correlation window; 2..7
-    double zncc_min = 0.8; // of a match
+    double zncc_min = 0.8; // of a match; maps of what correlates below 0.8 are not fitted but their parent's
     double seed_zncc_min = 0.8;
     double texture = 0.01;    // least difference to a neighbour (of 1)
     double sigma_min = 0.01;  // least deviation within a window
@@ -49,6 +49,8 @@ struct Match {
     int x = 0, y = 0;                                 // pixel of image 1
     Eigen::Vector2f centre = Eigen::Vector2f::Zero(); // where it is in image 2
     Eigen::Matrix2f a = Eigen::Matrix2f::Identity();  // maps offsets in image 1 to offsets in image 2
+    // Of the window as resampled with its own map: one of radius + 1 where it was fitted, of `radius` where it was not
+    // (translation), of radius 7 for a seed.
     float zncc = -1;
     int parent = -1; // the match it grew from, -1 for a seed
     int seed = -1;   // the seed it comes from, an index into what was given
@@ -62,7 +64,7 @@ struct Seed {
 struct Growth {
     std::vector<Match> matches;
     int seeds_used = 0; // seeds that passed
-    // Candidates that were turned away, by reason.
+    // Candidates that were looked at, and those turned away, by reason: low_zncc before or after the fit.
     int64_t tried = 0, low_zncc = 0, taken = 0, off_line = 0;
     int64_t at_border = 0; // matches found at the rim of their search: many mean a wrong map
 };

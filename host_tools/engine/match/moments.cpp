@@ -89,12 +89,6 @@ Histogram directions(const Patch &p, const Eigen::Matrix2d &t)
     return smooth;
 }
 
-double vertex(double left, double middle, double right)
-{
-    const double bend = left - 2 * middle + right;
-    return bend < 0 ? 0.5 * (left - right) / bend : 0;
-}
-
 // The shift of h that resembles h_2 most, among those within 30 degrees of none.
 double turn_by_correlation(const Histogram &h, const Histogram &h_2)
 {

@@ -2,8 +2,6 @@
 
 #include "match/vec.hpp"
 
-#include <Eigen/LU>
-
 #include <algorithm>
 #include <cmath>
 
@@ -74,11 +72,8 @@ Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const E
 
 bool sane(const Eigen::Matrix2f &a)
 {
-    const float det = std::abs(a.determinant()), sum = a.squaredNorm();
-    // singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = sum
-    const float both = std::sqrt(std::max(0.0F, sum * sum - 4 * det * det));
-    const float most = 0.5F * (sum + both), least = 0.5F * (sum - both);
-    return det > 1.0F / 36 && det < 36 && most <= 36 * least;
+    const float det = std::abs(a.determinant());
+    return det > 1.0F / 36 && det < 36 && aspect(a) <= 6;
 }
 
 bool compare(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local,

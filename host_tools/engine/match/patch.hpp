@@ -3,7 +3,11 @@
 
 #include "match/image.hpp"
 
-#include <Eigen/Core>
+#include <Eigen/LU>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
 
 namespace pipefish::match
 {
@@ -54,6 +58,14 @@ bool compare(const ScaleStack &first, const ScaleStack &second, int x, int y, in
              Pair &out);
 // The same where only the correlation matters.
 bool measure(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, Local &local);
+
+// Ratio of the singular values of a map, 1 or more; infinite for a singular one.
+template <typename T> T aspect(const Eigen::Matrix<T, 2, 2> &a)
+{
+    const T sum = a.squaredNorm(), det = std::abs(a.determinant()); // of their squares, and their product
+    const T both = std::sqrt(std::max(T(0), sum * sum - 4 * det * det));
+    return sum - both > 0 ? std::sqrt((sum + both) / (sum - both)) : std::numeric_limits<T>::infinity();
+}
 
 // Bounds on what a map may be: shape (ratio of singular values) at most 6, scale 1/6 to 6.
 bool sane(const Eigen::Matrix2f &a);

@@ -14,12 +14,12 @@ namespace
 {
 
 // The window's weight at -r..r, 0 beyond: a Gaussian of sigma 0.6 r.
-struct Window {
+struct Weights {
     int r = 0;
     alignas(16) float w[kPatchWide] = {};
     alignas(16) float at[kPatchWide] = {};
 
-    explicit Window(int radius) : r(radius)
+    explicit Weights(int radius) : r(radius)
     {
         for (int i = 0; i < kPatchWide; i++) {
             at[i] = static_cast<float>(i - radius);
@@ -29,11 +29,11 @@ struct Window {
     }
 };
 
-const Window &window_of(int r)
+const Weights &weights_of(int r)
 {
-    thread_local Window kept(r);
+    thread_local Weights kept(r);
     if (kept.r != r)
-        kept = Window(r);
+        kept = Weights(r);
     return kept;
 }
 
@@ -47,7 +47,7 @@ struct Normal {
 };
 
 // Row j of both patches: residual e = a - b, mean gradient, weighted and summed over the columns.
-void sum_row(const Patch &p, Level lp, const Patch &q, Level lq, int j, const Window &window, double (&out)[kSums][3])
+void sum_row(const Patch &p, Level lp, const Patch &q, Level lq, int j, const Weights &window, double (&out)[kSums][3])
 {
     Float4 s[kSums][3] = {};
     const float sp = 1 / lp.sigma, sq = 1 / lq.sigma;
@@ -75,7 +75,7 @@ void sum_row(const Patch &p, Level lp, const Patch &q, Level lq, int j, const Wi
 
 Normal normal_of(const Patch &p, Level lp, const Patch &q, Level lq, int r)
 {
-    const Window &window = window_of(r);
+    const Weights &window = weights_of(r);
     // m[sum][i][j]: weighted by column^i row^j, i + j <= 2
     double m[kSums][3][3] = {};
     for (int j = 1; j <= 2 * r + 1; j++) {
@@ -112,7 +112,7 @@ Normal normal_of(const Patch &p, Level lp, const Patch &q, Level lq, int r)
 } // namespace
 
 bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int r, double sigma_min, float max_shift,
-            float max_change, Local &local, float *shift)
+            float max_change, Local &local)
 {
     Pair pair;
     if (!compare(first, second, x, y, r, sigma_min, local, pair))
@@ -127,8 +127,6 @@ bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int
     Eigen::Matrix2f c;
     c << d(2), d(3), d(4), d(5);
     const Eigen::Vector2f t = d.head<2>();
-    if (shift)
-        *shift = t.norm();
     if (!(t.norm() < max_shift) || (max_change > 0 && !(c.norm() <= max_change))) // NaN too
         return false;
     Local moved = local;

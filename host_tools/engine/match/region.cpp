@@ -1,11 +1,12 @@
 #include "match/region.hpp"
 
+#include "match/detect.hpp"
 #include "match/moments.hpp"
+#include "match/vec.hpp"
 #include "parallel.hpp"
 
 #include <Eigen/LU>
-#include <opencv2/features2d.hpp>
-#include <opencv2/imgproc.hpp>
+#include <opencv2/core.hpp>
 
 #include <algorithm>
 #include <cmath>
@@ -56,13 +57,6 @@ bool within(const ScaleStack &stack, const Region &region)
     return inside(stack.image(), region.at.cast<float>(), region.shape.cast<float>(), 1.0F);
 }
 
-double aspect(const Eigen::Matrix2d &m)
-{
-    const double sum = m.squaredNorm(), det = std::abs(m.determinant());
-    const double both = std::sqrt(std::max(0.0, sum * sum - 4 * det * det));
-    return std::sqrt((sum + both) / std::max(sum - both, 1e-300));
-}
-
 // Lindeberg's and Mikolajczyk's iteration: the shape in which the gradient's second moments are round. False when it
 // does not settle, or on a shape longer than 6 times its width.
 bool adapt_shape(const ScaleStack &stack, Region &region)
@@ -88,7 +82,7 @@ bool adapt_shape(const ScaleStack &stack, Region &region)
         if (!(m.determinant() > 1e-6 * m.trace() * m.trace()))
             return false;
         const double both = std::sqrt(std::max(0.0, m.trace() * m.trace() - 4 * m.determinant()));
-        if (m.trace() - both > 0.9 * (m.trace() + both)) // ratio of eigenvalues above 0.9
+        if (m.trace() - both > 0.95 * (m.trace() + both)) // ratio of eigenvalues
             return true;
         Eigen::Matrix2d u = region.shape * root(m).inverse();
         u *= std::sqrt(det / std::abs(u.determinant()));
@@ -120,8 +114,8 @@ std::vector<double> orientations(const Normalised &p)
     for (size_t k = 0; k < bins; k++) {
         const double left = h[(k + bins - 1) % bins], right = h[(k + 1) % bins];
         if (h[k] >= 0.8 * most && h[k] > left && h[k] >= right) {
-            const double peak = 0.5 * (left - right) / (left - 2 * h[k] + right);
-            found.emplace_back(-h[k], (static_cast<double>(k) + 0.5 + peak) * 2 * std::numbers::pi / bins);
+            const double peak = static_cast<double>(k) + 0.5 + vertex(left, h[k], right);
+            found.emplace_back(-h[k], peak * 2 * std::numbers::pi / bins);
         }
     }
     std::sort(found.begin(), found.end());
@@ -162,49 +156,6 @@ Eigen::Matrix<float, kDescriptor, 1> descriptor(const Normalised &p)
         out = pass ? out : Eigen::Matrix<float, kDescriptor, 1>(out.cwiseMin(0.2F));
     }
     return (out / std::max(out.sum(), 1e-12F)).cwiseSqrt();
-}
-
-// Circles of SIFT's detector and ellipses of extremal regions, of the detected size.
-std::vector<Region> detect(const ScaleStack &stack, const RegionOptions &options)
-{
-    cv::Mat1b grey;
-    stack.image().convertTo(grey, CV_8U, 255);
-    std::vector<Region> out;
-    std::vector<cv::KeyPoint> points;
-    cv::SIFT::create(options.most, 3, 0.02)->detect(grey, points);
-    std::stable_sort(points.begin(), points.end(),
-                     [](const auto &p, const auto &q) { return p.response > q.response; });
-    const cv::Point2f *last = nullptr;
-    for (const cv::KeyPoint &p : points) {
-        if (last && *last == p.pt)
-            continue; // a second orientation: ours are found later
-        last = &p.pt;
-        out.push_back({{static_cast<double>(p.pt.x), static_cast<double>(p.pt.y)},
-                       Eigen::Matrix2d::Identity() * (static_cast<double>(p.size) / 2 * 1.25)});
-        if (static_cast<int>(out.size()) >= options.most)
-            break;
-    }
-    if (!options.extremal)
-        return out;
-    std::vector<std::vector<cv::Point>> sets;
-    std::vector<cv::Rect> boxes;
-    const int area = grey.rows * grey.cols;
-    cv::MSER::create(5, 40, area / 20, 0.25, 0.2)->detectRegions(grey, sets, boxes);
-    for (size_t k = 0; k < std::min(sets.size(), static_cast<size_t>(options.most) / 2); k++) {
-        Eigen::Vector2d mean = Eigen::Vector2d::Zero();
-        for (const cv::Point &p : sets[k])
-            mean += Eigen::Vector2d(p.x, p.y);
-        mean /= static_cast<double>(sets[k].size());
-        Eigen::Matrix2d spread = Eigen::Matrix2d::Zero();
-        for (const cv::Point &p : sets[k]) {
-            const Eigen::Vector2d d = Eigen::Vector2d(p.x, p.y) - mean;
-            spread += d * d.transpose();
-        }
-        spread /= static_cast<double>(sets[k].size());
-        if (spread.determinant() > 1 && aspect(root(spread)) < 6)
-            out.push_back({mean, 2 * root(spread) * 0.75}); // a filled ellipse has half axes of 2 deviations
-    }
-    return out;
 }
 
 } // namespace

@@ -15,8 +15,9 @@ struct Region {
 };
 
 struct RegionOptions {
-    int most = 3000;      // strongest first
-    bool adapt = true;    // shapes adapted to the surroundings (the Harris-affine iteration), else circles
+    int most = 3000;      // of SIFT's, as many of the Hessian's, half as many extremal ones; strongest first
+    bool adapt = true;    // shapes adapted to the surroundings (Lindeberg's iteration), else circles
+    bool hessian = false; // blobs of the Hessian's determinant too
     bool extremal = true; // maximally stable extremal regions too
     int threads = 1;
 };
