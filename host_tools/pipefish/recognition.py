@@ -5,6 +5,7 @@ docs/recognition.md explains score and limits; the work on a pair is C++ (engine
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -79,6 +80,7 @@ class Segment:
     coverage        share of its textured pixels that are matched, counted in the coarser picture
     correlation     mean of (zncc - 0.5) / 0.5
     matches         pixels
+    centre          x, y of its middle in the scene
     view            label of the model's picture
     model_contours, scene_contours  outer boundaries, (N,2) each, in pixels of the pictures given
     """
@@ -88,6 +90,7 @@ class Segment:
     coverage: float
     correlation: float
     matches: int
+    centre: tuple[float, float]
     view: str
     model_contours: list[Floats]
     scene_contours: list[Floats]
@@ -102,7 +105,8 @@ class Recognition:
     sum_score      the sum over the views
     present        whether score is at least the threshold
     view           label of the best view
-    segments       of the best view, and of others whose score is at least the threshold; best first
+    segments       of the best view, and of others whose score is at least the threshold, as far as they are where the
+                   best view's best segment has the object; best first
     extent         outline of the whole model, (N,2) each, carried into the scene by the affine map that fits the
                    matches of the view that has most of them: where all of the object would be, hidden parts too
     outline        (N,2) each: what is seen of a present object, its bare parts too: the extent, settled by the
@@ -243,14 +247,16 @@ def _ahead(pool: ThreadPoolExecutor, scenes: Sequence[ArrayLike], max_pixels: in
 def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], threshold: float) -> Recognition:
     scores = np.array([f["score"] for f in found])
     best = int(np.argmax(scores))
-    segments = [
-        Segment(**s, view=model.labels[k])
-        for k, f in enumerate(found)
+    x, y, radius = found[best]["place"]
+    parts = [
+        [s for s in f["segments"] if math.hypot(s["centre"][0] - x, s["centre"][1] - y) <= radius]
         if k == best or scores[k] >= threshold
-        for s in f["segments"]
+        else []
+        for k, f in enumerate(found)
     ]
+    segments = [Segment(**s, view=model.labels[k]) for k, own in enumerate(parts) for s in own]
     segments.sort(key=lambda s: (s.view != model.labels[best], -s.score))
-    most = max(range(len(found)), key=lambda k: sum(s["matches"] for s in found[k]["segments"]))
+    most = max(range(len(found)), key=lambda k: sum(s["matches"] for s in parts[k]))
     return Recognition(
         object=model.name,
         scene=scene,

@@ -123,6 +123,35 @@ def test_what_another_object_covers_is_not_the_ones() -> None:
     assert shared.sum() > 300 and (rose.mask((H, W)) & shared).sum() < 0.1 * shared.sum()
 
 
+def test_what_is_farther_away_than_the_object_is_large_is_no_part_of_it() -> None:
+    """Its halves, 250 pixels apart: one counts, whether both are in one view or each in its own."""
+    picture, mask = model_picture("rose")
+    halves = (
+        np.where(np.arange(picture.shape[1]) < 70, mask, False),
+        np.where(np.arange(picture.shape[1]) > 69, mask, 0),
+    )
+    apart = waves(grid(2 * W, H), 50)
+    for half, x in zip(halves, (10, 260), strict=True):
+        place = apart[10 : 10 + mask.shape[0], x : x + mask.shape[1]]
+        place[half != 0] = picture[half != 0]
+    views = [(picture, half) for half in halves]
+    for model in (pf.ObjectModel("whole", [(picture, mask)]), pf.ObjectModel("halves", views)):
+        (r,) = pf.recognise([model], [apart])
+        seen = r.matched(apart.shape)
+        assert r.present and min(seen[:, :W].sum(), seen[:, W:].sum()) == 0
+        assert r.view != "view 1" or len(r.segments) == 1
+
+
+def test_a_piece_of_few_pixels_in_the_scene_is_no_evidence() -> None:
+    """45 x 45 pixels of a model are some 60 cells at any size, a quarter of the pixels in a scene of half the size."""
+    picture, mask = model_picture("rose")
+    mask = np.pad(mask[30:75, 40:85], ((30, mask.shape[0] - 75), (40, mask.shape[1] - 85)))
+    piece, large = pf.ObjectModel("piece", [(picture, mask)]), scene("rose")[0]
+    same, half = pf.recognise([piece], [large, large.reshape(H // 2, 2, W // 2, 2).mean(axis=(1, 3))])
+    assert same.present
+    assert half.score == 0
+
+
 def _whole(r: pf.Recognition) -> NDArray[np.bool_]:
     return replace(r, outline=r.extent).mask((H, W))
 

@@ -61,6 +61,7 @@ nb::dict to_python(const Recognition &r)
         d["coverage"] = s.coverage;
         d["correlation"] = s.correlation;
         d["matches"] = s.matches;
+        d["centre"] = nb::make_tuple(s.centre.x, s.centre.y);
         d["model_contours"] = to_python(s.model);
         d["scene_contours"] = to_python(s.scene);
         segments.append(d);
@@ -70,6 +71,7 @@ nb::dict to_python(const Recognition &r)
     out["matches"] = r.matches;
     out["score"] = r.score;
     out["segments"] = segments;
+    out["place"] = nb::make_tuple(r.place.centre.x, r.place.centre.y, r.place.radius);
     out["extent"] = to_python(r.extent);
     return out;
 }

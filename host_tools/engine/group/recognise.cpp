@@ -18,6 +18,8 @@ namespace
 constexpr int kMargin = 24;        // pixels kept around a mask, so that windows and descriptors fit
 constexpr double kTexture = 0.01;  // as match::Options
 constexpr double kLeastArea = 100; // pixels of a model
+constexpr double kBeyond = 1.25;   // radii of the object's circle: its map is known where it was matched only
+constexpr double kEvidence = 0.5;  // pixels matched of a group's least vertices' cells, in the coarser picture
 
 // What is outside the mask becomes a smooth continuation of what is inside: the mask's edge is no edge then, and no
 // background is learned.
@@ -111,6 +113,26 @@ std::vector<std::vector<cv::Point2d>> in_picture(const std::vector<Outline> &lin
     return out;
 }
 
+// The circle around the model's outline, carried over by a segment's map: by its larger scale, since the smaller one is
+// foreshortened. A rigid object's parts are in it whichever way it is turned.
+Place place_of(const Eigen::Matrix<double, 2, 3> &map, const Prepared &model, const Prepared &scene)
+{
+    std::vector<cv::Point2f> points;
+    for (const Outline &line : outlines(model.mask()))
+        points.insert(points.end(), line.begin(), line.end());
+    cv::Point2f middle;
+    float radius = 0;
+    cv::minEnclosingCircle(points, middle, radius);
+    const Eigen::Matrix2d a = map.leftCols<2>();
+    const double squares = a.squaredNorm(), twice = 2 * std::abs(a.determinant());
+    const double larger = 0.5 * (std::sqrt(squares + twice) + std::sqrt(std::max(0.0, squares - twice)));
+    const Eigen::Vector2d at = map * Eigen::Vector3d(middle.x, middle.y, 1);
+    const cv::Point2d centre(at.x(), at.y()), rim(at.x() + kBeyond * larger * radius, at.y());
+    Place out{scene.in_picture(centre), 0};
+    out.radius = scene.in_picture(rim).x - out.centre.x;
+    return out;
+}
+
 Candidate measure(const std::vector<match::Match> &matches, const Groups &groups, int group, const Prepared &model,
                   const Prepared &scene, double reach)
 {
@@ -134,6 +156,9 @@ Candidate measure(const std::vector<match::Match> &matches, const Groups &groups
     s.coverage = std::min(1.0, matched / std::max(1.0, textured * std::min(1.0, det)));
     s.correlation = std::min(1.0, correlation / matched);
     s.score = s.area * s.coverage * s.correlation;
+    const cv::Moments moments = cv::moments(out.scene, true);
+    if (moments.m00 > 0)
+        s.centre = scene.in_picture({moments.m10 / moments.m00, moments.m01 / moments.m00});
     s.model = in_picture(outlines(one), model);
     s.scene = in_picture(outlines(out.scene), scene);
     return out;
@@ -215,9 +240,16 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
                      [](const Candidate &a, const Candidate &b) { return a.segment.score > b.segment.score; });
     Mask taken(scene.mask().size(), 0);
     Fit fit;
+    // Vertices are cells of the model's picture. In a smaller scene as many stand on fewer pixels, and match by chance.
+    const double evidence = kEvidence * options.grouping.least * options.grouping.cell * options.grouping.cell;
     for (Candidate &c : found) {
         const int area = cv::countNonZero(c.scene);
-        if (c.segment.score < options.least || 2 * cv::countNonZero(c.scene & taken) > area)
+        if (c.segment.score < options.least || c.segment.matches < evidence ||
+            2 * cv::countNonZero(c.scene & taken) > area)
+            continue;
+        if (out.segments.empty())
+            out.place = place_of(c.fit.map(), model, scene);
+        else if (!out.place.has(c.segment.centre))
             continue;
         taken |= c.scene;
         out.score = std::min(1.0, out.score + c.segment.score);

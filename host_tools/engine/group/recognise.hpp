@@ -4,6 +4,8 @@
 #include "group/support.hpp"
 #include "match/region.hpp"
 
+#include <cmath>
+
 namespace pipefish::group
 {
 
@@ -40,13 +42,22 @@ struct Segment {
     double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
     double correlation = 0; // mean of (zncc - 0.5) / 0.5
     int matches = 0;
+    cv::Point2d centre;                                 // of its support in the scene
     std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
+};
+
+// Where a rigid object as a whole can be in the scene, pixels of the picture that was given.
+struct Place {
+    cv::Point2d centre;
+    double radius = 0;
+    bool has(cv::Point2d p) const { return std::hypot(p.x - centre.x, p.y - centre.y) <= radius; }
 };
 
 struct Recognition {
     int seeds = 0, matches = 0;    // before grouping
     double score = 0;              // sum over `segments`, at most 1
-    std::vector<Segment> segments; // best first; none overlaps a better one by half in the scene
+    std::vector<Segment> segments; // best first; none overlaps a better one by half, all are in `place`
+    Place place;                   // by the best segment's map
     // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
     // of the object would be.
     std::vector<std::vector<cv::Point2d>> extent;
