@@ -30,6 +30,7 @@ GROSS = 4.0  # standard deviations
 # Of the diameter. Neighbouring tracks see the same relief in the same changing light and go astray together, which no
 # point's own sigma knows: heaps of 0.7 to 1.2 mm were found in a smooth DN300.
 LEAST_HEIGHT = 0.005
+SURELY = 1.645  # of its own sigmas by which a patch has to stand out further than that: 95 %, one-sided
 
 
 def chi2_limit(p: float, freedom: int) -> float:
@@ -326,7 +327,7 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
             cluster = _grown(p, seed, sign, radius, spacing, float(np.abs(median[seed]).max()))
             if len(cluster) >= 4:
                 event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
-                if event["height"] < LEAST_HEIGHT * tube.summary["d_mean"]:
+                if event["height"] - SURELY * event["height_sigma"] < LEAST_HEIGHT * d:
                     continue
                 ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
                 if not (sign > 0 and ringed and event["length"] < 0.3 * d):

@@ -56,6 +56,13 @@ def test_an_open_joint_is_found_with_its_gap() -> None:
     assert joint["step"] is None
 
 
+@pytest.mark.parametrize(("height", "is_told"), [(0.0016, False), (0.0025, True)])
+def test_a_heap_is_told_where_it_is_surely_more_than_tracks_have_in_common(height: float, is_told: bool) -> None:
+    pipe = Pipe(deposit=(1.4, 3.0, 0.12, height), noise=0.0003, seed=5)
+    tube = pf.fit_tube(pipe.points(2500), pipe.noise, pipe.cameras())
+    assert [e["kind"] for e in tube.events] == ["deposit"] * is_told
+
+
 @pytest.mark.parametrize(("clock", "height"), [(3.0, 0.015), (0.05, 0.009), (4.5, -0.012)])
 def test_deposits_and_holes_have_place_height_and_kind(clock: float, height: float) -> None:
     pipe = Pipe(deposit=(1.4, clock, 0.15, height), outliers=0.1, seed=5)
