@@ -28,6 +28,7 @@
 #define TICK_MS        50
 #define OVERRIDES_MAX  128
 #define ALONE_NS       UINT64_C(10000000000) /* without a host, after a signal; hosts pause 5 s at most between tries */
+#define ROUND_NS       UINT64_C(1000000000)  /* the GPIO thread goes round several times in it */
 #define SILENCES       4 /* keepalives without an answer after which a host counts as gone, as the link has it */
 
 enum { DONE = 0, FAILED = 1, USAGE = 2 };
@@ -259,7 +260,9 @@ static void note_gpio(pf_daemon *d, pf_gpio_state *before)
 {
     pf_gpio_state now;
     d->gpio.ops->state(d->gpio.self, &now);
-    pf_pulse_note(PF_PULSE_GPIO, now.round_ns);
+    /* A round of less than a second ago says nothing: should this thread hang, it must not be the GPIO's that is named.
+     */
+    pf_pulse_note(PF_PULSE_GPIO, now.round_ns != 0 && pf_now() - now.round_ns > ROUND_NS ? now.round_ns : 0);
     if (now.is_stopped && !before->is_stopped)
         pf_log(PF_LOG_WARNING, "emergency stop: the lamp is off until the daemon starts anew");
     for (uint32_t bit = PF_LIMIT_FRONT; bit <= PF_LIMIT_REAR; bit <<= 1)
@@ -440,10 +443,12 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
                (double)store.capacity / 1e6);
         return FAILED;
     }
+    pf_pulse_work();
     if (!pf_store_open(&d->store, &d->spool, survey, &store, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }
+    pf_pulse_work();
     if (!pf_still_open(&d->still, camera->width, camera->height))
         (void)snprintf(error, sizeof error, "no memory for a still");
     else if (pf_courier_open(&courier, d, error, sizeof error) &&
@@ -451,6 +456,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
         pf_log(PF_LOG_INFO, "%s; %s; survey %02x%02x%02x%02x, boot %u; %s", d->source,
                d->transport.ops->name(d->transport.self), survey->id[0], survey->id[1], survey->id[2], survey->id[3],
                survey->boots, survey->is_resumed ? "goes on" : "begins");
+        pf_pulse_work();
         is_good = pf_pipeline_start(pipeline, error, sizeof error);
     }
     if (is_good) {
@@ -510,6 +516,7 @@ static int open_and_run(pf_daemon *d, pf_guard *guard, int signals)
         if (open_transport(d, error, sizeof error)) {
             pf_pulse_work();
             if (pf_spool_open(&d->spool, &spool, error, sizeof error) == PF_OK) {
+                pf_pulse_work();
                 if (pf_survey_open(&survey, &before, &d->spool, setup, error, sizeof error)) {
                     memcpy(d->survey_id, survey.id, sizeof d->survey_id);
                     code = run_survey(d, &survey, &before, guard, signals);

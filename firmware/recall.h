@@ -1,8 +1,9 @@
 /* What worked last. A daemon that did not come up three times in a row with the same settings takes those of its last
  * good run. A start is good once it has run for a minute, or ended as it was meant to. One that was up and well for
- * five seconds when the board lost its power is neither good nor failed. A folder keeps starts    how many starts in a
- * row were not good, the SHA-256 of the settings' file they had, the kernel's boot id at the last of them, and "up"
- * once that was up and well good.ini  every setting of the last good run
+ * five seconds when the board lost its power is neither good nor failed. A folder keeps
+ * - starts: how many starts in a row were not good, the SHA-256 of the settings' file they had, the kernel's boot id at
+ *   the last of them, and "up" once that was up and well
+ * - good.ini: every setting of the last good run
  */
 #ifndef PIPEFISHD_RECALL_H
 #define PIPEFISHD_RECALL_H

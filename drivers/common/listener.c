@@ -74,9 +74,10 @@ pf_status pf_listener_open(int *fd, char *name, const pf_address *address, const
     *fd = socket(a.any.sa_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     if (*fd < 0)
         return pf_fail(failure, PF_ERR_IO, "%s: %s", name, strerror(errno));
-    /* Before the cable is in, or the address server has answered, a board does not have its address. */
+    /* Before the cable is in, or the address server has answered, a board does not have its address; one that is being
+     * looked at for duplicates is listed and cannot be bound. */
     const bool must_wait = !is_there(&a);
-    if ((must_wait && setsockopt(*fd, IPPROTO_IP, IP_FREEBIND, &on, sizeof on) != 0) ||
+    if (setsockopt(*fd, IPPROTO_IP, IP_FREEBIND, &on, sizeof on) != 0 ||
         setsockopt(*fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof on) != 0 || bind(*fd, &a.any, size) != 0 ||
         listen(*fd, BACKLOG) != 0 || getsockname(*fd, &a.any, &size) != 0) {
         pf_status status = pf_fail(failure, PF_ERR_IO, "%s: %s", name, strerror(errno));

@@ -26,6 +26,15 @@ static const char *wait_for_hung(void)
     return hung();
 }
 
+/* After longer than a thread may work on one thing; a busy machine gets more time. */
+static bool is_well_again(void)
+{
+    (void)poll(NULL, 0, 60);
+    for (int i = 0; i < 3000 && hung() != NULL; i++)
+        (void)poll(NULL, 0, 10);
+    return hung() == NULL;
+}
+
 static _Atomic bool is_hanging;
 
 static void track(void *user, void *item)
@@ -43,23 +52,22 @@ static void test_a_tracker_that_hangs_is_named(void)
     char error[128];
     int frame = 1;
     TEST_ASSERT_TRUE(pf_worker_open(&worker, track, NULL, error, sizeof error));
-    (void)poll(NULL, 0, 60);
-    TEST_ASSERT_NULL(hung());
+    TEST_ASSERT_TRUE(is_well_again());
     is_hanging = true;
     pf_worker_give(worker, &frame);
     TEST_ASSERT_EQUAL_STRING("tracking", wait_for_hung());
     is_hanging = false;
     pf_worker_wait(worker);
-    (void)poll(NULL, 0, 60);
-    TEST_ASSERT_NULL(hung());
+    TEST_ASSERT_TRUE(is_well_again());
     pf_worker_close(worker);
 }
 
 /* Proves: a thread that knows nothing of pulses, as the GPIO driver's, hangs when it has not gone round for long. */
 static void test_a_round_that_does_not_come_is_named(void)
 {
-    pf_pulse_note(PF_PULSE_GPIO, pf_now());
-    TEST_ASSERT_NULL(hung());
+    const uint64_t now = pf_now();
+    pf_pulse_note(PF_PULSE_GPIO, now);
+    TEST_ASSERT_NULL(pf_pulse_hung(now, LIMIT_NS));
     pf_pulse_note(PF_PULSE_GPIO, pf_now() - 2 * LIMIT_NS);
     TEST_ASSERT_EQUAL_STRING("GPIO", hung());
     pf_pulse_note(PF_PULSE_GPIO, 0);

@@ -389,18 +389,25 @@ static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
     close_store();
 }
 
+/* After longer than a thread may work on one thing; a busy machine gets more time. */
+static bool is_well_again(void)
+{
+    (void)poll(NULL, 0, 60);
+    for (int i = 0; i < 3000 && pf_pulse_hung(pf_now(), 50000000) != NULL; i++)
+        (void)poll(NULL, 0, 10);
+    return pf_pulse_hung(pf_now(), 50000000) == NULL;
+}
+
 /* Proves: a disk that takes for ever makes the store a thread that hangs, for whoever feeds the watchdogs; one that
  * waits for work, or for a full disk, does not hang. */
 static void test_a_disk_that_hangs_starves_the_watchdogs(void)
 {
     const char *hung = NULL;
     open_store(true);
-    (void)poll(NULL, 0, 60);
-    TEST_ASSERT_NULL(pf_pulse_hung(pf_now(), 50000000));
+    TEST_ASSERT_TRUE(is_well_again());
     fake.is_full = true;
     give(PF_OBJECT_KEYFRAME, 0, "");
-    (void)poll(NULL, 0, 60);
-    TEST_ASSERT_NULL(pf_pulse_hung(pf_now(), 50000000));
+    TEST_ASSERT_TRUE(is_well_again());
     fake.is_hanging = true;
     for (int i = 0; i < 3000 && hung == NULL; i++) {
         (void)poll(NULL, 0, 10);
