@@ -59,6 +59,7 @@ def run_dense(args: argparse.Namespace) -> Result:
         document, files = write_dense(Path(args.output), maps, mapped, measured.unit, summary, made)
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
+    sigma = document["sigma_median"]  # None: nothing was measured
     rows: list[tuple[str, object]] = [
         ("pairs", f"{document['pairs']} of keyframes"),
         (
@@ -66,7 +67,7 @@ def run_dense(args: argparse.Namespace) -> Result:
             f"{document['measured']} of {length_text(document['cell'], unit)}, {100 * document['coverage']:.0f} % of "
             "those in view of two pairs",
         ),
-        ("sigma of a cell", f"median {length_text(document['sigma_median'], unit)}"),
+        ("sigma of a cell", "-" if sigma is None else f"median {length_text(sigma, unit)}"),
         (
             "off the tube",
             f"median {length_text(middle, unit)}, 90 % within {length_text(low, unit)} to {length_text(high, unit)}",

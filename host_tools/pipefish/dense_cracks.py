@@ -214,12 +214,31 @@ def chains(dark: Dark, unroller: Unroller) -> list[NDArray[np.int64]]:
             if _convinces(dark, chain, unroller.columns):
                 out.append(chain)
             # Beside the line lie cells of the same.
-            for part in np.array_split(whole, max(1, len(whole) // 1000)):
-                dx = (dark.x[part][:, None] - dark.x[chain] + unroller.columns / 2) % unroller.columns
-                near = np.hypot(dx - unroller.columns / 2, dark.y[part][:, None] - dark.y[chain]).min(axis=1) < 4
-                left[part[near]] = False
-            left[chain] = False
+            left[whole[_beside(dark, whole, chain, unroller.columns)]] = False
     return out
+
+
+def _beside(dark: Dark, cells: NDArray[np.int64], chain: NDArray[np.int64], columns: int) -> NDArray[np.bool_]:
+    """Which cells are less than NEAR from one of the chain's (itself included); by bins, in time linear in both."""
+    across = max(1, int(columns / NEAR))
+
+    def bins(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.minimum((dark.x[rows] / columns * across).astype(int), across - 1), (dark.y[rows] // NEAR).astype(int)
+
+    x, y = bins(chain)
+    order = np.argsort(y * across + x, kind="stable")
+    keys, chain = (y * across + x)[order], chain[order]
+    x, y = bins(cells)
+    near = np.zeros(len(cells), bool)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        there = (y + i) * across + (x + j) % across
+        first, last = np.searchsorted(keys, there), np.searchsorted(keys, there, "right")
+        for k in range(int((last - first).max(initial=0))):
+            asked = np.flatnonzero(first + k < last)
+            other = chain[first[asked] + k]
+            dx = (dark.x[cells[asked]] - dark.x[other] + columns / 2) % columns - columns / 2
+            near[asked] |= np.hypot(dx, dark.y[cells[asked]] - dark.y[other]) < NEAR
+    return near
 
 
 def _ways(

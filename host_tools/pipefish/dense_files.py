@@ -208,7 +208,7 @@ def document_of(
             "cells": sum(f.deviation.size for f in maps),
             "measured": len(values),
             "coverage": float(np.mean([f.coverage for f in maps])) if maps else 0.0,
-            "cell": maps[0].s[1] - maps[0].s[0] if maps and len(maps[0].s) > 1 else None,
+            "cell": maps[0].wall.length / len(maps[0].s) if maps else None,
             "pairs": sum(f.pairs_used for f in maps),
             "deviation_p05_p50_p95": np.percentile(values, [5, 50, 95]) if len(values) else None,
             "sigma_median": float(np.median(sigmas)) if len(sigmas) else None,

@@ -13,7 +13,7 @@ from typing import Any
 from pipefish.errors import FormatError, PipefishError
 from pipefish.measured_texts import Z95, length_text
 
-FORMAT, VERSION = "pipefish-dense", 1
+FORMAT, VERSION = "pipefish-dense", 2
 COLUMNS = (
     *("kind", "piece", "chainage", "clock", "clock_text", "sigma", "length", "length_sigma", "width", "width_sigma"),
     *("height", "height_sigma", "step", "step_sigma", "widening", "widening_sigma", "area", "volume"),
@@ -82,7 +82,7 @@ def finding_parts(e: dict[str, Any], unit: str) -> list[str]:
 
 def read_dense(folder: Path, measured: Path) -> dict[str, Any]:
     """dense.json of a folder, of a map of the reconstruction in the folder `measured`. Raises PipefishError (another
-    reconstruction's), FormatError, OSError."""
+    reconstruction's, another version's), FormatError, OSError."""
     path = folder / "dense.json"
     try:
         document = json.loads(path.read_bytes())
@@ -90,8 +90,11 @@ def read_dense(folder: Path, measured: Path) -> dict[str, Any]:
         raise FormatError(path, None, f"not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(path, "format", f"not '{FORMAT}': is this a folder of `pipefish dense`?")
-    if document.get("version") != VERSION or not {"cracks", "reconstruction", "files"} <= set(document):
-        raise FormatError(path, "version", "not one that this program reads; run `pipefish dense` again")
+    if document.get("version") != VERSION:
+        raise PipefishError(f"{path}: version {document.get('version')}, not {VERSION}; run `pipefish dense` again")
+    wanted = {"reconstruction", "files", "unit", "cell", "measured", "coverage", "sigma_median", "cracks"}
+    if missing := sorted(wanted - set(document)):
+        raise FormatError(path, missing[0], "missing")
     if document["reconstruction"] != fingerprint(measured):
         raise PipefishError(f"{path}: is a map of another reconstruction than {measured}; run `pipefish dense` again")
     try:
