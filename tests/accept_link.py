@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -197,6 +197,15 @@ class Taker(ObjectHandlers):
         return STORED
 
 
+def _wait_while(is_waiting: Callable[[], bool], what: str, processes: list[subprocess.Popen]) -> None:
+    """At most a minute, and only while all the processes live."""
+    end = time.monotonic() + 60
+    while is_waiting():
+        if time.monotonic() > end or any(p.poll() is not None for p in processes):
+            raise RuntimeError(f"not seen: {what}")
+        time.sleep(0.05)
+
+
 def run_control(_piece: int) -> dict:
     """REQUESTS requests to a daemon whose line has more to carry than it can; ms each, and the share of the line."""
     with tempfile.TemporaryDirectory() as name:
@@ -206,9 +215,6 @@ def run_control(_piece: int) -> dict:
         (folder / "loop.csv").write_text("\n".join(["sequence,time_ns,encoder_count", *rows]) + "\n")
         (folder / "empty.ini").touch()
         ends = folder / "crawler", folder / "host"
-        cable = subprocess.Popen([LINE, "--baud", str(CONTROL_BAUD), *ends], stdout=subprocess.DEVNULL)
-        while not ends[1].exists():
-            time.sleep(0.01)
         settings = {
             **SETTINGS,
             "camera.path": folder / "loop.y4m",
@@ -223,14 +229,15 @@ def run_control(_piece: int) -> dict:
             "link.baud": CONTROL_BAUD,
         }
         flags = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-        with (folder / "log").open("wb") as log:
-            daemon = subprocess.Popen([DAEMON, "--config", folder / "empty.ini", *flags], stderr=log)
-        while "survey ends" not in (folder / "log").read_text():  # nobody tracks: what is timed is the link
-            time.sleep(0.1)
-        taker = Taker()
-        client = Client(SerialTransport(str(ends[1]), CONTROL_BAUD), taker)
-        took = []
+        said, taker, took = folder / "log", Taker(), []
+        running = [subprocess.Popen([LINE, "--baud", str(CONTROL_BAUD), *ends], stdout=subprocess.DEVNULL)]
         try:
+            _wait_while(lambda: not ends[1].exists(), "the line", running)
+            with said.open("wb") as log:
+                running.append(subprocess.Popen([DAEMON, "--config", folder / "empty.ini", *flags], stderr=log))
+            # Nobody tracks any more: what is timed is the link.
+            _wait_while(lambda: "survey ends" not in said.read_text(), "the survey's end", running)
+            client = Client(SerialTransport(str(ends[1]), CONTROL_BAUD), taker)
             client.open()
             client.run(lambda: taker.bytes > 200_000, 60)
             start, before = time.monotonic(), taker.bytes
@@ -241,9 +248,9 @@ def run_control(_piece: int) -> dict:
                 pause = time.monotonic() + 0.02
                 client.run(lambda pause=pause: time.monotonic() > pause, 5)
             share = (taker.bytes - before) / ((time.monotonic() - start) * CONTROL_BAUD / 10)
-        finally:
             client.close()
-            for process in (daemon, cable):
+        finally:
+            for process in running:
                 process.kill()
                 process.wait()
     took.sort()
