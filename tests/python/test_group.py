@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import pipefish as pf
-from test_match import bend, bend_slope, one_seed, pair, unbend
+from test_match import bent
 
 Floats = NDArray[np.float64]
 W, H = 240, 180
@@ -77,7 +77,7 @@ def test_a_bent_surface_stays_one_group() -> None:
 
 
 def test_a_bent_surface_stays_one_group_after_growth_too() -> None:
-    m = pf.match_quasi_dense(*pair(unbend), one_seed(bend, bend_slope()))
+    m = pf.match_quasi_dense(*bent())
     g = pf.group_matches(m)
     assert g.count == 1 and (g.label == 0).mean() >= 0.97
 

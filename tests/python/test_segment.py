@@ -183,7 +183,8 @@ def test_matches_of_no_group_go_to_the_layer_whose_motion_they_have_and_wrong_on
     own = groups.label == 0
     strip = own & (np.abs(m.xy1[:, 0] - np.median(m.xy1[own, 0])) < 15)
     wrong = strip & (np.random.default_rng(1).random(len(m)) < 0.5)
-    xy2 = m.xy2 + 20 * wrong[:, None] * np.array([0, 1])
+    inwards = np.where(m.xy2[:, 1] < 90, 20, -20)
+    xy2 = m.xy2 + (wrong * inwards)[:, None] * np.array([0, 1])
     label = np.where(strip, -1, np.where(groups.label < 0, groups.count, groups.label))  # and no others
     monkeypatch.setattr("pipefish.segmentation.group_matches", lambda m, least: replace(groups, matches=m, label=label))
     s = pf.segment_motion(*pair.images, replace(m, xy2=xy2), rounds=1)
