@@ -67,12 +67,32 @@ typedef struct salvage {
     int64_t up_to, after; /* rows that are done: from the first one up, from the last one down */
     bool has_begun;       /* an earlier run has taken the values: they may have changed since */
     int chunk;            /* objects of the open transaction */
-    char why[128];        /* the new file takes no more */
+    char why[128];        /* the new file takes no more, or the damaged one cannot be read now */
 } salvage;
 
 static bool run(sqlite3 *db, const char *text)
 {
     return sqlite3_exec(db, text, NULL, NULL, NULL) == SQLITE_OK;
+}
+
+/* After an error in reading the damaged file. True: its bytes are bad, and always will be. False: it is the moment (no
+ * descriptor, no memory, a lock), and s->why says so. "No such table" and a row too big to be one are its bytes too. */
+static bool is_lost(salvage *s)
+{
+    const int code = sqlite3_extended_errcode(s->from);
+    switch (code & 0xff) {
+    case SQLITE_CORRUPT:
+    case SQLITE_NOTADB:
+    case SQLITE_ERROR:
+    case SQLITE_TOOBIG:
+        return true;
+    default:
+        break;
+    }
+    if (code == SQLITE_IOERR_READ || code == SQLITE_IOERR_SHORT_READ || code == SQLITE_IOERR_CORRUPTFS)
+        return true;
+    (void)snprintf(s->why, sizeof s->why, "%s", sqlite3_errmsg(s->from));
+    return false;
 }
 
 static void load_progress(salvage *s)
@@ -111,19 +131,22 @@ static bool commit(salvage *s)
     return ok || give_up(s);
 }
 
+/* False: the new file does not take them, or they cannot be read now. */
 static bool copy_values(salvage *s)
 {
     sqlite3_stmt *get = NULL, *set = NULL;
+    int code = SQLITE_OK;
     bool ok = sqlite3_prepare_v2(s->to, "INSERT OR IGNORE INTO value (key, bytes) VALUES (?1, ?2)", -1, &set, NULL) ==
               SQLITE_OK;
-    if (ok && sqlite3_prepare_v2(s->from, "SELECT key, bytes FROM value", -1, &get, NULL) == SQLITE_OK) {
-        while (ok && sqlite3_step(get) == SQLITE_ROW) {
+    if (ok && (code = sqlite3_prepare_v2(s->from, "SELECT key, bytes FROM value", -1, &get, NULL)) == SQLITE_OK)
+        while (ok && (code = sqlite3_step(get)) == SQLITE_ROW) {
             (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
             (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
             ok = sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
-    }
+    if (ok && code != SQLITE_DONE)
+        ok = is_lost(s);
     sqlite3_finalize(get);
     sqlite3_finalize(set);
     return ok;
@@ -144,8 +167,8 @@ static bool copy_object(salvage *s, sqlite3_stmt *row)
     return ok;
 }
 
-/* Walks over the rows that are left, one way. False: the new file takes no more. *has_ended: it reached the end, and no
- * page stopped it. */
+/* Walks over the rows that are left, one way. False: the new file takes no more, or the damaged one cannot be read now.
+ * *has_ended: it reached the end, and no page stopped it. */
 static bool walk(salvage *s, bool is_down, bool *has_ended)
 {
     static const char *const orders[] = {
@@ -153,8 +176,8 @@ static bool walk(salvage *s, bool is_down, bool *has_ended)
         "SELECT row, kind, name, bytes FROM object NOT INDEXED WHERE row > ?1 AND row < ?2 ORDER BY row DESC"};
     sqlite3_stmt *q = NULL;
     bool ok = true;
-    int code = SQLITE_ERROR;
-    if (sqlite3_prepare_v2(s->from, orders[is_down], -1, &q, NULL) == SQLITE_OK) {
+    int code = sqlite3_prepare_v2(s->from, orders[is_down], -1, &q, NULL);
+    if (code == SQLITE_OK) {
         (void)sqlite3_bind_int64(q, 1, s->up_to);
         (void)sqlite3_bind_int64(q, 2, s->after);
         while (ok && (code = sqlite3_step(q)) == SQLITE_ROW) {
@@ -170,13 +193,14 @@ static bool walk(salvage *s, bool is_down, bool *has_ended)
             }
         }
     }
+    if (ok && code != SQLITE_DONE)
+        ok = is_lost(s);
     sqlite3_finalize(q);
     *has_ended = ok && code == SQLITE_DONE;
     return ok;
 }
 
-/* From both ends: a page that cannot be read stops a walk over the table. False: there is more, which the new file does
- * not take now. */
+/* From both ends: a page that cannot be read stops a walk over the table. False: there is more, for another time. */
 static bool copy_all(salvage *s)
 {
     bool has_ended = false;
@@ -193,9 +217,13 @@ static bool salvage_file(salvage *s, const char *file)
                               "CASE WHEN EXISTS (SELECT 1 FROM object WHERE row = ?1) THEN NULL ELSE ?1 END, "
                               "?2, ?3, ?4";
     static const char note[] = "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)";
-    bool is_done = sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK; /* nothing can be had */
-    if (!is_done && sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) == SQLITE_OK &&
-        sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) == SQLITE_OK)
+    bool is_done;
+    if (sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK)
+        is_done = is_lost(s);
+    else if (sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) != SQLITE_OK ||
+             sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) != SQLITE_OK)
+        is_done = give_up(s);
+    else
         is_done = copy_all(s);
     sqlite3_finalize(s->put);
     sqlite3_finalize(s->note);

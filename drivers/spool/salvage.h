@@ -1,6 +1,6 @@
 /* A spool's file that has become unreadable: it is set aside, and what can be read of it goes into a new one. Until all
- * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk or a new file that cannot be
- * opened ends nothing: the next opening goes on. */
+ * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk, a missing descriptor or
+ * a new file that cannot be opened ends nothing: the next opening goes on. */
 #ifndef PIPEFISH_SPOOL_SALVAGE_H
 #define PIPEFISH_SPOOL_SALVAGE_H
 

@@ -214,11 +214,12 @@ static bool is_unread(const char *name)
     return access(temporary_path(unread), F_OK) == 0;
 }
 
-static bool refuses_opening;
+/* Opening paths with the one and without the other fails; NULL: none does. */
+static const char *no_such, *but_not;
 
 static int open_or_not(const char *path, int flags, int mode)
 {
-    if (refuses_opening && strstr(path, "reopen.db") != NULL && strstr(path, "damaged") == NULL) {
+    if (no_such != NULL && strstr(path, no_such) != NULL && (but_not == NULL || strstr(path, but_not) == NULL)) {
         errno = EMFILE;
         return -1;
     }
@@ -235,14 +236,15 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
     open_and_wear("reopen.db", 60, 300);
     (void)temporary_write("twin.db", worn, slurp(temporary_path("reopen.db"), worn, sizeof worn));
     hook("open", (sqlite3_syscall_ptr)open_or_not);
-    refuses_opening = true;
+    no_such = "reopen.db";
+    but_not = "damaged";
     for (uint64_t row = 1; row <= COUNT; row++)
         (void)spool.ops->read(spool.self, &(pf_spool_item){.row = row}, read_bytes, sizeof read_bytes, &n);
     for (int i = 0; i < 3; i++) {
         TEST_ASSERT_EQUAL_INT(PF_ERR_IO, spool.ops->next(spool.self, 0, &item));
         TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "reopen.db"));
     }
-    refuses_opening = false;
+    no_such = but_not = NULL;
     sift();
     hook("open", NULL);
     TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
@@ -253,6 +255,64 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
     sift();
     TEST_ASSERT_EQUAL_UINT64(count_whole(), there);
     TEST_ASSERT_TRUE(there > COUNT / 2);
+}
+
+/* Proves: a damaged file that cannot be opened now, or whose log cannot (no descriptor is left), is not taken for one
+ * with nothing in it: it stays unread, in words, and the next opening reads it. */
+static void test_a_damaged_file_that_cannot_be_opened_now_is_read_later(void)
+{
+    static const char *const names[] = {".unread", ".unread-wal", ".unread-shm"};
+    bool is_there[MANY + 2];
+    uint64_t value = 0;
+    size_t n;
+    for (int i = 0; i < 3; i++) {
+        char name[32];
+        (void)snprintf(name, sizeof name, "scarce%d.db", i);
+        const uint64_t whole = make_worn(name);
+        hook("open", (sqlite3_syscall_ptr)open_or_not);
+        no_such = names[i];
+        open_spool(name, 0);
+        sift();
+        TEST_ASSERT_EQUAL_UINT64(0, stats().objects);
+        TEST_ASSERT_TRUE(is_unread(name));
+        const char *healing = spool.ops->healing(spool.self);
+        TEST_ASSERT_NOT_NULL_MESSAGE(strstr(healing, "the next start tries again: unable to open"), healing);
+        close_spool();
+        no_such = NULL;
+        hook("open", NULL);
+        open_spool(name, 0);
+        TEST_ASSERT_EQUAL_UINT64(whole, list_ids(is_there));
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "survey", &value, sizeof value, &n));
+        TEST_ASSERT_FALSE(is_unread(name));
+        close_spool();
+    }
+}
+
+static bool is_worn_out;
+
+static ssize_t pread_or_not(int fd, void *bytes, size_t n, off_t at)
+{
+    if (is_worn_out && at >= 20 * 4096 && at < 21 * 4096) {
+        errno = EIO;
+        return -1;
+    }
+    return pread(fd, bytes, n, at);
+}
+
+/* Proves: a sector that the medium does not give any more costs what lies in it; the file is not read again for ever.
+ */
+static void test_a_sector_that_cannot_be_read_is_given_up(void)
+{
+    const uint64_t whole = make_worn("sector.db");
+    hook("pread", (sqlite3_syscall_ptr)pread_or_not);
+    hook("pread64", (sqlite3_syscall_ptr)pread_or_not);
+    is_worn_out = true;
+    open_spool("sector.db", 0);
+    is_worn_out = false;
+    hook("pread", NULL);
+    hook("pread64", NULL);
+    TEST_ASSERT_FALSE(is_unread("sector.db"));
+    TEST_ASSERT_TRUE(stats().objects > whole / 2 && stats().objects < whole);
 }
 
 /* Proves: a disk that is full while a damaged file is read through costs nothing: what was copied is there and the rest
@@ -348,6 +408,8 @@ int main(void)
     RUN_TEST(test_damage_found_in_use_is_healed);
     RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_a_damaged_file_without_a_successor_is_read_later);
+    RUN_TEST(test_a_damaged_file_that_cannot_be_opened_now_is_read_later);
+    RUN_TEST(test_a_sector_that_cannot_be_read_is_given_up);
     RUN_TEST(test_a_disk_that_is_full_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_a_kill_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_damage_is_mended_by_the_call_that_finds_it);
