@@ -1,4 +1,5 @@
 #include "spool/salvage.h"
+#include "pipefish/drivers/file.h"
 #include "pipefish/drivers/sha256.h"
 
 #include <errno.h>
@@ -269,7 +270,8 @@ uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf
         (void)pf_fail(told, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", path, saved,
                       read);
     }
-    if (left == 0) /* not before the names have changed, or the values would be taken once more */
+    /* Not before the names have changed, on the disk too, or all would be taken once more. */
+    if (left == 0 && pf_file_sync_folder(path))
         (void)run(to, "DELETE FROM value WHERE key GLOB 'salvage [0-9]*'");
     return files;
 }

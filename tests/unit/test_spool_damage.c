@@ -2,6 +2,7 @@
 #include "spool_medium.h"
 
 #include <sys/stat.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 
 /* ---- a damaged file is replaced */
@@ -399,6 +400,47 @@ static void test_a_kill_while_a_damaged_file_is_read_loses_nothing(void)
     TEST_ASSERT_FALSE(is_unread("cutshort.db"));
 }
 
+static struct {
+    const char *read; /* its name when all of it has been read */
+    bool is_synced;   /* with that name */
+    int writes;       /* since */
+} folder;
+
+/* SQLite's calls land here too. */
+int fsync(int fd)
+{
+    struct stat file;
+    if (folder.read != NULL && fstat(fd, &file) == 0 && S_ISDIR(file.st_mode) && access(folder.read, F_OK) == 0) {
+        folder.is_synced = true;
+        folder.writes = 0;
+    }
+    return (int)syscall(SYS_fsync, fd);
+}
+
+static ssize_t pwrite_counted(int fd, const void *bytes, size_t n, off_t at)
+{
+    folder.writes++;
+    return pwrite(fd, bytes, n, at);
+}
+
+/* Proves: how far a damaged file was read is forgotten only when its new name is on the disk: else a power cut would
+ * bring back what was removed since. */
+static void test_the_new_name_is_on_the_disk_before_the_progress_is_forgotten(void)
+{
+    (void)make_worn("renamed.db");
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_counted);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_counted);
+    folder.read = strdup(temporary_path("renamed.db.damaged-1"));
+    open_spool("renamed.db", 0);
+    sift();
+    TEST_ASSERT_TRUE(folder.is_synced);
+    TEST_ASSERT_TRUE(folder.writes > 0);
+    free((void *)folder.read);
+    folder.read = NULL;
+    hook("pwrite", NULL);
+    hook("pwrite64", NULL);
+}
+
 int main(void)
 {
     (void)setenv("TMPDIR", "/dev/shm", 1);
@@ -412,6 +454,7 @@ int main(void)
     RUN_TEST(test_a_sector_that_cannot_be_read_is_given_up);
     RUN_TEST(test_a_disk_that_is_full_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_a_kill_while_a_damaged_file_is_read_loses_nothing);
+    RUN_TEST(test_the_new_name_is_on_the_disk_before_the_progress_is_forgotten);
     RUN_TEST(test_damage_is_mended_by_the_call_that_finds_it);
     temporary_remove();
     return UNITY_END();
