@@ -149,6 +149,7 @@ static pf_status go_on_after_highest(pf_spool_database *d)
 static pf_status open_for_writing(pf_spool_database *d)
 {
     bool is_empty = false;
+    pf_spool_finish_setting_aside(d->path);
     if (sqlite3_open_v2(d->path, &d->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
         SQLITE_OK)
         return d->db != NULL ? fail_sqlite(d, "opening") : pf_fail(&d->failure, PF_ERR_SPACE, "%s: no memory", d->path);

@@ -58,6 +58,21 @@ pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
     return PF_OK;
 }
 
+void pf_spool_finish_setting_aside(const char *path)
+{
+    char read[PATH_BYTES], unread[PATH_BYTES], log[PATH_BYTES + 8], log_unread[PATH_BYTES + 8];
+    int number = ASIDE_MAX;
+    (void)snprintf(log, sizeof log, "%s-wal", path);
+    if (access(path, F_OK) == 0 || access(log, F_OK) != 0)
+        return;
+    do
+        name_aside(path, number, read, unread);
+    while (access(unread, F_OK) != 0 && --number > 0);
+    (void)snprintf(log_unread, sizeof log_unread, "%s-wal", unread);
+    if (number > 0 && access(log_unread, F_OK) != 0)
+        (void)rename(log, log_unread);
+}
+
 /* ---- one file */
 
 typedef struct salvage {

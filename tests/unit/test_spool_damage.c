@@ -400,6 +400,22 @@ static void test_a_kill_while_a_damaged_file_is_read_loses_nothing(void)
     TEST_ASSERT_FALSE(is_unread("cutshort.db"));
 }
 
+/* Proves: a kill between the new names of a damaged file and of its log costs nothing that is only in the log. */
+static void test_a_kill_between_the_two_renames_loses_nothing(void)
+{
+    static uint8_t bytes[1 << 20];
+    bool is_there[MANY + 2];
+    open_spool("halfway.db", 0);
+    for (uint64_t id = 1; id <= 40; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put_small(id));
+    (void)temporary_write("cut.db.damaged-2.unread", bytes, slurp(temporary_path("halfway.db"), bytes, sizeof bytes));
+    (void)temporary_write("cut.db-wal", bytes, slurp(temporary_path("halfway.db-wal"), bytes, sizeof bytes));
+    close_spool();
+    open_spool("cut.db", 0);
+    TEST_ASSERT_EQUAL_UINT64(40, list_ids(is_there));
+    TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
+}
+
 static struct {
     const char *read; /* its name when all of it has been read */
     bool is_synced;   /* with that name */
@@ -455,6 +471,7 @@ int main(void)
     RUN_TEST(test_a_disk_that_is_full_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_a_kill_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_the_new_name_is_on_the_disk_before_the_progress_is_forgotten);
+    RUN_TEST(test_a_kill_between_the_two_renames_loses_nothing);
     RUN_TEST(test_damage_is_mended_by_the_call_that_finds_it);
     temporary_remove();
     return UNITY_END();
