@@ -47,12 +47,15 @@ static void name_aside(const char *path, int number, char read[PATH_BYTES], char
 pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
 {
     char read[PATH_BYTES], unread[PATH_BYTES];
-    int number = 1;
-    for (;; number++) {
-        name_aside(path, number, read, unread);
-        if (number == ASIDE_MAX || (access(read, F_OK) != 0 && access(unread, F_OK) != 0))
+    int number = ASIDE_MAX;
+    for (int i = ASIDE_MAX; i > 0; i--) { /* above every unread one: of those the highest is the newest */
+        name_aside(path, i, read, unread);
+        if (access(unread, F_OK) == 0)
             break;
+        if (access(read, F_OK) != 0)
+            number = i;
     }
+    name_aside(path, number, read, unread);
     if (rename_both(path, unread) != 0)
         return pf_fail(failure, PF_ERR_IO, "%s: damaged, and cannot be set aside: %s", path, strerror(errno));
     return PF_OK;
@@ -147,20 +150,26 @@ static bool commit(salvage *s)
     return ok || give_up(s);
 }
 
-/* False: the new file does not take them, or they cannot be read now. */
+/* Of a value that is there already the newer one stays. A note that the damaged file has of another one says that the
+ * other's values were taken into it, and no more: objects taken with them may be lost here. False: the new file does
+ * not take them, or they cannot be read now. */
 static bool copy_values(salvage *s)
 {
+    static const char order[] = "SELECT key, CASE WHEN key GLOB 'salvage [0-9]*' THEN ?1 ELSE bytes END FROM value";
+    const int64_t rows[2] = {0, INT64_MAX};
     sqlite3_stmt *get = NULL, *set = NULL;
     int code = SQLITE_OK;
     bool ok = sqlite3_prepare_v2(s->to, "INSERT OR IGNORE INTO value (key, bytes) VALUES (?1, ?2)", -1, &set, NULL) ==
               SQLITE_OK;
-    if (ok && (code = sqlite3_prepare_v2(s->from, "SELECT key, bytes FROM value", -1, &get, NULL)) == SQLITE_OK)
+    if (ok && (code = sqlite3_prepare_v2(s->from, order, -1, &get, NULL)) == SQLITE_OK) {
+        (void)sqlite3_bind_blob(get, 1, rows, sizeof rows, SQLITE_STATIC);
         while (ok && (code = sqlite3_step(get)) == SQLITE_ROW) {
             (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
             (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
             ok = sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
+    }
     if (ok && code != SQLITE_DONE)
         ok = is_lost(s);
     sqlite3_finalize(get);
@@ -261,7 +270,7 @@ static uint64_t count(sqlite3 *db)
 uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf_failure *told)
 {
     uint32_t files = 0, left = 0;
-    for (int number = 1; number <= ASIDE_MAX; number++) {
+    for (int number = ASIDE_MAX; number > 0; number--) {
         char read[PATH_BYTES], unread[PATH_BYTES];
         salvage s = {.to = to, .alive = alive};
         name_aside(path, number, read, unread);
