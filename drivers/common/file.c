@@ -22,13 +22,16 @@ static bool write_all(int fd, const char *bytes, size_t n)
     return true;
 }
 
-/* A rename is on the disk when its folder is. */
-static bool sync_folder(char *path)
+bool pf_file_sync_folder(const char *path)
 {
-    char *slash = strrchr(path, '/');
-    if (slash != NULL)
-        slash[slash == path ? 1 : 0] = '\0';
-    int fd = open(slash != NULL ? path : ".", O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+    char folder[PATH_BYTES] = ".";
+    const char *slash = strrchr(path, '/');
+    if (slash != NULL &&
+        snprintf(folder, sizeof folder, "%.*s", slash == path ? 1 : (int)(slash - path), path) >= (int)sizeof folder) {
+        errno = ENAMETOOLONG;
+        return false;
+    }
+    int fd = open(folder, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
     bool ok = fd >= 0 && fsync(fd) == 0;
     if (fd >= 0)
         (void)close(fd);
@@ -56,7 +59,7 @@ pf_status pf_file_replace(const char *path, const void *bytes, size_t size, char
     }
     if (!ok) {
         (void)unlink(draft);
-    } else if (!sync_folder(draft)) {
+    } else if (!pf_file_sync_folder(path)) {
         ok = false;
         why = errno;
     }

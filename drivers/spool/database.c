@@ -149,6 +149,7 @@ static pf_status go_on_after_highest(pf_spool_database *d)
 static pf_status open_for_writing(pf_spool_database *d)
 {
     bool is_empty = false;
+    pf_spool_finish_setting_aside(d->path);
     if (sqlite3_open_v2(d->path, &d->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
         SQLITE_OK)
         return d->db != NULL ? fail_sqlite(d, "opening") : pf_fail(&d->failure, PF_ERR_SPACE, "%s: no memory", d->path);
@@ -205,17 +206,33 @@ static pf_status open_for_reading(pf_spool_database *d)
     return status;
 }
 
+static int call_alive(void *self)
+{
+    ((pf_spool_database *)self)->alive();
+    return 0;
+}
+
+/* Every row is looked at, on a slow card with a read for most of them: some 250 rows, 0.1 s, between two alive(). */
+static pf_status measure(pf_spool_database *d)
+{
+    int64_t objects = 0, bytes = 0;
+    sqlite3_progress_handler(d->db, 1000, d->alive != NULL ? call_alive : NULL, d);
+    pf_status status = ask(d, "SELECT count(*) FROM object", &objects);
+    if (status == PF_OK)
+        status = ask(d, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
+    sqlite3_progress_handler(d->db, 0, NULL, NULL);
+    d->stats.objects = (uint64_t)objects;
+    d->stats.bytes = (uint64_t)bytes;
+    return status;
+}
+
 static pf_status open_file(pf_spool_database *d)
 {
     d->is_read_only = pf_spool_is_read_only(d->path);
+    d->stats.objects = d->stats.bytes = 0;
     pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
-    int64_t objects = 0, bytes = 0;
     if (status == PF_OK)
-        status = ask(d, "SELECT count(*) FROM object", &objects);
-    if (status == PF_OK)
-        status = ask(d, "SELECT coalesce(sum(length(bytes)), 0) FROM object", &bytes);
-    d->stats.objects = (uint64_t)objects;
-    d->stats.bytes = (uint64_t)bytes;
+        status = measure(d);
     for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
         if (sqlite3_prepare_v3(d->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[i], NULL) != SQLITE_OK)
             status = fail_sqlite(d, "opening");

@@ -1,4 +1,5 @@
 #include "spool/salvage.h"
+#include "pipefish/drivers/file.h"
 #include "pipefish/drivers/sha256.h"
 
 #include <errno.h>
@@ -46,15 +47,33 @@ static void name_aside(const char *path, int number, char read[PATH_BYTES], char
 pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
 {
     char read[PATH_BYTES], unread[PATH_BYTES];
-    int number = 1;
-    for (;; number++) {
-        name_aside(path, number, read, unread);
-        if (number == ASIDE_MAX || (access(read, F_OK) != 0 && access(unread, F_OK) != 0))
+    int number = ASIDE_MAX;
+    for (int i = ASIDE_MAX; i > 0; i--) { /* above every unread one: of those the highest is the newest */
+        name_aside(path, i, read, unread);
+        if (access(unread, F_OK) == 0)
             break;
+        if (access(read, F_OK) != 0)
+            number = i;
     }
+    name_aside(path, number, read, unread);
     if (rename_both(path, unread) != 0)
         return pf_fail(failure, PF_ERR_IO, "%s: damaged, and cannot be set aside: %s", path, strerror(errno));
     return PF_OK;
+}
+
+void pf_spool_finish_setting_aside(const char *path)
+{
+    char read[PATH_BYTES], unread[PATH_BYTES], log[PATH_BYTES + 8], log_unread[PATH_BYTES + 8];
+    int number = ASIDE_MAX;
+    (void)snprintf(log, sizeof log, "%s-wal", path);
+    if (access(path, F_OK) == 0 || access(log, F_OK) != 0)
+        return;
+    do
+        name_aside(path, number, read, unread);
+    while (access(unread, F_OK) != 0 && --number > 0);
+    (void)snprintf(log_unread, sizeof log_unread, "%s-wal", unread);
+    if (number > 0 && access(log_unread, F_OK) != 0)
+        (void)rename(log, log_unread);
 }
 
 /* ---- one file */
@@ -67,12 +86,32 @@ typedef struct salvage {
     int64_t up_to, after; /* rows that are done: from the first one up, from the last one down */
     bool has_begun;       /* an earlier run has taken the values: they may have changed since */
     int chunk;            /* objects of the open transaction */
-    char why[128];        /* the new file takes no more */
+    char why[128];        /* the new file takes no more, or the damaged one cannot be read now */
 } salvage;
 
 static bool run(sqlite3 *db, const char *text)
 {
     return sqlite3_exec(db, text, NULL, NULL, NULL) == SQLITE_OK;
+}
+
+/* After an error in reading the damaged file. True: its bytes are bad, and always will be. False: it is the moment (no
+ * descriptor, no memory, a lock), and s->why says so. "No such table" and a row too big to be one are its bytes too. */
+static bool is_lost(salvage *s)
+{
+    const int code = sqlite3_extended_errcode(s->from);
+    switch (code & 0xff) {
+    case SQLITE_CORRUPT:
+    case SQLITE_NOTADB:
+    case SQLITE_ERROR:
+    case SQLITE_TOOBIG:
+        return true;
+    default:
+        break;
+    }
+    if (code == SQLITE_IOERR_READ || code == SQLITE_IOERR_SHORT_READ || code == SQLITE_IOERR_CORRUPTFS)
+        return true;
+    (void)snprintf(s->why, sizeof s->why, "%s", sqlite3_errmsg(s->from));
+    return false;
 }
 
 static void load_progress(salvage *s)
@@ -111,19 +150,28 @@ static bool commit(salvage *s)
     return ok || give_up(s);
 }
 
+/* Of a value that is there already the newer one stays. A note that the damaged file has of another one says that the
+ * other's values were taken into it, and no more: objects taken with them may be lost here. False: the new file does
+ * not take them, or they cannot be read now. */
 static bool copy_values(salvage *s)
 {
+    static const char order[] = "SELECT key, CASE WHEN key GLOB 'salvage [0-9]*' THEN ?1 ELSE bytes END FROM value";
+    const int64_t rows[2] = {0, INT64_MAX};
     sqlite3_stmt *get = NULL, *set = NULL;
+    int code = SQLITE_OK;
     bool ok = sqlite3_prepare_v2(s->to, "INSERT OR IGNORE INTO value (key, bytes) VALUES (?1, ?2)", -1, &set, NULL) ==
               SQLITE_OK;
-    if (ok && sqlite3_prepare_v2(s->from, "SELECT key, bytes FROM value", -1, &get, NULL) == SQLITE_OK) {
-        while (ok && sqlite3_step(get) == SQLITE_ROW) {
+    if (ok && (code = sqlite3_prepare_v2(s->from, order, -1, &get, NULL)) == SQLITE_OK) {
+        (void)sqlite3_bind_blob(get, 1, rows, sizeof rows, SQLITE_STATIC);
+        while (ok && (code = sqlite3_step(get)) == SQLITE_ROW) {
             (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
             (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
             ok = sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
     }
+    if (ok && code != SQLITE_DONE)
+        ok = is_lost(s);
     sqlite3_finalize(get);
     sqlite3_finalize(set);
     return ok;
@@ -144,8 +192,8 @@ static bool copy_object(salvage *s, sqlite3_stmt *row)
     return ok;
 }
 
-/* Walks over the rows that are left, one way. False: the new file takes no more. *has_ended: it reached the end, and no
- * page stopped it. */
+/* Walks over the rows that are left, one way. False: the new file takes no more, or the damaged one cannot be read now.
+ * *has_ended: it reached the end, and no page stopped it. */
 static bool walk(salvage *s, bool is_down, bool *has_ended)
 {
     static const char *const orders[] = {
@@ -153,8 +201,8 @@ static bool walk(salvage *s, bool is_down, bool *has_ended)
         "SELECT row, kind, name, bytes FROM object NOT INDEXED WHERE row > ?1 AND row < ?2 ORDER BY row DESC"};
     sqlite3_stmt *q = NULL;
     bool ok = true;
-    int code = SQLITE_ERROR;
-    if (sqlite3_prepare_v2(s->from, orders[is_down], -1, &q, NULL) == SQLITE_OK) {
+    int code = sqlite3_prepare_v2(s->from, orders[is_down], -1, &q, NULL);
+    if (code == SQLITE_OK) {
         (void)sqlite3_bind_int64(q, 1, s->up_to);
         (void)sqlite3_bind_int64(q, 2, s->after);
         while (ok && (code = sqlite3_step(q)) == SQLITE_ROW) {
@@ -170,13 +218,14 @@ static bool walk(salvage *s, bool is_down, bool *has_ended)
             }
         }
     }
+    if (ok && code != SQLITE_DONE)
+        ok = is_lost(s);
     sqlite3_finalize(q);
     *has_ended = ok && code == SQLITE_DONE;
     return ok;
 }
 
-/* From both ends: a page that cannot be read stops a walk over the table. False: there is more, which the new file does
- * not take now. */
+/* From both ends: a page that cannot be read stops a walk over the table. False: there is more, for another time. */
 static bool copy_all(salvage *s)
 {
     bool has_ended = false;
@@ -193,9 +242,13 @@ static bool salvage_file(salvage *s, const char *file)
                               "CASE WHEN EXISTS (SELECT 1 FROM object WHERE row = ?1) THEN NULL ELSE ?1 END, "
                               "?2, ?3, ?4";
     static const char note[] = "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)";
-    bool is_done = sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK; /* nothing can be had */
-    if (!is_done && sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) == SQLITE_OK &&
-        sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) == SQLITE_OK)
+    bool is_done;
+    if (sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK)
+        is_done = is_lost(s);
+    else if (sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) != SQLITE_OK ||
+             sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) != SQLITE_OK)
+        is_done = give_up(s);
+    else
         is_done = copy_all(s);
     sqlite3_finalize(s->put);
     sqlite3_finalize(s->note);
@@ -217,7 +270,7 @@ static uint64_t count(sqlite3 *db)
 uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf_failure *told)
 {
     uint32_t files = 0, left = 0;
-    for (int number = 1; number <= ASIDE_MAX; number++) {
+    for (int number = ASIDE_MAX; number > 0; number--) {
         char read[PATH_BYTES], unread[PATH_BYTES];
         salvage s = {.to = to, .alive = alive};
         name_aside(path, number, read, unread);
@@ -241,7 +294,8 @@ uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf
         (void)pf_fail(told, PF_OK, "%s: was damaged: %" PRIu64 " objects saved from it, the rest is in %s", path, saved,
                       read);
     }
-    if (left == 0) /* not before the names have changed, or the values would be taken once more */
+    /* Not before the names have changed, on the disk too, or all would be taken once more. */
+    if (left == 0 && pf_file_sync_folder(path))
         (void)run(to, "DELETE FROM value WHERE key GLOB 'salvage [0-9]*'");
     return files;
 }

@@ -1,6 +1,6 @@
 /* A spool's file that has become unreadable: it is set aside, and what can be read of it goes into a new one. Until all
- * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk or a new file that cannot be
- * opened ends nothing: the next opening goes on. */
+ * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk, a missing descriptor or
+ * a new file that cannot be opened ends nothing: the next opening goes on. */
 #ifndef PIPEFISH_SPOOL_SALVAGE_H
 #define PIPEFISH_SPOOL_SALVAGE_H
 
@@ -12,13 +12,18 @@
  * left alone. */
 bool pf_spool_was_one(const char *path, uint32_t application_id);
 
-/* Gives the file, and the log beside it, the name <path>.damaged-1.unread, or that with the next free number. PF_OK,
- * PF_ERR_IO. */
+/* Gives the file, and the log beside it, the name <path>.damaged-1.unread, or that with the first free number above
+ * those that are still called so. PF_OK, PF_ERR_IO. */
 pf_status pf_spool_set_aside(const char *path, pf_failure *failure);
 
-/* Copies from every file of `path` that is still called so: each object that is whole by its SHA-256, under its row
- * number, and, once, every value; 64 objects a transaction, alive() before each object. Objects that cannot be reached
- * from either end of the damaged table are lost. Returns how many files there were; *told says what came of the last.
+/* Where a kill came between the two names: the log of a file that is no longer there follows the newest unread one. To
+ * be called before SQLite opens `path`, which would throw that log away. */
+void pf_spool_finish_setting_aside(const char *path);
+
+/* Copies from every file of `path` that is still called so, the newest first: each object that is whole by its SHA-256,
+ * under its row number, and, once, every value that is not there yet; 64 objects a transaction, alive() before each
+ * object. Objects that cannot be reached from either end of the damaged table are lost. Returns how many files there
+ * were; *told says what came of the last.
  */
 uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf_failure *told);
 

@@ -364,12 +364,44 @@ static void test_read_only_medium(void)
         TEST_ASSERT_EQUAL_INT(0, umount(folder));
 }
 
+static uint64_t lives;
+
+static void count_life(void)
+{
+    lives++;
+}
+
+/* Proves: while a large spool is opened the caller hears that it goes on, the more often the larger it is (a slow card
+ * takes half a minute for what the default quota holds; the watchdog waits less): at least once in 500 objects. */
+static void test_opening_a_large_spool_is_heard(void)
+{
+    const pf_spool_config config = {.path = temporary_path("large.db"), .alive = count_life};
+    uint64_t heard[2];
+    uint8_t name[32];
+    for (uint64_t half = 0; half < 2; half++) {
+        open_spool("large.db", 0);
+        for (uint64_t id = 1000 * half; id < 1000 * (half + 1); id++) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, pf_sha256((const uint8_t *)&id, sizeof id, name));
+            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->put(spool.self, 2, name, &id, sizeof id));
+        }
+        close_spool();
+        lives = 0;
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_spool_open(&spool, &config, error, sizeof error));
+        heard[half] = lives;
+        TEST_ASSERT_EQUAL_UINT64(1000 * (half + 1), stats().objects);
+        TEST_ASSERT_EQUAL_UINT64(8000 * (half + 1), stats().bytes);
+        close_spool();
+    }
+    TEST_ASSERT_TRUE(heard[0] >= 2 && heard[1] >= heard[0] + 2);
+}
+
 int main(void)
 {
     (void)setenv("TMPDIR", "/dev/shm", 1); /* on a busy disk hundreds of syncs take a minute */
     temporary_make();
     UNITY_BEGIN();
     RUN_TEST(test_first_in_first_out);
+    RUN_TEST(test_opening_a_large_spool_is_heard);
     RUN_TEST(test_values);
     RUN_TEST(test_quota);
     RUN_TEST(test_threads);

@@ -2,6 +2,7 @@
 #include "spool_medium.h"
 
 #include <sys/stat.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 
 /* ---- a damaged file is replaced */
@@ -214,11 +215,12 @@ static bool is_unread(const char *name)
     return access(temporary_path(unread), F_OK) == 0;
 }
 
-static bool refuses_opening;
+/* Opening paths with the one and without the other fails; NULL: none does. */
+static const char *no_such, *but_not;
 
 static int open_or_not(const char *path, int flags, int mode)
 {
-    if (refuses_opening && strstr(path, "reopen.db") != NULL && strstr(path, "damaged") == NULL) {
+    if (no_such != NULL && strstr(path, no_such) != NULL && (but_not == NULL || strstr(path, but_not) == NULL)) {
         errno = EMFILE;
         return -1;
     }
@@ -235,14 +237,15 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
     open_and_wear("reopen.db", 60, 300);
     (void)temporary_write("twin.db", worn, slurp(temporary_path("reopen.db"), worn, sizeof worn));
     hook("open", (sqlite3_syscall_ptr)open_or_not);
-    refuses_opening = true;
+    no_such = "reopen.db";
+    but_not = "damaged";
     for (uint64_t row = 1; row <= COUNT; row++)
         (void)spool.ops->read(spool.self, &(pf_spool_item){.row = row}, read_bytes, sizeof read_bytes, &n);
     for (int i = 0; i < 3; i++) {
         TEST_ASSERT_EQUAL_INT(PF_ERR_IO, spool.ops->next(spool.self, 0, &item));
         TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "reopen.db"));
     }
-    refuses_opening = false;
+    no_such = but_not = NULL;
     sift();
     hook("open", NULL);
     TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
@@ -253,6 +256,64 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
     sift();
     TEST_ASSERT_EQUAL_UINT64(count_whole(), there);
     TEST_ASSERT_TRUE(there > COUNT / 2);
+}
+
+/* Proves: a damaged file that cannot be opened now, or whose log cannot (no descriptor is left), is not taken for one
+ * with nothing in it: it stays unread, in words, and the next opening reads it. */
+static void test_a_damaged_file_that_cannot_be_opened_now_is_read_later(void)
+{
+    static const char *const names[] = {".unread", ".unread-wal", ".unread-shm"};
+    bool is_there[MANY + 2];
+    uint64_t value = 0;
+    size_t n;
+    for (int i = 0; i < 3; i++) {
+        char name[32];
+        (void)snprintf(name, sizeof name, "scarce%d.db", i);
+        const uint64_t whole = make_worn(name);
+        hook("open", (sqlite3_syscall_ptr)open_or_not);
+        no_such = names[i];
+        open_spool(name, 0);
+        sift();
+        TEST_ASSERT_EQUAL_UINT64(0, stats().objects);
+        TEST_ASSERT_TRUE(is_unread(name));
+        const char *healing = spool.ops->healing(spool.self);
+        TEST_ASSERT_NOT_NULL_MESSAGE(strstr(healing, "the next start tries again: unable to open"), healing);
+        close_spool();
+        no_such = NULL;
+        hook("open", NULL);
+        open_spool(name, 0);
+        TEST_ASSERT_EQUAL_UINT64(whole, list_ids(is_there));
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "survey", &value, sizeof value, &n));
+        TEST_ASSERT_FALSE(is_unread(name));
+        close_spool();
+    }
+}
+
+static bool is_worn_out;
+
+static ssize_t pread_or_not(int fd, void *bytes, size_t n, off_t at)
+{
+    if (is_worn_out && at >= 20 * 4096 && at < 21 * 4096) {
+        errno = EIO;
+        return -1;
+    }
+    return pread(fd, bytes, n, at);
+}
+
+/* Proves: a sector that the medium does not give any more costs what lies in it; the file is not read again for ever.
+ */
+static void test_a_sector_that_cannot_be_read_is_given_up(void)
+{
+    const uint64_t whole = make_worn("sector.db");
+    hook("pread", (sqlite3_syscall_ptr)pread_or_not);
+    hook("pread64", (sqlite3_syscall_ptr)pread_or_not);
+    is_worn_out = true;
+    open_spool("sector.db", 0);
+    is_worn_out = false;
+    hook("pread", NULL);
+    hook("pread64", NULL);
+    TEST_ASSERT_FALSE(is_unread("sector.db"));
+    TEST_ASSERT_TRUE(stats().objects > whole / 2 && stats().objects < whole);
 }
 
 /* Proves: a disk that is full while a damaged file is read through costs nothing: what was copied is there and the rest
@@ -339,6 +400,134 @@ static void test_a_kill_while_a_damaged_file_is_read_loses_nothing(void)
     TEST_ASSERT_FALSE(is_unread("cutshort.db"));
 }
 
+/* Proves: a kill between the new names of a damaged file and of its log costs nothing that is only in the log. */
+static void test_a_kill_between_the_two_renames_loses_nothing(void)
+{
+    static uint8_t bytes[1 << 20];
+    bool is_there[MANY + 2];
+    open_spool("halfway.db", 0);
+    for (uint64_t id = 1; id <= 40; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put_small(id));
+    (void)temporary_write("cut.db.damaged-2.unread", bytes, slurp(temporary_path("halfway.db"), bytes, sizeof bytes));
+    (void)temporary_write("cut.db-wal", bytes, slurp(temporary_path("halfway.db-wal"), bytes, sizeof bytes));
+    close_spool();
+    open_spool("cut.db", 0);
+    TEST_ASSERT_EQUAL_UINT64(40, list_ids(is_there));
+    TEST_ASSERT_EQUAL_UINT64(1, stats().healed);
+}
+
+/* Gives what is to be an unread file of `name`: objects from `first` to `last`, a value, and another. */
+static void make_unread(const char *name, int number, uint64_t first, uint64_t last, const char *key, uint64_t value,
+                        const char *other, const int64_t rows[2])
+{
+    char model[32], unread[64];
+    (void)snprintf(model, sizeof model, "%s-%d", name, number);
+    (void)snprintf(unread, sizeof unread, "%s.damaged-%d.unread", name, number);
+    open_spool(model, 0);
+    for (uint64_t id = first; id <= last; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put_small(id));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, key, &value, sizeof value));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, other, rows, 2 * sizeof *rows));
+    close_spool();
+    TEST_ASSERT_EQUAL_INT(0, rename(temporary_path(model), temporary_path(unread)));
+}
+
+/* Proves: of two damaged files that wait, the newer one's values win: a keyframe number is not used twice. A value that
+ * the newer had taken from the older and then removed, a survey that had ended, does not come back; the objects of the
+ * older come all, for those that the newer had taken may be lost with it. */
+static void test_of_two_damaged_files_the_newer_has_the_last_word(void)
+{
+    static const int64_t rows[2] = {2, INT64_MAX};
+    bool is_there[MANY + 2];
+    uint64_t value = 0;
+    int64_t other[2];
+    size_t n;
+    make_unread("two.db", 1, 1, 5, "survey", 1, "first", rows);
+    make_unread("two.db", 2, 6, 9, "survey", 2, "second", rows);
+    open_spool("two.db", 0);
+    TEST_ASSERT_EQUAL_UINT64(9, list_ids(is_there));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "survey", &value, sizeof value, &n));
+    TEST_ASSERT_EQUAL_UINT64(2, value);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "first", other, sizeof other, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "second", other, sizeof other, &n));
+    close_spool();
+    make_unread("ended.db", 1, 1, 5, "survey", 1, "first", rows);
+    make_unread("ended.db", 2, 6, 9, "next", 2, "salvage 1", rows);
+    open_spool("ended.db", 0);
+    TEST_ASSERT_EQUAL_UINT64(9, list_ids(is_there));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->get(spool.self, "survey", &value, sizeof value, &n));
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "next", &value, sizeof value, &n));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->get(spool.self, "salvage 1", other, sizeof other, &n));
+}
+
+/* Proves: a file that is set aside while another waits gets the higher number, also where a lower one is free: the
+ * highest is the newest. */
+static void test_a_newer_damaged_file_gets_the_higher_number(void)
+{
+    static const int64_t rows[2] = {2, INT64_MAX};
+    uint64_t value = 2;
+    size_t n;
+    make_unread("order.db", 5, 1, 5, "survey", 1, "first", rows);
+    open_spool("order.db-model", 0);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->set(spool.self, "survey", &value, sizeof value));
+    close_spool();
+    damage(temporary_path("order.db-model"), 4096, 4096); /* the objects' table */
+    TEST_ASSERT_EQUAL_INT(0, rename(temporary_path("order.db-model"), temporary_path("order.db")));
+    hook("open", (sqlite3_syscall_ptr)open_or_not);
+    no_such = ".unread";
+    open_spool("order.db", 0);
+    sift();
+    no_such = NULL;
+    hook("open", NULL);
+    TEST_ASSERT_EQUAL_INT(0, access(temporary_path("order.db.damaged-6.unread"), F_OK));
+    close_spool();
+    open_spool("order.db", 0);
+    TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->get(spool.self, "survey", &value, sizeof value, &n));
+    TEST_ASSERT_EQUAL_UINT64(2, value);
+    TEST_ASSERT_EQUAL_UINT64(5, stats().objects);
+}
+
+static struct {
+    const char *read; /* its name when all of it has been read */
+    bool is_synced;   /* with that name */
+    int writes;       /* since */
+} folder;
+
+/* SQLite's calls land here too. */
+int fsync(int fd)
+{
+    struct stat file;
+    if (folder.read != NULL && fstat(fd, &file) == 0 && S_ISDIR(file.st_mode) && access(folder.read, F_OK) == 0) {
+        folder.is_synced = true;
+        folder.writes = 0;
+    }
+    return (int)syscall(SYS_fsync, fd);
+}
+
+static ssize_t pwrite_counted(int fd, const void *bytes, size_t n, off_t at)
+{
+    folder.writes++;
+    return pwrite(fd, bytes, n, at);
+}
+
+/* Proves: how far a damaged file was read is forgotten only when its new name is on the disk: else a power cut would
+ * bring back what was removed since. */
+static void test_the_new_name_is_on_the_disk_before_the_progress_is_forgotten(void)
+{
+    (void)make_worn("renamed.db");
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_counted);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_counted);
+    folder.read = strdup(temporary_path("renamed.db.damaged-1"));
+    open_spool("renamed.db", 0);
+    sift();
+    TEST_ASSERT_TRUE(folder.is_synced);
+    TEST_ASSERT_TRUE(folder.writes > 0);
+    free((void *)folder.read);
+    folder.read = NULL;
+    hook("pwrite", NULL);
+    hook("pwrite64", NULL);
+}
+
 int main(void)
 {
     (void)setenv("TMPDIR", "/dev/shm", 1);
@@ -348,8 +537,14 @@ int main(void)
     RUN_TEST(test_damage_found_in_use_is_healed);
     RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_a_damaged_file_without_a_successor_is_read_later);
+    RUN_TEST(test_a_damaged_file_that_cannot_be_opened_now_is_read_later);
+    RUN_TEST(test_a_sector_that_cannot_be_read_is_given_up);
     RUN_TEST(test_a_disk_that_is_full_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_a_kill_while_a_damaged_file_is_read_loses_nothing);
+    RUN_TEST(test_the_new_name_is_on_the_disk_before_the_progress_is_forgotten);
+    RUN_TEST(test_a_kill_between_the_two_renames_loses_nothing);
+    RUN_TEST(test_of_two_damaged_files_the_newer_has_the_last_word);
+    RUN_TEST(test_a_newer_damaged_file_gets_the_higher_number);
     RUN_TEST(test_damage_is_mended_by_the_call_that_finds_it);
     temporary_remove();
     return UNITY_END();

@@ -8,4 +8,7 @@
  * error[n] says what. */
 pf_status pf_file_replace(const char *path, const void *bytes, size_t size, char *error, size_t n);
 
+/* Puts the folder of `path` on the disk, and with it the renames in it. False: errno says why. */
+bool pf_file_sync_folder(const char *path);
+
 #endif

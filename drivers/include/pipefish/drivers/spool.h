@@ -83,7 +83,8 @@ typedef struct pf_spool_ops {
 typedef struct pf_spool_config {
     const char *path;    /* SQLite file; its folder must exist */
     uint64_t quota;      /* most bytes of objects; 0 = no limit */
-    void (*alive)(void); /* called now and then by what takes long: reading a damaged file. NULL: nobody asks */
+    void (*alive)(void); /* called now and then by what takes long: opening a large file, reading a damaged one. NULL:
+                            nobody asks */
 } pf_spool_config;
 
 /* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
