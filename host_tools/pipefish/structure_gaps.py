@@ -165,8 +165,10 @@ def _zooms(
         return total - total[first]
 
     information, push = before(across), before(push)
-    often = (np.arange(len(track)) - first >= 2) & ok
+    often = (before(ok.astype(float)) >= 2) & ok
     information[~often] = np.eye(3)
+    # Views from one place leave the depth open, which the gate below tells; here the matrix must have an inverse.
+    information += 1e-12 * np.einsum("nii->n", information)[:, None, None] * np.eye(3)
     spread = np.linalg.inv(information)
     predicted = np.einsum("nij,nj->ni", spread, push)
     seen = np.einsum("nij,nj->ni", turn, predicted) + poses[place, :, 3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -124,6 +126,19 @@ def test_a_lens_that_did_not_zoom_is_believed(seed: int) -> None:
     drifted = t.pixels + 0.1 * since[:, None] * out / np.linalg.norm(out, axis=1)[:, None]
     rec = pf.reconstruct(pf.Tracks(t.frame, t.track, drifted), drive.camera, drive.driven)
     assert not [g for g in rec.gaps if g.reason == "zoom"] and rec.frames[-1] == 40
+
+
+def test_tracks_that_come_in_from_beyond_the_cameras_model_are_no_error() -> None:
+    """Backwards, corners come in from the rim: a profile up to 69 degrees has no ray for their first views, and two
+    such views say nothing of where a corner is."""
+    drive = tube_drive(62, 1.0, limits=(20.0, 89.0))
+    t = drive.tracks
+    backwards = pf.Tracks(t.frame.max() - t.frame, t.track, t.pixels)
+    camera = dataclasses.replace(drive.camera, theta_max=1.2)
+    rec = pf.reconstruct(backwards, camera, drive.driven[::-1])
+    assert rec.status == "ok" and rec.outside > 500 and len(rec.frames) == 21
+    scale, turn, move = similarity(rec.centres, drive.centres[::-1])
+    assert np.abs(scale * rec.centres @ turn.T + move - drive.centres[::-1]).max() < 0.01
 
 
 @pytest.mark.parametrize("kind", ["mirrored", "one pixel"])
