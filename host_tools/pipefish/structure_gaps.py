@@ -105,7 +105,7 @@ def zoom_between(
     nobody knows.
 
     place: the picture's number among the frames used; track (n,), pixels (n,2): what it shows; sigma: of pixels."""
-    _, here, there = np.intersect1d(track, segment["tracks"], assume_unique=True, return_indices=True)
+    _, here, there = np.intersect1d(track, segment["tracks"], return_indices=True)  # a track may be there twice
     if len(here) < LEAST:
         return None
     points, pixels = segment["points"][there], pixels[here]

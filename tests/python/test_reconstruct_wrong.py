@@ -9,6 +9,7 @@ import pytest
 
 import pipefish as pf
 from pipefish import _engine
+from pipefish.structure_gaps import zoom_between
 from test_reconstruct_covariance import residuals
 from tube_tracks import Drive, rotation, similarity, tube_drive
 
@@ -114,6 +115,17 @@ def test_what_was_seen_before_the_lens_zoomed_is_measured_and_nothing_behind_it(
     r, t = drive.poses[0, :, :3], drive.poses[0, :, 3]
     off = rec.points - (drive.points[rec.track] @ r.T + t)
     assert np.median(np.linalg.norm(off, axis=1)) < 0.004
+
+
+def test_a_track_that_is_twice_in_a_frame_tells_the_same_zoom() -> None:
+    drive, by, frame = tube_drive(62, 1.0), 1.2, 10
+    t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
+    known, on = np.unique(t.track[t.frame < frame]), t.frame == frame
+    stretch = {"tracks": known, "points": drive.points[known], "first": 0, "poses": drive.poses[:frame]}
+    track, pixels = t.track[on], middle + by * (t.pixels[on] - middle)
+    once = zoom_between(drive.camera, stretch, frame, track, pixels, 0.3)
+    twice = zoom_between(drive.camera, stretch, frame, np.repeat(track, 2), np.repeat(pixels, 2, axis=0), 0.3)
+    assert once is not None and twice == once and once[0] == pytest.approx(np.log(by), abs=0.005)
 
 
 @pytest.mark.parametrize("seed", [71, 72])
