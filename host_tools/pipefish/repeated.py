@@ -183,5 +183,8 @@ def cut(tracks: Tracks, frames: list[int]) -> Tracks:
 
 
 def renamed(gaps: list[Gap], frames: list[int]) -> list[Gap]:
-    """Gaps that begin where tracks were cut have that as their reason."""
-    return [dataclasses.replace(g, reason="repeated_pattern") if g.last in frames else g for g in gaps]
+    """Gaps in which tracks were cut have that as their reason: the frame behind a cut may itself be lost."""
+    return [
+        dataclasses.replace(g, reason="repeated_pattern") if any(g.first < f <= g.last for f in frames) else g
+        for g in gaps
+    ]

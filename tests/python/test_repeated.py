@@ -13,6 +13,8 @@ import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.measure import Measurement, measure
 from pipefish.measured_remarks import _repeated_remark, not_measured
+from pipefish.repeated import renamed
+from pipefish.structure import Gap
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_KEYFRAME
 from synthetic import as_object, write_survey
@@ -122,3 +124,9 @@ def test_a_wall_that_does_not_repeat_is_believed(tmp_path) -> None:
     m = measured(drive, texture(2, 2.4), tmp_path / "a.mcap")
     assert m.repeats.places > 60 and m.repeats.share < 0.1 and not m.repeats.alarm and not m.jumped
     assert not any("same again" in r for r in m.remarks)
+
+
+def test_a_gap_that_holds_the_cut_is_told_as_one_and_no_other() -> None:
+    gaps = [Gap(first, last, "weak_texture", 0) for first, last in ((2, 9), (9, 10), (9, 11), (10, 12))]
+    reasons = [g.reason for g in renamed(gaps, [JUMP])]
+    assert reasons == ["weak_texture", "repeated_pattern", "repeated_pattern", "weak_texture"]
