@@ -13,6 +13,7 @@ from pipefish.camera import Camera
 from pipefish.health import VERDICTS
 from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.measured_texts import clock_text, length_text
+from pipefish.repeated import against_encoder
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
@@ -165,13 +166,14 @@ def _repeated_remark(m: Measurement) -> list[str]:
         return [words]
     steps = np.linalg.norm(np.diff(m.structure.centres, axis=0), axis=1)[np.diff(m.structure.segment) == 0]
     step, value = float(np.median(steps)), mean_diameter(m)[0]
-    if m.encoder is None or m.scale.unit != "metre":
+    compared = int(np.isfinite(against_encoder(m)).sum())
+    if not compared:
         return [words + ": without an encoder nobody knows whether tracks went on to the next repeat."]
+    each = "each step" if compared == len(steps) else f"the {compared} of {len(steps)} steps that it has readings of"
     other = [value * step / (step + k * found.period) for k in (-1, 1) if step + k * found.period > 0.2 * step]
     sizes = " or ".join(length_text(d, m.scale.unit) for d in other)
     return [
-        words
-        + ". Encoder and pictures agree about each step; had tracks gone on by one repeat at every keyframe, they "
+        words + f". Encoder and pictures agree about {each}; had tracks gone on by one repeat at every keyframe, they "
         f"would, too, and the diameter would be {sizes}."
     ]
 

@@ -141,27 +141,36 @@ def repetition(m: Measurement) -> Repetition:
     return Repetition(float(alike.mean()), len(found), period if agree > 0.7 else float("nan"))
 
 
-def jumps(m: Measurement, found: Repetition) -> list[int]:
-    """Frames of the tracks from which on they are of the next repeat: pictures and encoder disagree about the step to
-    them by a whole number of repeats, and by more than the encoder's noise."""
-    if not found.alarm or not np.isfinite(found.period) or m.encoder is None or m.scale.unit != "metre":
-        return []
-    structure, out = m.structure, []
-    frames, centres = structure.frames, structure.centres
+def against_encoder(m: Measurement) -> Floats:
+    """(F-1,) how much further pictures than encoder say each step of the structure's frames was, in its unit; NaN from
+    one stretch to the next and where the encoder says nothing."""
+    structure = m.structure
+    centres, count = structure.centres, len(structure.frames)
+    if m.encoder is None or m.scale.unit != "metre" or count < 2:
+        return np.full(max(count - 1, 0), np.nan)
     # Along the path around: a jump may be longer than the step, and turn it round.
-    count = len(frames)
     low, high = np.maximum(np.arange(count - 1) - AROUND, 0), np.minimum(np.arange(count - 1) + 1 + AROUND, count - 1)
     ahead = centres[high] - centres[low]
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
-    driven = np.diff(m.encoder[frames])
-    apart = np.einsum("ni,ni->n", np.diff(centres, axis=0), ahead) - driven * np.sign(np.nanmedian(driven))
-    same = np.diff(structure.segment) == 0
-    usual = 1.4826 * float(np.median(np.abs(apart[same]))) if same.any() else 0.0
-    for k in np.flatnonzero(same & np.isfinite(apart)):
+    driven = np.diff(m.encoder[structure.frames])
+    known = np.isfinite(driven) & (np.diff(structure.segment) == 0)
+    way = np.sign(np.median(driven[known])) if known.any() else 1.0
+    return np.where(known, np.einsum("ni,ni->n", np.diff(centres, axis=0), ahead) - driven * way, np.nan)
+
+
+def jumps(m: Measurement, found: Repetition) -> list[int]:
+    """Frames of the tracks from which on they are of the next repeat: pictures and encoder disagree about the step to
+    them by a whole number of repeats, and by more than the encoder's noise."""
+    apart, out = against_encoder(m), []
+    known = np.flatnonzero(np.isfinite(apart))
+    if not found.alarm or not np.isfinite(found.period) or not len(known):
+        return []
+    usual = 1.4826 * float(np.median(np.abs(apart[known])))
+    for k in known:
         number = round(apart[k] / found.period)
         left = abs(apart[k] - number * found.period)
         if number and abs(apart[k]) > 2 * OFF_SIGMAS * usual and left < max(OFF * found.period, OFF_SIGMAS * usual):
-            out.append(int(frames[k + 1]))
+            out.append(int(m.structure.frames[k + 1]))
     return out
 
 
@@ -174,5 +183,8 @@ def cut(tracks: Tracks, frames: list[int]) -> Tracks:
 
 
 def renamed(gaps: list[Gap], frames: list[int]) -> list[Gap]:
-    """Gaps that begin where tracks were cut have that as their reason."""
-    return [dataclasses.replace(g, reason="repeated_pattern") if g.last in frames else g for g in gaps]
+    """Gaps in which tracks were cut have that as their reason: the frame behind a cut may itself be lost."""
+    return [
+        dataclasses.replace(g, reason="repeated_pattern") if any(g.first < f <= g.last for f in frames) else g
+        for g in gaps
+    ]

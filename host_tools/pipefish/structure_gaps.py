@@ -25,6 +25,7 @@ ONE, ONE_SIGMAS = 0.015, 5.0  # of one frame against the median of those before 
 END, END_SIGMAS = 3, 2.5  # of the last frames before a gap
 CHUNK, LEAD = 200, 30  # frames that are looked at together, and before them for their tracks' earlier views
 RUN, RUN_LEAST, RUN_SIGMAS = 5, 0.01, 6.0  # of the mean of so many
+TRIES = 24  # whole reconstructions that doubts may cost: stretches that break off everywhere have other reasons
 
 
 @dataclass
@@ -105,7 +106,7 @@ def zoom_between(
     nobody knows.
 
     place: the picture's number among the frames used; track (n,), pixels (n,2): what it shows; sigma: of pixels."""
-    _, here, there = np.intersect1d(track, segment["tracks"], assume_unique=True, return_indices=True)
+    _, here, there = np.intersect1d(track, segment["tracks"], return_indices=True)  # a track may be there twice
     if len(here) < LEAST:
         return None
     points, pixels = segment["points"][there], pixels[here]
@@ -165,8 +166,10 @@ def _zooms(
         return total - total[first]
 
     information, push = before(across), before(push)
-    often = (np.arange(len(track)) - first >= 2) & ok
+    often = (before(ok.astype(float)) >= 2) & ok
     information[~often] = np.eye(3)
+    # Views from one place leave the depth open, which the gate below tells; here the matrix must have an inverse.
+    information += 1e-12 * np.einsum("nii->n", information)[:, None, None] * np.eye(3)
     spread = np.linalg.inv(information)
     predicted = np.einsum("nij,nj->ni", spread, push)
     seen = np.einsum("nij,nj->ni", turn, predicted) + poses[place, :, 3]
@@ -242,16 +245,22 @@ class Zooms:
             return None
         place = np.searchsorted(used, self.frame)
         place = np.where(used[np.minimum(place, len(used) - 1)] == self.frame, place, -1)
+        left = TRIES
         for segment in found["segments"]:
             begin, end = segment["first"], segment["first"] + len(segment["poses"])
             of_frames = frame_zooms(self.camera, segment, place - begin, self.track, self.pixels, self.sigma)
             doubt = doubted(*of_frames, end < len(used))
             if doubt is None and (end >= len(used) or not self._confirmed(used, segment, end, None)):
                 continue
-            at, way = (begin + doubt[0], doubt[1]) if doubt else (end, None)
-            before = again(int(used[at]))
-            last = before["segments"][-1] if before["segments"] else None
-            reached = last is not None and last["first"] + len(last["poses"]) > at - 3
-            if last is not None and reached and self._confirmed(used, last, at, way):
-                return int(used[at]), before
+            # A zoomed frame that the stretch took up makes those before it look zoomed, too: the first doubt is early.
+            tries = [(begin + k, doubt[1]) for k in range(doubt[0], len(of_frames[0]))[:RUN]] if doubt else []
+            if end < len(used) and (doubt is None or self._confirmed(used, segment, end, None)):
+                tries.append((end, None))
+            for at, way in tries[:left]:
+                left -= 1
+                before = again(int(used[at]))
+                last = before["segments"][-1] if before["segments"] else None
+                reached = last is not None and last["first"] + len(last["poses"]) > at - 3
+                if last is not None and reached and self._confirmed(used, last, at, way):
+                    return int(used[at]), before
         return None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import pipefish as pf
 from pipefish import _engine
+from pipefish.structure_gaps import zoom_between
 from test_reconstruct_covariance import residuals
 from tube_tracks import Drive, rotation, similarity, tube_drive
 
@@ -93,25 +96,41 @@ def test_a_tenth_of_wrong_observations_is_told_and_leaves_no_gap() -> None:
     assert right > 0.95 * wrong and right > 0.98 * flags
 
 
-def zoomed(drive: Drive, by: float, frames: int) -> pf.Tracks:
-    """Tracks of a drive whose lens zooms over so many frames from the twentieth on."""
+def zoomed(drive: Drive, by: float, frames: int, start: int) -> pf.Tracks:
+    """Tracks of a drive whose lens zooms over so many frames after one."""
     t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
-    zoom = by ** np.clip((t.frame - 20) / frames, 0, 1)
+    zoom = by ** np.clip((t.frame - start) / frames, 0, 1)
     return pf.Tracks(t.frame, t.track, middle + zoom[:, None] * (t.pixels - middle))
 
 
-@pytest.mark.parametrize(("by", "frames"), [(1.2, 1), (0.8, 4), (1.5, 4)])
-def test_what_was_seen_before_the_lens_zoomed_is_measured_and_nothing_behind_it(by: float, frames: int) -> None:
+@pytest.mark.parametrize(
+    ("by", "frames", "start", "seed"),
+    [(1.2, 1, 20, 62), (1.2, 1, 34, 62), (1.2, 1, 12, 64), (1.2, 4, 16, 62), (0.8, 4, 24, 62), (1.5, 4, 30, 63)],
+)
+def test_what_was_seen_before_the_lens_zoomed_is_measured_and_nothing_behind_it(
+    by: float, frames: int, start: int, seed: int
+) -> None:
     """From there on the profile does not hold, and diameters would be off by half of it: a step all at once, which no
     pose explains, and a slow one, which poses and points take up with small residuals."""
-    drive = tube_drive(62, 2.0)
-    rec = pf.reconstruct(zoomed(drive, by, frames), drive.camera, drive.driven)
-    assert rec.status == "partial" and 18 <= rec.frames[-1] <= 21 and not rec.standing
+    drive = tube_drive(seed, 2.0)
+    rec = pf.reconstruct(zoomed(drive, by, frames, start), drive.camera, drive.driven)
+    assert rec.status == "partial" and start - 1 <= rec.frames[-1] <= start and not rec.standing
     assert (rec.gaps[-1].reason, rec.gaps[-1].first, rec.gaps[-1].last) == ("zoom", rec.frames[-1], 40)
     assert "the lens zoomed" in rec.reason
     r, t = drive.poses[0, :, :3], drive.poses[0, :, 3]
     off = rec.points - (drive.points[rec.track] @ r.T + t)
     assert np.median(np.linalg.norm(off, axis=1)) < 0.004
+
+
+def test_a_track_that_is_twice_in_a_frame_tells_the_same_zoom() -> None:
+    drive, by, frame = tube_drive(62, 1.0), 1.2, 10
+    t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
+    known, on = np.unique(t.track[t.frame < frame]), t.frame == frame
+    stretch = {"tracks": known, "points": drive.points[known], "first": 0, "poses": drive.poses[:frame]}
+    track, pixels = t.track[on], middle + by * (t.pixels[on] - middle)
+    once = zoom_between(drive.camera, stretch, frame, track, pixels, 0.3)
+    twice = zoom_between(drive.camera, stretch, frame, np.repeat(track, 2), np.repeat(pixels, 2, axis=0), 0.3)
+    assert once is not None and twice == once and once[0] == pytest.approx(np.log(by), abs=0.005)
 
 
 @pytest.mark.parametrize("seed", [71, 72])
@@ -124,6 +143,19 @@ def test_a_lens_that_did_not_zoom_is_believed(seed: int) -> None:
     drifted = t.pixels + 0.1 * since[:, None] * out / np.linalg.norm(out, axis=1)[:, None]
     rec = pf.reconstruct(pf.Tracks(t.frame, t.track, drifted), drive.camera, drive.driven)
     assert not [g for g in rec.gaps if g.reason == "zoom"] and rec.frames[-1] == 40
+
+
+def test_tracks_that_come_in_from_beyond_the_cameras_model_are_no_error() -> None:
+    """Backwards, corners come in from the rim: a profile up to 69 degrees has no ray for their first views, and two
+    such views say nothing of where a corner is."""
+    drive = tube_drive(62, 1.0, limits=(20.0, 89.0))
+    t = drive.tracks
+    backwards = pf.Tracks(t.frame.max() - t.frame, t.track, t.pixels)
+    camera = dataclasses.replace(drive.camera, theta_max=1.2)
+    rec = pf.reconstruct(backwards, camera, drive.driven[::-1])
+    assert rec.status == "ok" and rec.outside > 500 and len(rec.frames) == 21
+    scale, turn, move = similarity(rec.centres, drive.centres[::-1])
+    assert np.abs(scale * rec.centres @ turn.T + move - drive.centres[::-1]).max() < 0.01
 
 
 @pytest.mark.parametrize("kind", ["mirrored", "one pixel"])

@@ -12,7 +12,9 @@ from PIL import Image
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.measure import Measurement, measure
-from pipefish.measured_remarks import not_measured
+from pipefish.measured_remarks import _repeated_remark, not_measured
+from pipefish.repeated import renamed
+from pipefish.structure import Gap
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_KEYFRAME
 from synthetic import as_object, write_survey
@@ -76,7 +78,8 @@ def jumped(drive: Drive) -> Drive:
     )
 
 
-def measured(drive: Drive, grain: np.ndarray, path: Path) -> Measurement:
+def measured(drive: Drive, grain: np.ndarray, path: Path, silent: int | None = None) -> Measurement:
+    """silent: a keyframe without an encoder's reading."""
     objects, camera = [], drive.camera
     v, u = np.mgrid[: camera.height, : camera.width]
     rays, ok = camera.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(float))
@@ -85,6 +88,8 @@ def measured(drive: Drive, grain: np.ndarray, path: Path) -> Measurement:
         if kind == OBJECT_KEYFRAME:
             message = pb.Keyframe.FromString(data)
             message.jpeg = photograph(camera, rays, drive.poses[message.index], grain)
+            if message.index == silent:
+                message.telemetry.ClearField("encoder_count")
             name, kind, data = as_object(kind, message)
         objects.append((name, kind, data))
     write_survey(path, objects=objects)
@@ -92,9 +97,11 @@ def measured(drive: Drive, grain: np.ndarray, path: Path) -> Measurement:
 
 
 def test_tracks_that_went_on_to_the_next_repeat_are_cut_and_told(tmp_path) -> None:
-    """All of them at one keyframe: a rigid scene, small residuals, and 60 mm that the camera did not drive back."""
+    """All of them at one keyframe: a rigid scene, small residuals, and 60 mm that the camera did not drive back. That
+    another one's encoder said nothing is no matter."""
     drive = repeating()
-    m = measured(jumped(drive), texture(1, PERIOD), tmp_path / "a.mcap")
+    m = measured(jumped(drive), texture(1, PERIOD), tmp_path / "a.mcap", silent=3)
+    assert np.isnan(m.encoder[3])
     assert m.repeats.alarm and m.repeats.share > 0.6 and m.repeats.period == pytest.approx(PERIOD, abs=0.004)
     assert m.jumped == [JUMP]
     at = [np.linalg.norm(m.structure.centres[i] - m.structure.centres[0]) for i in range(len(m.structure.frames))]
@@ -103,6 +110,13 @@ def test_tracks_that_went_on_to_the_next_repeat_are_cut_and_told(tmp_path) -> No
     assert "mm further along the pipe" in told and f"keyframe {JUMP}" in told
     gap = next(g for g in not_measured(m) if g["reason"] == "repeated_pattern")
     assert gap["start"] == pytest.approx(0.05 * JUMP, abs=0.2) and m.measured
+    # Without a jump: agreement is said of the steps alone that were compared.
+    m.jumped, steps = [], int((np.diff(m.structure.segment) == 0).sum())
+    (told,) = _repeated_remark(m)
+    assert f"agree about the {steps - 2} of {steps} steps" in told
+    m.encoder = np.full(len(m.encoder), np.nan)
+    (told,) = _repeated_remark(m)
+    assert "agree" not in told and "nobody knows" in told
 
 
 def test_a_wall_that_does_not_repeat_is_believed(tmp_path) -> None:
@@ -110,3 +124,9 @@ def test_a_wall_that_does_not_repeat_is_believed(tmp_path) -> None:
     m = measured(drive, texture(2, 2.4), tmp_path / "a.mcap")
     assert m.repeats.places > 60 and m.repeats.share < 0.1 and not m.repeats.alarm and not m.jumped
     assert not any("same again" in r for r in m.remarks)
+
+
+def test_a_gap_that_holds_the_cut_is_told_as_one_and_no_other() -> None:
+    gaps = [Gap(first, last, "weak_texture", 0) for first, last in ((2, 9), (9, 10), (9, 11), (10, 12))]
+    reasons = [g.reason for g in renamed(gaps, [JUMP])]
+    assert reasons == ["weak_texture", "repeated_pattern", "repeated_pattern", "weak_texture"]
