@@ -140,9 +140,7 @@ def from_survey(path: str | os.PathLike[str]) -> Input:
     found: list[tuple[float, int, int, Pair]] = []
     for a in range(len(frames)):
         for b in range(min(len(frames) - 1, a + 40), a, -1):
-            _, one, two = np.intersect1d(
-                tracks.track[rows[a]], tracks.track[rows[b]], assume_unique=True, return_indices=True
-            )
+            _, one, two = np.intersect1d(tracks.track[rows[a]], tracks.track[rows[b]], return_indices=True)
             if len(one) >= SURVEY_COMMON:
                 pair = tracks.pixels[rows[a][one]], tracks.pixels[rows[b][two]]
                 found.append((float(np.linalg.norm(np.median(pair[1] - pair[0], axis=0))), a, b, pair))
