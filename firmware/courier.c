@@ -7,9 +7,9 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "clock.h"
 #include "keeper.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/sha256.h"
 #include "pulse.h"
 #include "requests.h"

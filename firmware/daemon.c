@@ -5,8 +5,8 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "clock.h"
 #include "keeper.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/profile_integers.h"
 #include "utf8.h"
 

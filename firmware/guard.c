@@ -13,9 +13,9 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "clock.h"
 #include "config.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pulse.h"
 
 #define SECOND    UINT64_C(1000000000)

@@ -10,13 +10,14 @@
 #include <sys/signalfd.h>
 #include <unistd.h>
 
-#include "clock.h"
 #include "courier.h"
 #include "guard.h"
 #include "keeper.h"
 #include "log.h"
+#include "objects.h"
 #include "pairing.h"
 #include "pipefish/camera_fixed.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipeline.h"
 #include "pulse.h"
@@ -432,7 +433,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     pf_store_stats stats;
     pf_store_config store = {.jobs = c->keyframe.queue,
                              .slots = c->link.send_slots,
-                             .capacity = pf_pipeline_object_max(d),
+                             .capacity = pf_object_max(d),
                              .is_patient = c->camera.driver == PF_CAMERA_REPLAY && c->camera.speed == PF_SPEED_FAST,
                              .wake_fd = d->wake_fd};
     uint64_t status_due = 0;

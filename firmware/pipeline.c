@@ -3,9 +3,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "clock.h"
 #include "index.h"
 #include "log.h"
+#include "objects.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/jpeg.h"
 #include "pipefish/drivers/sha256.h"
 #include "pulse.h"
@@ -16,7 +17,6 @@
 #define PREVIEW_OVERHEAD 128u /* most bytes of a preview message without its JPEG: six numbers and their tags */
 #define NEXT_TIMEOUT_MS  100u /* how long a stop may go unnoticed while the camera is silent */
 #define UNCOUNTED_MAX    30u  /* frames without an encoder count after which that is said */
-#define START_MAX        (PF_PROFILE_BINARY_MAX + PF_CONFIG_KEYS_MAX * PF_CONFIG_LINE_MAX + 4096u)
 
 #define SHOTS PF_CAMERA_HELD_MAX /* the tracker's reference, the frame being tracked, the one that is being taken */
 
@@ -45,19 +45,6 @@ struct pf_pipeline {
 };
 
 /* ---- opening */
-
-/* What libjpeg-turbo's own bound allows, two bytes a pixel in whole blocks; the pages that a JPEG does not reach are
- * never touched, so they cost no memory. */
-static size_t jpeg_max(const pf_camera_info *info)
-{
-    return 2 * (((size_t)info->width + 15) & ~(size_t)15) * (((size_t)info->height + 15) & ~(size_t)15) + 2048;
-}
-
-size_t pf_pipeline_object_max(const pf_daemon *d)
-{
-    size_t keyframe = PF_MSG_KEYFRAME_MAX(d->config.tracker.max_tracks, jpeg_max(d->camera.ops->info(d->camera.self)));
-    return keyframe > START_MAX ? keyframe : START_MAX;
-}
 
 static bool open_shots(pf_pipeline *p, char *error, size_t n)
 {
@@ -97,80 +84,6 @@ static bool open_jpeg(pf_pipeline *p, char *error, size_t n)
                         .preview_quality = d->config.status.preview_quality};
     j.circle_radius = pf_tracking_circle(d, &j.circle_u, &j.circle_v);
     return pf_jpeg_open(&p->jpeg, &j, error, n) == PF_OK;
-}
-
-/* The survey's start: every boot has one. */
-static bool store_start(pf_pipeline *p, char *error, size_t n)
-{
-    pf_daemon *d = p->daemon;
-    const pf_config *c = &d->config;
-    const pf_camera_info *info = d->camera.ops->info(d->camera.self);
-    uint32_t count = pf_config_keys();
-    char(*text)[PF_CONFIG_LINE_MAX] = calloc(count, sizeof *text);
-    const char **lines = calloc(count, sizeof *lines);
-    char *tracker = calloc(count, PF_CONFIG_LINE_MAX);
-    size_t tracker_n = 0;
-    pf_job *job = pf_store_take(d->store);
-    bool ok = false;
-    pf_msg_survey_start start = {.time = {d->boot_id, pf_now()},
-                                 .name = c->survey.name,
-                                 .software = PF_SOFTWARE,
-                                 .source = d->source,
-                                 .profile = d->has_profile ? d->profile_bytes : NULL,
-                                 .profile_size = d->profile_size,
-                                 .metres_per_count = c->encoder.metres_per_count,
-                                 .metres_per_count_sigma = c->encoder.sigma,
-                                 .noise_m_per_sqrt_m = c->encoder.noise,
-                                 .width = info->width,
-                                 .height = info->height,
-                                 .frame_rate = info->frame_rate,
-                                 .nominal_diameter_m = c->survey.nominal_diameter_mm / 1e3,
-                                 .config = lines,
-                                 .config_count = count};
-    memcpy(start.survey_id, d->survey_id, sizeof start.survey_id);
-    for (uint32_t i = 0; text && lines && tracker && i < count; i++) {
-        lines[i] = text[i];
-        (void)pf_config_line(c, i, text[i], sizeof text[i]);
-        if (strncmp(text[i], "tracker.", 8) == 0)
-            tracker_n += (size_t)sprintf(tracker + tracker_n, "%s\n", text[i]);
-    }
-    if (text && lines && tracker && job && pf_sha256(tracker, tracker_n, start.tracker_config_sha256) == PF_OK &&
-        pf_msg_encode_survey_start(&start, job->bytes, pf_store_capacity(d->store), &job->n) == PF_OK) {
-        job->kind = PF_OBJECT_SURVEY_START;
-        pf_store_give(d->store, job);
-        ok = true;
-    } else {
-        (void)snprintf(error, n, "cannot make the survey's start message");
-    }
-    free(text);
-    free(lines);
-    free(tracker);
-    return ok;
-}
-
-/* The end of a survey that had none when another began. */
-static bool store_end_of(pf_pipeline *p, const pf_survey *before, char *error, size_t n)
-{
-    pf_daemon *d = p->daemon;
-    pf_job *job = pf_store_take(d->store);
-    pf_msg_survey_end end = {.time = {d->boot_id, pf_now()},
-                             .keyframes = before->next_index,
-                             .boots = before->boots,
-                             .reason = "interrupted; another survey began",
-                             .lost_first = before->lost_first,
-                             .lost_count = before->lost_count,
-                             .lost_ranges = before->lost_ranges};
-    memcpy(end.survey_id, before->id, sizeof end.survey_id);
-    if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
-        (void)snprintf(error, n, "cannot make the end of the survey before");
-        return false;
-    }
-    pf_log(PF_LOG_WARNING,
-           "survey %02x%02x%02x%02x was interrupted with %u keyframes, and its setup has changed: it ends",
-           before->id[0], before->id[1], before->id[2], before->id[3], before->next_index);
-    job->kind = PF_OBJECT_SURVEY_END;
-    pf_store_give(d->store, job);
-    return true;
 }
 
 static void release(pf_pipeline *p)
@@ -227,7 +140,7 @@ bool pf_pipeline_open(pf_pipeline **pipeline, pf_daemon *daemon, pf_courier *cou
     if (!open_parts(p, error, n) ||
         (daemon->config.camera.index[0] != '\0' &&
          !pf_index_open(&p->index, daemon->config.camera.index, survey->id, survey->boots, error, n)) ||
-        (before->boots > 0 && !store_end_of(p, before, error, n)) || !store_start(p, error, n)) {
+        (before->boots > 0 && !pf_object_interrupted(daemon, before, error, n)) || !pf_object_start(daemon, error, n)) {
         release(p);
         return false;
     }
@@ -281,55 +194,6 @@ static pf_msg_telemetry read_telemetry(pf_pipeline *p, const pf_frame *frame)
     m.limit_front = gpio.limits & PF_LIMIT_FRONT;
     m.limit_rear = gpio.limits & PF_LIMIT_REAR;
     return m;
-}
-
-/* Makes and queues a keyframe; false if it is lost. */
-static bool make_keyframe(pf_pipeline *p, const pf_shot *shot)
-{
-    pf_daemon *d = p->daemon;
-    const pf_frame *frame = &shot->frame;
-    pf_status status;
-    pf_msg_keyframe k = {.index = p->next_index,
-                         .time = {d->boot_id, frame->time_ns},
-                         .frame_sequence = frame->sequence,
-                         .recorded_ns = frame->recorded_ns,
-                         .width = frame->image.width,
-                         .height = frame->image.height,
-                         .jpeg_quality = d->config.keyframe.jpeg_quality,
-                         .cause = shot->cause,
-                         .telemetry = shot->telemetry,
-                         .tracks = shot->tracks,
-                         .n_tracks = shot->n_tracks,
-                         .common_tracks = shot->common,
-                         .tracking = shot->tracking};
-    pf_job *job = pf_store_take(d->store);
-    if (job == NULL) {
-        pf_log(PF_LOG_WARNING, "the disk is too slow: keyframe %u is dropped", k.index);
-        return false;
-    }
-    memcpy(k.survey_id, d->survey_id, sizeof k.survey_id);
-    status = pf_jpeg_encode(p->jpeg, &frame->image, &k.jpeg, &k.jpeg_size);
-    if (status != PF_OK)
-        pf_log(PF_LOG_ERROR, "keyframe %u: %s", k.index, pf_jpeg_error(p->jpeg));
-    if (status == PF_OK && frame->has_sha256)
-        memcpy(k.frame_sha256, frame->sha256, sizeof k.frame_sha256);
-    else if (status == PF_OK)
-        status = pf_sha256_image(&frame->image, k.frame_sha256);
-    if (status == PF_OK) {
-        status = pf_msg_encode_keyframe(&k, job->bytes, pf_store_capacity(d->store), &job->n);
-        if (status != PF_OK)
-            pf_log(PF_LOG_ERROR, "keyframe %u: %s", k.index, pf_status_text(status));
-    }
-    if (status != PF_OK) {
-        pf_store_give_back(d->store, job);
-        return false;
-    }
-    job->kind = PF_OBJECT_KEYFRAME;
-    job->index = k.index;
-    job->is_event = k.cause == PF_KEYFRAME_FIRST || k.cause == PF_KEYFRAME_STATE;
-    memcpy(job->break_reason, p->break_reason, sizeof job->break_reason);
-    pf_store_give(d->store, job);
-    return true;
 }
 
 static void make_preview(pf_pipeline *p, const pf_frame *frame)
@@ -448,7 +312,7 @@ static void finish_shot(pf_pipeline *p, const pf_shot *shot)
     if (shot->break_reason[0] != '\0')
         memcpy(p->break_reason, shot->break_reason, sizeof p->break_reason);
     if (shot->cause != PF_KEYFRAME_NO) {
-        if (make_keyframe(p, shot))
+        if (pf_object_keyframe(p->daemon, p->jpeg, shot, p->next_index, p->break_reason))
             p->break_reason[0] = '\0';
         else
             pf_store_lose(p->daemon->store, p->next_index);
@@ -548,39 +412,6 @@ static void capture(pf_pipeline *p, char *reason, size_t reason_n)
     }
 }
 
-/* The survey's end, after all its keyframes. */
-static void store_end(pf_pipeline *p, const char *reason)
-{
-    pf_daemon *d = p->daemon;
-    pf_msg_status status;
-    char peer[PF_PEER_NAME_MAX];
-    pf_survey survey;
-    pf_job *job;
-    pf_msg_survey_end end = {.time = {d->boot_id, pf_now()},
-                             .keyframes = p->next_index,
-                             .boots = p->boots,
-                             .reason = reason,
-                             .last_status = &status,
-                             .lost_first = survey.lost_first,
-                             .lost_count = survey.lost_count};
-    pf_store_settle(d->store);
-    pf_daemon_status(d, &status, peer);
-    pf_store_get_survey(d->store, &survey);
-    memcpy(end.survey_id, d->survey_id, sizeof end.survey_id);
-    end.frames = status.frames;
-    end.lost_ranges = survey.lost_ranges;
-    job = pf_store_take(d->store);
-    if (job == NULL || pf_msg_encode_survey_end(&end, job->bytes, pf_store_capacity(d->store), &job->n) != PF_OK) {
-        pf_log(PF_LOG_ERROR, "cannot make the survey's end message");
-        if (job != NULL)
-            pf_store_give_back(d->store, job);
-        return;
-    }
-    job->kind = PF_OBJECT_SURVEY_END;
-    pf_store_give(d->store, job);
-    pf_store_settle(d->store);
-}
-
 static void *run(void *argument)
 {
     pf_pipeline *p = argument;
@@ -594,7 +425,7 @@ static void *run(void *argument)
     atomic_store(&d->state, PF_STATE_DRAINING);
     d->gpio.ops->indicate(d->gpio.self, PF_INDICATE_SEND);
     pf_log(p->has_failed ? PF_LOG_ERROR : PF_LOG_INFO, "survey ends: %s; %u keyframes", reason, p->next_index);
-    store_end(p, reason);
+    pf_object_end(d, p->next_index, p->boots, reason);
     pf_pulse_rest();
     atomic_store(&p->is_done, true);
     return NULL;

@@ -9,9 +9,6 @@
 
 typedef struct pf_pipeline pf_pipeline;
 
-/* Most bytes of a keyframe message with this configuration and camera: what the store's jobs must hold. */
-size_t pf_pipeline_object_max(const pf_daemon *daemon);
-
 /* Whether all that depends on the settings, the camera and the profile opens; it is closed again. False: error[n]. */
 bool pf_pipeline_can_open(pf_daemon *daemon, char *error, size_t n);
 

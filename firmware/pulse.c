@@ -4,7 +4,7 @@
 #include <stddef.h>
 #include <sys/prctl.h>
 
-#include "clock.h"
+#include "pipefish/drivers/clock.h"
 
 static _Atomic uint64_t working_since[PF_PULSES]; /* 0 = rests, or is not there */
 static _Thread_local _Atomic uint64_t *own;

@@ -4,9 +4,9 @@
 #include <stdio.h>
 #include <string.h>
 
-#include "clock.h"
 #include "keeper.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 
 #define COMPLAIN_NS UINT64_C(1000000000)
 

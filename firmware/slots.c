@@ -3,10 +3,10 @@
 #include <string.h>
 #include <unistd.h>
 
-#include "clock.h"
 #include "config.h"
 #include "damage.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/messages.h"
 
 /* Says once, not every second, that the spool fails; without the mutex, after a call that says how. Returns why, or

@@ -5,9 +5,9 @@
 #include <string.h>
 #include <time.h>
 
-#include "clock.h"
 #include "config.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/messages.h"
 #include "pulse.h"
 

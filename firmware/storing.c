@@ -2,9 +2,9 @@
 
 #include <string.h>
 
-#include "clock.h"
 #include "config.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/messages.h"
 

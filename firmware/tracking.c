@@ -4,8 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "clock.h"
 #include "log.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/picture.h"
 
 struct pf_tracking {

@@ -1,7 +1,7 @@
 /* A recording as a camera: which frame is due when, loops, stamps, and the check of the recorded hashes. */
 #include "replay.h"
-#include "common/monotonic.h"
 
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/sha256.h"
 
 #include <errno.h>
@@ -79,7 +79,7 @@ static pf_status replay_start(void *self)
 {
     replay *r = self;
     r->started = true;
-    r->start_ns = pf_monotonic_ns();
+    r->start_ns = pf_now();
     r->start_time = is_over(r) ? 0 : time_of(r, r->index, r->loop);
     return PF_OK;
 }
@@ -95,14 +95,14 @@ static pf_status replay_stop(void *self)
  * late whose successor is due already. The last frame is never skipped. */
 static pf_status wait_until_due(replay *r, uint32_t timeout_ms)
 {
-    uint64_t now = pf_monotonic_ns(), due = due_ns(r, r->index, r->loop);
+    uint64_t now = pf_now(), due = due_ns(r, r->index, r->loop);
     if (now < due) {
         uint64_t until = now + (uint64_t)timeout_ms * 1000000u;
         if (until > due)
             until = due;
         struct timespec t = {(time_t)(until / SECOND_NS), (long)(until % SECOND_NS)};
         (void)clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL); /* a signal ends it early: AGAIN */
-        return pf_monotonic_ns() < due ? PF_ERR_AGAIN : PF_OK;
+        return pf_now() < due ? PF_ERR_AGAIN : PF_OK;
     }
     for (;;) {
         uint64_t index = r->index, loop = r->loop;

@@ -1,7 +1,7 @@
 /* A crawler's lamp, wheel, buttons and LED. One thread of its own watches the inputs: what a button does must not wait
  * for anybody. */
-#include "common/monotonic.h"
 #include "gpio/wheel.h"
+#include "pipefish/drivers/clock.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -177,7 +177,7 @@ static void show(board *b)
 static void *watch(void *argument)
 {
     board *b = argument;
-    uint64_t tick = pf_monotonic_ns();
+    uint64_t tick = pf_now();
     (void)pthread_setname_np(pthread_self(), "GPIO");
     pthread_mutex_lock(&b->mutex);
     while (!b->is_over) {
@@ -188,7 +188,7 @@ static void *watch(void *argument)
                 0};
         pthread_mutex_unlock(&b->mutex);
         (void)poll(fd, 2 + BUTTONS, (int)TICK_MS);
-        uint64_t now = pf_monotonic_ns();
+        uint64_t now = pf_now();
         pthread_mutex_lock(&b->mutex);
         b->round_ns = now;
         if (fd[2].revents != 0)
@@ -241,7 +241,7 @@ static pf_status board_encoder(void *self, uint64_t time_ns, int64_t *count, uin
     if (status != PF_OK)
         return status;
     pthread_mutex_lock(&b->mutex);
-    pf_wheel_read(&b->wheel, pf_monotonic_ns()); /* what the thread has not come to yet */
+    pf_wheel_read(&b->wheel, pf_now()); /* what the thread has not come to yet */
     *count = pf_history_at(&b->wheel.history, time_ns, b->wheel.decoder.count);
     *missed = b->wheel.decoder.missed;
     if (b->wheel.is_broken)
@@ -316,7 +316,7 @@ static pf_status open_parts(board *b, const pf_gpio_config *c)
     b->is_stopped = b->button[0].is_pressed;
     if (has_light(&b->lamp) && !b->is_stopped && set_light(&b->lamp, c->lamp_level) != PF_OK)
         return pf_fail(f, PF_ERR_IO, "gpio.lamp: %s: cannot be set", c->lamp);
-    b->round_ns = pf_monotonic_ns();
+    b->round_ns = pf_now();
     b->wake = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     if (b->wake < 0 || pthread_create(&b->thread, NULL, watch, b) != 0)
         return pf_fail(f, PF_ERR_SPACE, "gpio: cannot start its thread");

@@ -1,6 +1,6 @@
 /* Serial line: raw, non-blocking, any baud rate the device can make (termios2), reopened when it was unplugged. */
 #include "common/failure.h"
-#include "common/monotonic.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/transport.h"
 #include "pipefish/link.h"
 
@@ -126,7 +126,7 @@ static pf_status open_device(serial *s, bool *is_absent)
     s->fd = fd;
     s->fresh = true;
     s->pty_queue = 0;
-    s->pty_time_ns = pf_monotonic_ns();
+    s->pty_time_ns = pf_now();
     return PF_OK;
 }
 
@@ -181,7 +181,7 @@ static size_t five_ms(const serial *s)
 
 static void drain_pty(serial *s)
 {
-    uint64_t now = pf_monotonic_ns();
+    uint64_t now = pf_now();
     s->pty_queue -= (double)(now - s->pty_time_ns) * 1e-9 * s->baud / 10;
     if (s->pty_queue < 0)
         s->pty_queue = 0;

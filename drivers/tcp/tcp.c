@@ -1,7 +1,7 @@
 /* TCP on loopback: a listener, the connection that has the line, and a few that look on. One epoll descriptor holds
  * them all: it is what the daemon polls. */
 #include "common/lines.h"
-#include "common/monotonic.h"
+#include "pipefish/drivers/clock.h"
 
 #include <errno.h>
 #include <poll.h>
@@ -44,7 +44,7 @@ static bool is_leaving(const tcp *t)
 static pf_status admit(tcp *t, bool *fresh)
 {
     pf_address peer;
-    uint64_t now = pf_monotonic_ns();
+    uint64_t now = pf_now();
     if (is_leaving(t))
         return PF_ERR_AGAIN;
     int fd = pf_listener_accept(t->lines.listener, &peer);
@@ -97,7 +97,7 @@ static pf_status tcp_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     ssize_t k = recv(l->fd, bytes, capacity, 0);
     if (k > 0) {
         *done = (size_t)k;
-        pf_line_heard(l, pf_monotonic_ns());
+        pf_line_heard(l, pf_now());
     } else if (k == 0) {
         return hang_up(l, "the other side closed the connection");
     } else if (errno != EAGAIN && errno != EINTR) {

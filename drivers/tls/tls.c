@@ -1,7 +1,7 @@
 /* Mutual TLS 1.3 by OpenSSL. One epoll descriptor holds the listener, the guests whose handshake is under way, the host
  * that has the line, and the visitors that look on: it is what the daemon polls, and it becomes readable for all. */
 #include "common/lines.h"
-#include "common/monotonic.h"
+#include "pipefish/drivers/clock.h"
 #include "tls/gate.h"
 #include "trust/private.h"
 
@@ -331,7 +331,7 @@ static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     int k = SSL_read(g->ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
     if (k > 0) {
         *done = (size_t)k;
-        pf_line_heard(&g->line, pf_monotonic_ns());
+        pf_line_heard(&g->line, pf_now());
     } else if (!may_go_on(g, k, &is_full)) {
         return hang_up(g, "the other side closed the connection");
     }
@@ -364,7 +364,7 @@ static pf_status tls_service(void *self, bool *fresh)
 {
     guest *g = self;
     tls *t = owner(g);
-    uint64_t now = pf_monotonic_ns();
+    uint64_t now = pf_now();
     *fresh = false;
     if (g != &t->host)
         return g->line.fd >= 0 ? PF_OK : PF_ERR_CLOSED;

@@ -1,6 +1,6 @@
 /* What a daemon that hangs or fails is known by: the pulse of a thread (pulse.c), and what starts leave behind for the
  * next ones (recall.c). Threads that hang inside the whole daemon: tests/python/test_daemon_guard.py. */
-#include "clock.h"
+#include "pipefish/drivers/clock.h"
 #include "pulse.h"
 #include "recall.h"
 #include "temporary.h"

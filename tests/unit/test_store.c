@@ -1,4 +1,4 @@
-#include "clock.h"
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/link.h"
 #include "pulse.h"

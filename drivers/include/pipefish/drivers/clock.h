@@ -1,6 +1,6 @@
-/* The monotonic clock, nanoseconds. */
-#ifndef PIPEFISHD_CLOCK_H
-#define PIPEFISHD_CLOCK_H
+/* CLOCK_MONOTONIC, in nanoseconds: the clock of every time in pipefishd. */
+#ifndef PIPEFISH_DRIVERS_CLOCK_H
+#define PIPEFISH_DRIVERS_CLOCK_H
 
 #include <stdint.h>
 #include <time.h>
