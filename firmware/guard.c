@@ -108,7 +108,6 @@ static void look(pf_guard *g, uint64_t now)
         (void)snprintf(text, sizeof text, "STATUS=%s%s", hung != NULL ? "hangs: " : "well", hung != NULL ? hung : "");
         tell_manager(g, text);
         g->hung = hung;
-        atomic_store(&g->is_hung, hung != NULL);
     }
     if (hung == NULL)
         feed(g, now);
@@ -119,21 +118,24 @@ static void *watch(void *argument)
     pf_guard *g = argument;
     const struct timespec tick = {0, TICK_NS};
     (void)prctl(PR_SET_NAME, "watchdogs");
-    bool was_ready = false;
+    uint64_t up_ns = UINT64_MAX; /* from when on the start counts as one that came up */
     while (!atomic_load(&g->is_over)) {
-        bool is_ready = atomic_load(&g->is_ready);
-        if (is_ready && !was_ready)
+        const uint64_t now = pf_now();
+        if (up_ns == UINT64_MAX && atomic_load(&g->is_ready)) {
             g->manager_due = 0;
-        was_ready = is_ready;
-        look(g, pf_now());
+            up_ns = now + PF_RECALL_UP_NS;
+        }
+        look(g, now);
+        if (now > up_ns)
+            pf_recall_up(g->recall, g->hung == NULL);
         (void)nanosleep(&tick, NULL);
     }
     return NULL;
 }
 
-bool pf_guard_open(pf_guard *guard, const char *device, uint32_t hang_s, char *error, size_t n)
+bool pf_guard_open(pf_guard *guard, pf_recall *recall, const char *device, uint32_t hang_s, char *error, size_t n)
 {
-    *guard = (pf_guard){.manager = -1, .device = -1, .hang_ns = hang_s * SECOND / 2};
+    *guard = (pf_guard){.recall = recall, .manager = -1, .device = -1, .hang_ns = hang_s * SECOND / 2};
     open_manager(guard);
     if (!open_device(guard, device, hang_s, error, n))
         return false;

@@ -9,12 +9,14 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "recall.h"
+
 typedef struct pf_guard {
     pthread_t thread;
     bool is_running;
     _Atomic bool is_ready, is_over;
-    _Atomic bool is_hung; /* a thread hangs: nothing is fed */
-    int manager;          /* socket; -1 = none */
+    pf_recall *recall;
+    int manager; /* socket; -1 = none */
     uint64_t manager_ns, manager_due;
     int device; /* -1 = none */
     uint64_t device_ns, device_due;
@@ -24,8 +26,9 @@ typedef struct pf_guard {
 
 /* Starts a thread that feeds them, from before the daemon's devices are opened: what hangs there is the main thread.
  * Until pf_guard_ready the service manager is told to go on waiting. `device`: "/dev/watchdog", or "" for none, barks
- * after `hang_s`; a thread hangs after half of it. False: error[n] says why. */
-bool pf_guard_open(pf_guard *guard, const char *device, uint32_t hang_s, char *error, size_t n);
+ * after `hang_s`; a thread hangs after half of it. `recall` is told from PF_RECALL_UP_NS after pf_guard_ready on, and
+ * lives until pf_guard_close. False: error[n] says why. */
+bool pf_guard_open(pf_guard *guard, pf_recall *recall, const char *device, uint32_t hang_s, char *error, size_t n);
 
 /* The daemon is up. */
 void pf_guard_ready(pf_guard *guard);

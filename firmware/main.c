@@ -385,11 +385,10 @@ static bool has_host(pf_daemon *d)
 }
 
 /* Returns when it is time to exit. */
-static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard, int signals)
+static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
-    const uint64_t up_ns = pf_now();
-    uint64_t host_ns = up_ns; /* when a host was there last */
+    uint64_t host_ns = pf_now(); /* when a host was there last */
     bool is_terminated = false, must_exit = false;
     pf_gpio_state gpio = {0};
     for (;;) {
@@ -398,8 +397,6 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         pf_pulse_work();
-        if (pf_now() - up_ns > PF_RECALL_UP_NS)
-            pf_recall_up(d->recall, !atomic_load(&guard->is_hung));
         if (pf_now() - d->started_ns > PF_RECALL_GOOD_NS)
             pf_recall_good(d->recall, &d->config);
         note_status(d, &status_due, false);
@@ -462,7 +459,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     }
     if (is_good) {
         pf_guard_ready(guard);
-        supervise(d, pipeline, guard, signals);
+        supervise(d, pipeline, signals);
     } else {
         pf_log(PF_LOG_ERROR, "%s", error);
     }
@@ -503,7 +500,7 @@ static int open_and_run(pf_daemon *d, pf_guard *guard, int signals)
     pf_pulse_begin(PF_PULSE_MAIN);
     d->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     if (d->wake_fd < 0 || !open_random(d, error, sizeof error) ||
-        !pf_guard_open(guard, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) ||
+        !pf_guard_open(guard, d->recall, c->daemon.watchdog, c->daemon.watchdog_s, error, sizeof error) ||
         !open_camera(d, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;

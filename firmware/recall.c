@@ -79,6 +79,7 @@ void pf_recall_begin(pf_recall *recall, const char *folder, const char *file)
         !hash_file(file, recall->hash))
         return;
     (void)strcpy(recall->folder, folder);
+    (void)pthread_mutex_init(&recall->mutex, NULL);
     if (mkdir(folder, 0755) != 0 && errno != EEXIST) {
         pf_log(PF_LOG_WARNING, "--state %s: %s", folder, strerror(errno));
         recall->folder[0] = '\0';
@@ -108,20 +109,31 @@ bool pf_recall_is_due(const pf_recall *recall, char *path, size_t n)
 
 void pf_recall_up(pf_recall *recall, bool is_well)
 {
-    if (recall->folder[0] == '\0' || recall->is_done || recall->is_up == is_well)
+    if (recall->folder[0] == '\0')
         return;
-    recall->is_up = is_well;
-    keep_starts(recall);
+    pthread_mutex_lock(&recall->mutex);
+    if (!recall->is_done && recall->is_up != is_well) {
+        recall->is_up = is_well;
+        keep_starts(recall);
+    }
+    pthread_mutex_unlock(&recall->mutex);
 }
 
-void pf_recall_good(pf_recall *recall, const pf_config *config)
+/* From now on whatever happens to this start is no failure. */
+static void end_trial(pf_recall *recall)
+{
+    pthread_mutex_lock(&recall->mutex);
+    recall->is_done = true;
+    if (!recall->is_recalled) { /* else it stays true that the file failed three times, until it is changed */
+        recall->starts = 0;
+        keep_starts(recall);
+    }
+    pthread_mutex_unlock(&recall->mutex);
+}
+
+static void keep_good(const pf_recall *recall, const pf_config *config)
 {
     size_t size = pf_config_keys() * (PF_CONFIG_LINE_MAX + 32), at = 0;
-    if (recall->folder[0] == '\0' || recall->is_done)
-        return;
-    recall->is_done = true;
-    if (recall->is_recalled) /* until the file is changed: that it failed three times stays true */
-        return;
     char *text = malloc(size), section[64] = "";
     if (text == NULL)
         return;
@@ -139,6 +151,13 @@ void pf_recall_good(pf_recall *recall, const pf_config *config)
     }
     keep(recall, "good.ini", text, at);
     free(text);
-    recall->starts = 0;
-    keep_starts(recall);
+}
+
+void pf_recall_good(pf_recall *recall, const pf_config *config)
+{
+    if (recall->folder[0] == '\0' || recall->is_done)
+        return;
+    if (!recall->is_recalled)
+        keep_good(recall, config);
+    end_trial(recall);
 }

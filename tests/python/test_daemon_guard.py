@@ -182,6 +182,48 @@ def test_a_process_that_stands_still_starves_the_watchdog(tmp_path: Path, manage
     crawler.kill()
 
 
+def wait_for_start(folder: Path, is_up: bool) -> str:
+    """The file that `--state` keeps of the start in progress, once it says so."""
+    end = time.monotonic() + 60
+    while (text := (folder / "starts").read_text()).endswith(" up\n") != is_up:
+        assert time.monotonic() < end, text
+        time.sleep(0.05)
+    return text
+
+
+def test_a_main_thread_that_hangs_is_a_failed_start_and_a_power_cut_of_a_daemon_that_is_well_is_none(
+    tmp_path: Path, manager: Manager
+):
+    """The board's own watchdog ends such a hang as a power cut ends all: without another word from the daemon."""
+    write_recording(tmp_path / "survey.y4m", 5)
+    state = tmp_path / "state"
+    crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0, daemon__watchdog_s=2)
+    crawler.start("--state", str(state))
+    assert "READY=1" in manager.listen(30, "READY=1")
+    well = wait_for_start(state, True)
+    draft = tmp_path / "status.json.new"  # nobody reads: who writes the status waits for ever
+    while not draft.is_fifo():
+        with contextlib.suppress(FileExistsError):  # it is just being written
+            os.mkfifo(draft)
+    assert "STATUS=hangs: main" in manager.listen(30, "STATUS=hangs: main")
+    hung = wait_for_start(state, False)
+    assert "WATCHDOG=1" not in manager.listen(4 * PERIOD_S)
+    assert "the main thread hangs" in crawler.text()
+    crawler.kill()
+    draft.unlink()
+    counts = []
+    for text in (well, hung):
+        count, settings, boot, *_ = text.split()
+        other = text.replace(boot, "0" * 8 + boot[8:])
+        assert count == "1" and settings != boot and other != text
+        (state / "starts").write_text(other)  # as found after the board has booted again
+        crawler.start("--state", str(state))
+        assert "READY=1" in manager.listen(30, "READY=1")
+        counts.append((state / "starts").read_text().split()[0])
+        crawler.kill()
+    assert counts == ["1", "2"]
+
+
 def test_a_watchdog_device_that_is_none_is_a_clear_error(tmp_path: Path):
     write_recording(tmp_path / "survey.y4m", 5)
     for path in ("/dev/null", tmp_path / "none"):
