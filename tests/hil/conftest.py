@@ -91,6 +91,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         terminalreporter.write_line(
             f"{r.name:34}{r.frames_in:10}{r.keyframes_out:10}{r.lost:6}{r.duplicated:6}{recovery:>10}"
         )
-    boot = sorted(r.boot_s for r in RESULTS)[0]
-    stages = ", ".join(f"{name} {us / 1000:.1f}" for name, us in RESULTS[0].stage_us.items())
-    terminalreporter.write_line(f"quickest boot {boot:.1f} s; {RESULTS[0].name}, ms of the board's time: {stages}")
+    stages = list(RESULTS[0].cpu_share)
+    terminalreporter.write_line("")
+    terminalreporter.write_line("seconds and milliseconds of the board's time, which runs with its instructions")
+    terminalreporter.write_line(
+        f"{'scenario':34}{'boot':>7}{'daemon':>7}{'frame':>7}{'CPU a frame':>14}"
+        + "".join(f"{stage:>9}" for stage in stages)
+    )
+    for r in RESULTS:
+        times = "".join("      -" if s is None else f"{s:7.2f}" for s in (r.up_s, r.daemon_s, r.frame_s))
+        shares = "".join(f"{100 * r.cpu_share[stage]:7.1f} %" for stage in stages)
+        terminalreporter.write_line(f"{r.name:34}{times}{r.cpu_ms:11.1f} ms{shares}")

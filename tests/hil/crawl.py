@@ -8,6 +8,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -83,8 +84,13 @@ class Result:
     lost: int = 0
     duplicated: int = 0
     recovery_s: float | None = None
-    boot_s: float | None = None
-    stage_us: dict[str, float] = field(default_factory=dict)  # of the daemon, mean a frame, in the board's time
+    # Of the last boot, in the board's time from its kernel's start on: it takes commands, the daemon is started, the
+    # daemon's first frame. What the test does in between is in it.
+    up_s: float | None = None
+    daemon_s: float | None = None
+    frame_s: float | None = None
+    cpu_ms: float | None = None  # of the daemon's last start, a frame, in the board's time
+    cpu_share: dict[str, float] = field(default_factory=dict)  # of that, by stage
 
 
 class Crawl:
@@ -97,6 +103,7 @@ class Crawl:
         self.patience = 3 if board.has_system else 1  # a whole system has much to do besides
         self.daemon = 0
         self.starts = 0
+        self._first_start = (0, 0, 0.0)  # of the last boot that had one: which boot, which start, the board's uptime
         self.environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "host")}
         self._receiver: subprocess.Popen[bytes] | None = None
         for suffix in ("y4m", "profile"):
@@ -135,10 +142,15 @@ class Crawl:
             "status.interval_ms": "200",
         }
         flags = " ".join(f"--set {a}" for a in self._arguments(settings, "/mnt"))
+        self._note_start()
         self.daemon = self.board.spawn(
-            f"exec /mnt/pipefishd --config /run/empty.ini {flags}", f"daemon{self.starts}.log"
+            f"exec /mnt/pipefishd --config /run/empty.ini {flags}", f"daemon{self.starts - 1}.log"
         )
+
+    def _note_start(self) -> None:
         self.starts += 1
+        if self._first_start[0] != self.board.boots:
+            self._first_start = self.board.boots, self.starts, self.board.uptime()
 
     def install(self, package: Path) -> None:
         """As its owner does: the package by dpkg, settings in its file, the service enabled and started. The log
@@ -166,7 +178,7 @@ class Crawl:
         board.run("cp /mnt/pipefishd.ini /mnt/crawl.profile /etc/pipefish/ && pipefishd --check-config")
         board.run("install -d -o pipefish -g pipefish -m 750 /var/lib/pipefish /var/lib/pipefish/index")
         board.run("ln -s /run/pipefish/status.json /run/status.json; touch /mnt/daemon0.log")
-        self.starts = 1
+        self._note_start()
         board.run("systemctl enable pipefishd && systemctl start pipefishd")
 
     def wait_for(self, text: str, timeout: float = 80) -> float:
@@ -193,6 +205,24 @@ class Crawl:
         """Begins to show frames to the camera; the process id of the world."""
         command = f"exec /mnt/pipefish-world /mnt/crawl.y4m {device} {pixels} {rate} {first} {count} {encoder}"
         return self.board.spawn(command, f"world{first}.log")
+
+    def measure(self, result: Result, process: int) -> None:
+        """Adds the daemon's CPU time to the table, while it runs: its threads', the tracking's by the stage timers."""
+        status = self.board.status()
+        ticks: dict[str, int] = {}
+        for line in self.board.run(f"cat /proc/{process}/task/*/stat 2>/dev/null", check=False).splitlines():
+            name, numbers = re.fullmatch(r"\d+ \((.*)\) \S (.*)", line).groups()
+            user, system = numbers.split()[10:12]
+            ticks[name] = ticks.get(name, 0) + int(user) + int(system)
+        stages = {stage: status["stage"][stage] for stage in ("pyramid", "track", "detect")}
+        tracking = ticks.pop("tracking", 0)
+        spent = {stage: tracking * us / max(sum(stages.values()), 1e-9) for stage, us in stages.items()}
+        spent |= {name: ticks.pop(name, 0) for name in ("capture", "store", "link")}
+        spent["main"] = ticks.pop("pipefishd", 0)  # opens everything, writes the status file
+        spent["other"] = sum(ticks.values())
+        total = sum(spent.values())
+        result.cpu_ms = 10 * total / max(status["frames"], 1)
+        result.cpu_share = {stage: part / max(total, 1) for stage, part in spent.items()}
 
     def stop_daemon(self) -> None:
         """The survey ends; the daemon drains and exits."""
@@ -288,6 +318,8 @@ class Crawl:
         result.duplicated = sum(n - 1 for n in moments.values())
         result.keyframes_out = len(survey.keyframes)
         boots = list(dict.fromkeys(s.time.boot_id for s in survey.starts))
+        _, start, result.daemon_s = self._first_start
+        result.up_s = self.board.up_s
         compared = 0
         for number, (path, rows) in enumerate(self.indices()):
             result.frames_in += len(rows)
@@ -296,7 +328,10 @@ class Crawl:
             rows = rows[: strange[0]] if strange else rows
             if not rows:
                 continue
-            boot = boots[int(path.stem.split("-")[1]) - 1]
+            count = int(path.stem.split("-")[1])
+            if count == start:
+                result.frame_s = int(rows[0]["time_ns"]) / 1e9
+            boot = boots[count - 1]
             last = int(rows[-1]["sequence"])
             got = {
                 k.message.frame_sequence: k

@@ -40,7 +40,8 @@ def begin(crawl, **settings: str):
 
 
 def end(survey, note, name: str, recovery_s: float | None = None, with_noise: bool = False) -> Result:
-    row = Result(name, recovery_s=recovery_s, boot_s=survey.board.boot_s, stage_us=survey.board.status()["stage"])
+    row = Result(name, recovery_s=recovery_s)
+    survey.measure(row, survey.daemon)
     survey.stop_daemon()
     result = survey.check(survey.finish(), row, with_noise)
     note(result)
