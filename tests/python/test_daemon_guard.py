@@ -197,7 +197,7 @@ def test_a_main_thread_that_hangs_is_a_failed_start_and_a_power_cut_of_a_daemon_
     """The board's own watchdog ends such a hang as a power cut ends all: without another word from the daemon."""
     write_recording(tmp_path / "survey.y4m", 5)
     state = tmp_path / "state"
-    crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0, daemon__watchdog_s=2)
+    crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0, daemon__watchdog_s=4)
     crawler.start("--state", str(state))
     assert "READY=1" in manager.listen(30, "READY=1")
     well = wait_for_start(state, True)
