@@ -115,6 +115,7 @@ class Client:
         self._open = False
         self._was_open = False
         self._open_error = ""  # why the line could not be opened, "" while it is open
+        self._lost_error = ""  # why it was lost before, "" since the device has answered
         self._backlog = b""  # bytes of the link that the line has not taken
         # Objects whose answer is due: slot, name, kind, bytes. The link asks once, whatever happens to the line.
         self._pending: list[tuple[int, bytes, int, bytes]] = []
@@ -156,8 +157,9 @@ class Client:
             self.step(IDLE_S)
             silent_s = (time.monotonic_ns() - self.down_since_ns) / 1e9
             if not self.up and timeout_s and silent_s > timeout_s:
-                why = f": {self._open_error}" if self._open_error else ""
-                raise NoDevice(f"no device answers on {self.transport.name} (waited {timeout_s:g} s){why}")
+                why = self._open_error or self._lost_error
+                waited = f"no device answers on {self.transport.name} (waited {timeout_s:g} s)"
+                raise NoDevice(f"{waited}: {why}" if why else waited)
 
     def step(self, most_s: float) -> None:
         """One turn: waits for bytes or a deadline, at most `most_s` seconds, and serves what happened."""
@@ -167,10 +169,13 @@ class Client:
         try:
             self._turn(most_s)
         except TransportClosed as error:
-            self._open_error = error.reason
+            self._lost_error = error.reason
             self._lost()
 
     def _turn(self, most_s: float) -> None:
+        # What has come while the caller was busy, or stood still, is heard before the link looks at the clock: it is a
+        # sign of life.
+        self._hear(0.0)
         now = time.monotonic_ns()
         blocked = self._flush(now)
         wait_s = min(most_s, max(0.0, (self.link.deadline(now) - now) / 1e9))
@@ -178,13 +183,17 @@ class Client:
             wait_s = min(wait_s, 0.01)
         if blocked:
             wait_s = min(wait_s, 0.005)
+        self._hear(wait_s)
+        self._answer_pending()
+        self._flush(time.monotonic_ns())
+
+    def _hear(self, wait_s: float) -> None:
+        """Serves what the device says within that time."""
         readable, _, _ = select.select([self.transport], [], [], wait_s)
         now = time.monotonic_ns()
         data = self.transport.read() if readable else b""
         for event in self.link.input(data, now):
             self._serve(event)
-        self._answer_pending()
-        self._flush(time.monotonic_ns())
 
     def _flush(self, now: int) -> bool:
         """Gives the line what the link wants to send. True while the line takes no more."""
@@ -203,6 +212,7 @@ class Client:
         match event.type:
             case x if x == UP:
                 self._waited_since_ns = self.down_since_ns
+                self._lost_error = ""
                 self.up, self.boot = True, event.peer_boot_id
                 self._backoff_s = BACKOFF_S[0]
                 self.handlers.on_up(event)

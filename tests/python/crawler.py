@@ -10,7 +10,7 @@ import sqlite3
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from pipefish.transport import TcpTransport, TransportClosed
 ROOT = Path(__file__).resolve().parents[2]
 START, KEYFRAME, END = 1, 2, 3
 SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
+PATIENCE_S = 60.0  # for what a busy machine may delay at will: only what will never come is waited for so long
 WIDTH, HEIGHT = 192, 160
 COUNTS_PER_FRAME = 10
 RESET_GAP = 5  # tracker.reset_gap's default
@@ -73,16 +74,21 @@ def write_recording(path: Path, frames: int, rate: int = 25, skip: tuple[int, ..
     return hashes
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
+def reserve_port() -> socket.socket:
+    """A port of the loopback that the system gives to nobody else while the socket is open: it is bound and does not
+    listen, and so keeps none out who binds this very port with SO_REUSEADDR, as the daemon does, again and again."""
+    holder = socket.socket()
+    holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    holder.bind(("127.0.0.1", 0))
+    return holder
 
 
 class Crawler:
     """A daemon's settings and its process, which may be started again and again on the same spool."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
-        self.port = free_port()
+        self._reserved = reserve_port()
+        self.port = self._reserved.getsockname()[1]
         self.status_file = folder / "status.json"
         self.config = folder / "pipefishd.ini"
         self.log = folder / "log"
@@ -95,7 +101,7 @@ class Crawler:
             "spool.path": folder / "spool.db",
             "status.interval_ms": 100,
             "status.preview_interval_ms": 100,
-            "daemon.drain_s": 20,
+            "daemon.drain_s": 600,
             "daemon.status_file": self.status_file,
         } | {key.replace("__", "."): value for key, value in settings.items()}
         sections: dict[str, list[str]] = {}
@@ -116,8 +122,8 @@ class Crawler:
     def terminate(self) -> None:
         self.process.send_signal(signal.SIGTERM)
 
-    def wait(self, timeout: float = 30) -> int:
-        return self.process.wait(timeout)
+    def wait(self) -> int:
+        return self.process.wait(2 * PATIENCE_S)
 
     def status(self) -> dict:
         return json.loads(self.status_file.read_text()) if self.status_file.exists() else {}
@@ -156,7 +162,7 @@ class Store(ObjectHandlers):
     def client(self) -> Iterator[Client]:
         """A fresh client, as after the host's own restart; waits for the daemon's port."""
         client = Client(self.transport("127.0.0.1", self.port), self)
-        end = time.monotonic() + 10
+        end = time.monotonic() + PATIENCE_S
         while True:
             try:
                 client.open()
@@ -185,19 +191,34 @@ class Store(ObjectHandlers):
         return [pb.SurveyEnd.FromString(data) for data in self.of_kind(END)]
 
 
-def serve(crawler: Crawler, client: Client, until, timeout: float = 30) -> None:
-    """Runs the client until `until()` or the daemon's end."""
-    end = time.monotonic() + timeout
-    while not until() and crawler.process.poll() is None:
+def serve(crawler: Crawler, client: Client, until: Callable[[], object]) -> None:
+    """Runs the client until `until()`, or until the daemon has ended and all it said has been heard."""
+    end = time.monotonic() + 2 * PATIENCE_S
+    while not until():
         assert time.monotonic() < end, crawler.text()
+        has_ended = crawler.process.poll() is not None
         client.step(0.02)
+        if has_ended and not client.up:
+            return
 
 
 def wait_for_log(crawler: Crawler, text: str) -> None:
     """Until the daemon has logged `text`."""
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while text not in crawler.text():
         assert time.monotonic() < end, crawler.text()
+        time.sleep(0.02)
+
+
+def wait_for_status(crawler: Crawler, is_so: Callable[[dict], object]) -> dict:
+    """The status file, once it is there and `is_so`; a key that it does not have means that it is not."""
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        status = crawler.status()
+        with contextlib.suppress(KeyError):
+            if status and is_so(status):
+                return status
+        assert time.monotonic() < end, f"{status}\n{crawler.text()}"
         time.sleep(0.02)
 
 
@@ -215,4 +236,4 @@ def receive_all(crawler: Crawler, store: Store) -> int:
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([find_daemon(), *map(str, arguments)], capture_output=True, text=True, timeout=20)
+    return subprocess.run([find_daemon(), *map(str, arguments)], capture_output=True, text=True, timeout=2 * PATIENCE_S)

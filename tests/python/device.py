@@ -64,7 +64,7 @@ class Device(threading.Thread):
 
     def stop(self) -> None:
         self._done.set()
-        self.join(5)
+        self.join(60)
         self._server.close()
 
     def __enter__(self) -> Device:
@@ -88,6 +88,14 @@ class Device(threading.Thread):
     def _serve(self, line: socket.socket) -> None:
         sent_here = 0
         while not self._done.is_set():
+            now = time.monotonic_ns()
+            wait = min(0.02, max(0, self.link.deadline(now) - now) / 1e9)
+            readable, _, _ = select.select([line], [], [], wait)
+            data = line.recv(65536) if readable else b""
+            if readable and not data:
+                return
+            for event in self.link.input(data, time.monotonic_ns()):
+                self._event(event)
             for name, (kind, data) in list(self.spool.items()):
                 is_held = len(self._under_way) >= self.most
                 if name not in self._under_way and not is_held and self.link.free_send_slots():
@@ -99,13 +107,6 @@ class Device(threading.Thread):
                 sent_here += len(out)
             if self.cut_after and sent_here > self.cut_after:
                 return
-            wait = min(0.02, max(0, self.link.deadline(now) - now) / 1e9)
-            readable, _, _ = select.select([line], [], [], wait)
-            data = line.recv(65536) if readable else b""
-            if readable and not data:
-                return
-            for event in self.link.input(data, time.monotonic_ns()):
-                self._event(event)
 
     def _spoil(self, data: bytes) -> bytes:
         if not self.corrupt_every:

@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import random
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,19 @@ from pathlib import Path
 import pytest
 
 import pipefish as pf
-from crawler import HEIGHT, SEED, WIDTH, Crawler, Store, run, serve, wait_for_log, write_recording
+from crawler import (
+    HEIGHT,
+    PATIENCE_S,
+    SEED,
+    WIDTH,
+    Crawler,
+    Store,
+    run,
+    serve,
+    wait_for_log,
+    wait_for_status,
+    write_recording,
+)
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
@@ -45,7 +58,7 @@ def crawler(tmp_path: Path) -> Iterator[Crawler]:
 
 def device(crawler: Crawler) -> Flasher:
     wait_for_log(crawler, "; survey ")
-    return Flasher(TcpTransport("127.0.0.1", crawler.port), 10)
+    return Flasher(TcpTransport("127.0.0.1", crawler.port), PATIENCE_S)
 
 
 def restart(crawler: Crawler) -> pb.ProfileState:
@@ -98,14 +111,10 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
     store = Store(crawler.port)
     with store.client() as client:
         serve(crawler, client, lambda: any(s.profile for s in store.starts) and store.statuses)
-        status = client.answer_to(10, get_status=pb.Nothing()).status
+        status = client.answer_to(PATIENCE_S, get_status=pb.Nothing()).status
     assert OLD.to_binary() in [s.profile for s in store.starts]
     assert status.profile == state.in_use == store.statuses[-1].profile
-    end = time.monotonic() + 10
-    while not crawler.status():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    assert crawler.status()["profile"]["sha256"] == status.profile.sha256.hex()
+    assert wait_for_status(crawler, lambda s: s["profile"])["profile"]["sha256"] == status.profile.sha256.hex()
     assert cli.main(["status", f"tcp://127.0.0.1:{crawler.port}"]) == 0
     assert "old, serial S1" in capsys.readouterr().out
 
@@ -182,11 +191,7 @@ def test_a_stored_profile_that_the_pipeline_cannot_use_does_not_end_the_daemon(c
         assert not flasher.confirm(flasher.state().in_use.sha256).in_use.trial
     state = restart(crawler)
     assert not state.HasField("in_use") and "image circle" in state.problem
-    end = time.monotonic() + 10
-    while not crawler.status():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    assert "image circle" in crawler.status()["profile_problem"]
+    assert "image circle" in wait_for_status(crawler, lambda s: s["profile_problem"])["profile_problem"]
     assert install(crawler, NEW).in_use.name == "new"
 
 
@@ -297,13 +302,14 @@ def test_sending_goes_on_after_the_device_was_killed(crawler: Crawler):
     crawler.start("--set", "link.port=" + str(crawler.port))
     with device(crawler) as flasher:
         flasher.state()
-        os.kill(crawler.process.pid, 19)  # SIGSTOP: it takes no profile any more
+        crawler.process.send_signal(signal.SIGSTOP)  # it takes no profile any more
+        os.waitid(os.P_PID, crawler.process.pid, os.WSTOPPED)
         result: list[pb.ProfileState | Exception] = []
 
         def send() -> None:
             try:
                 flasher._client.link.send_object(hashlib.sha256(NEW.to_binary()).digest(), 4, NEW.to_binary())
-                flasher._client.run(lambda: flasher._delivery.stored is not None, 20)
+                flasher._client.run(lambda: flasher._delivery.stored is not None, PATIENCE_S)
                 result.append(flasher.state())
             except PipefishError as error:
                 result.append(error)
@@ -313,7 +319,7 @@ def test_sending_goes_on_after_the_device_was_killed(crawler: Crawler):
         time.sleep(0.2)
         crawler.kill()
         crawler.start()
-        thread.join(30)
+        thread.join(2 * PATIENCE_S)
         assert isinstance(result[0], pb.ProfileState) and result[0].stored.name == "new", result
 
 
@@ -322,23 +328,28 @@ def test_kill_at_any_moment_of_flashing_leaves_the_old_profile_or_the_new_one(cr
     rng = random.Random(SEED)
     restart(crawler)
     install(crawler, OLD)
-    stored, seen = OLD, set()
+    stored, seen, rounds = OLD, set(), 8
 
     def cut(what: str, act) -> pb.ProfileState:
         with device(crawler) as flasher:
-            timer = threading.Timer(rng.uniform(0.0, 0.12), crawler.process.kill)
-            timer.start()
-            flasher._timeout_s = 0.3
+            is_last = round_ == rounds - 1
+            killer = threading.Timer(rng.uniform(0.0, 0.12), crawler.process.kill)
+            if not is_last:  # else it dies when all is done
+                flasher._timeout_s = 0.3
+                killer.start()
+            if round_ == 0:  # before the device hears of it
+                killer.join()
             try:
                 act(flasher)
                 seen.add(what)
             except PipefishError:
                 seen.add("cut")
-            timer.join()
+            if is_last:
+                crawler.process.kill()
         crawler.process.wait()
         return restart(crawler)
 
-    for round_ in range(8):
+    for round_ in range(rounds):
         wanted = camera(f"round {round_}", f_u=70 + round_)
         allowed = {hashlib.sha256(cam.to_binary()).digest(): cam for cam in (stored, wanted)}
         state = cut("sent", lambda flasher, wanted=wanted: flasher.send(wanted.to_binary()))

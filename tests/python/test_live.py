@@ -109,16 +109,16 @@ def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):
 
 
 def test_the_file_is_the_one_that_arrives_without(objects, tmp_path, capfd):
-    """The same objects in the same order; plain lines where there is no terminal; a summary."""
+    """The same objects, of which up to four are under way at once; plain lines where there is no terminal; a summary."""
     with Device(objects, SURVEY) as device:
-        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=10, live=True)
+        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=60, live=True)
     lines = capfd.readouterr().err.splitlines()
     assert summary["live"]["d_mean"] == pytest.approx(0.3, rel=0.005)
     assert lines and all(": diameter " in line or "not measured yet" in line for line in lines)
     with Device(objects, SURVEY) as device:
-        receive(open_transport(device.address), tmp_path / "b.mcap", timeout_s=10, quiet=True)
+        receive(open_transport(device.address), tmp_path / "b.mcap", timeout_s=60, quiet=True)
     a, b = (Survey.open(tmp_path / name) for name in ("a.mcap", "b.mcap"))
-    assert [r.sha256 for r in a.receipts] == [r.sha256 for r in b.receipts]
+    assert sorted(r.sha256 for r in a.receipts) == sorted(r.sha256 for r in b.receipts)
     assert [k.message.SerializeToString() for k in a.keyframes] == [k.message.SerializeToString() for k in b.keyframes]
     assert {p.name for p in tmp_path.iterdir()} == {"a.mcap", "b.mcap"}
 
@@ -130,7 +130,7 @@ def test_an_interrupted_reception_is_measured_from_its_beginning(objects, tmp_pa
             receive(
                 open_transport(device.address),
                 path,
-                timeout_s=10,
+                timeout_s=60,
                 quiet=True,
                 live=True,
                 stop=lambda: len(device.acknowledged) >= 20,
@@ -152,6 +152,6 @@ def test_a_measurement_that_dies_does_not_end_the_reception(objects, tmp_path, m
 
     monkeypatch.setattr(Live, "take", killed)
     with Device(objects, SURVEY) as device:
-        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=10, quiet=True, live=True)
+        summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=60, quiet=True, live=True)
     assert summary["keyframes"] == 51 and summary["live"] is None
     assert dict(summary_rows(None))["measured live"].startswith("no")

@@ -9,7 +9,9 @@ import errno
 import json
 import os
 import re
+import select
 import signal
+import socket
 import subprocess
 import sys
 import termios
@@ -18,6 +20,7 @@ from pathlib import Path
 
 import pytest
 
+from crawler import PATIENCE_S
 from device import Device
 from pipefish import client
 from pipefish.errors import PipefishError
@@ -28,7 +31,7 @@ from synthetic import BOOT, SURVEY, end, keyframe, name_of, start, survey_object
 
 
 def receive_from(device: Device, path: Path, **options):
-    return receive(open_transport(device.address), path, timeout_s=10, quiet=True, **options)
+    return receive(open_transport(device.address), path, timeout_s=PATIENCE_S, quiet=True, **options)
 
 
 def test_a_survey_arrives_whole_and_the_device_is_empty(tmp_path):
@@ -44,14 +47,18 @@ def test_a_survey_arrives_whole_and_the_device_is_empty(tmp_path):
 
 
 def test_wall_time_comes_from_the_clock_measured_on_the_link(tmp_path):
+    """As exact as it says, and half of a round trip on the link at most: that is no longer than the reception."""
+    before = time.monotonic_ns()
     with Device(survey_objects(3), SURVEY) as device:
         receive_from(device, tmp_path / "a.mcap")
         assert device.clock is not None and device.clock.boot_id == BOOT
+    took = time.monotonic_ns() - before
     survey = Survey.open(tmp_path / "a.mcap")
     offset = survey.keyframes[0].time_ns - survey.keyframes[0].monotonic_ns
     ours = time.time_ns() - time.monotonic_ns()
-    assert abs(offset - ours) < 50_000_000
-    assert survey.receipts[0].clock.error_ns < 50_000_000
+    [error] = [r.clock.error_ns for r in survey.receipts if r.sha256 == keyframe(0)[0]]
+    assert 0 < error < took / 2
+    assert abs(offset - ours) < error + 1_000_000  # the wall clock itself may be slewed by 0.5 ms a second
 
 
 def test_broken_connections_and_damaged_bytes_lose_and_double_nothing(tmp_path):
@@ -134,7 +141,7 @@ def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):
         while device.spool:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=10)
+        out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1 and out == ""
     assert (
         err == f"pipefish: interrupted: 5 keyframes are safe in {path}.partial; the same command goes on from there\n"
@@ -212,7 +219,7 @@ def test_a_host_that_is_sent_away_comes_again_less_and_less_often(monkeypatch):
         def open(self) -> None:
             self.opened += 1
 
-        def waiting(self) -> int:
+        def fileno(self) -> int:
             raise TransportClosed("sent away", reason="sent away")
 
     now = 0
@@ -234,6 +241,44 @@ def test_a_host_that_is_sent_away_comes_again_less_and_less_often(monkeypatch):
     with pytest.raises(client.NoDevice, match="sent away"):
         asker.run(lambda: False, 60)
     assert 10 < line.opened < 25, "0.1 s, 0.2 s, ... 5 s"
+
+
+def test_a_host_that_stood_still_takes_what_waits_for_a_sign_of_life(monkeypatch):
+    """A computer that slept, or has much else to do, for longer than a device may be silent."""
+
+    class Later:
+        time_ns = staticmethod(time.time_ns)
+
+        @staticmethod
+        def monotonic_ns() -> int:
+            return time.monotonic_ns() + 10_000_000_000
+
+    class Counting(client.Handlers):
+        losses = 0
+
+        def on_down(self) -> None:
+            self.losses += 1
+
+    with Device([], SURVEY) as device:
+        asker = client.Client(open_transport(device.address), Counting())
+        asker.open()
+        asker.run(lambda: asker.up, PATIENCE_S)
+        assert select.select([asker.transport], [], [], PATIENCE_S)[0], "the device's next words"
+        monkeypatch.setattr(client, "time", Later)
+        asker.step(0.0)
+        assert asker.up and asker.handlers.losses == 0
+        asker.close()
+
+
+def test_why_the_line_was_lost_is_told_until_the_device_answers():
+    """Also where the time is up while the line is open again."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        asker = client.Client(TcpTransport(*server.getsockname()), client.Handlers())
+        asker.open()
+        server.accept()[0].close()
+        with pytest.raises(client.NoDevice, match="other hosts are connected to the device"):
+            asker.run(lambda: False, 1)
+        asker.close()
 
 
 def test_nobody_there_is_said_at_once_and_waited_for(tmp_path, capsys):
@@ -274,7 +319,7 @@ def test_a_device_that_comes_later_is_no_reconnection(tmp_path):
             real()
 
         transport.open = late
-        summary = receive(transport, tmp_path / "a.mcap", timeout_s=10, quiet=True)
+        summary = receive(transport, tmp_path / "a.mcap", timeout_s=PATIENCE_S, quiet=True)
     assert len(calls) == 3 and summary["link"]["reconnections"] == 0
 
 
@@ -370,8 +415,6 @@ def test_interruption_counts_the_keyframes_of_each_file(tmp_path):
 
 
 def test_a_silent_line_ends_with_the_timeout(tmp_path):
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as server:
         transport = open_transport(f"tcp://127.0.0.1:{server.getsockname()[1]}")
         with pytest.raises(Interrupted, match=r"no device answers .*nothing has arrived"):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from crawler import COUNTS_PER_FRAME, HEIGHT, WIDTH, Crawler, Store, receive_all, serve, write_recording
+from crawler import COUNTS_PER_FRAME, HEIGHT, PATIENCE_S, WIDTH, Crawler, Store, receive_all, serve, write_recording
 from device import Device
 from pipefish import cli
 from pipefish import pipefish_pb2 as pb
@@ -28,8 +28,8 @@ from synthetic import SURVEY, keyframe, start
 
 @pytest.fixture
 def crawler(tmp_path):
-    """A daemon that plays a recording at its speed, for eight seconds; frames' hashes by sequence."""
-    hashes = write_recording(tmp_path / "survey.y4m", 200)
+    """A daemon that plays a recording at its speed, for longer than any test takes; frames' hashes by sequence."""
+    hashes = write_recording(tmp_path / "survey.y4m", 1000, rate=10)
     daemon = Crawler(tmp_path, camera__speed="recorded", daemon__exit_when_done="false")
     daemon.start()
     yield daemon, hashes
@@ -38,7 +38,7 @@ def crawler(tmp_path):
 
 
 def stills_of(crawler: Crawler) -> Stills:
-    return Stills(TcpTransport("127.0.0.1", crawler.port), 10.0)
+    return Stills(TcpTransport("127.0.0.1", crawler.port), PATIENCE_S)
 
 
 def test_stills_are_the_frames_of_the_camera_and_the_survey_stays_on_the_device(crawler):
@@ -78,7 +78,7 @@ def test_after_the_survey_there_are_no_stills_and_the_device_says_so(crawler):
     daemon, _ = crawler
     with stills_of(daemon) as stills:
         stills.take()
-        stills.client.answer_to(5.0, stop_survey=pb.Nothing())
+        stills.client.answer_to(PATIENCE_S, stop_survey=pb.Nothing())
         with pytest.raises(SurveyOver, match="survey is over"):
             for _ in range(9):
                 stills.take()
@@ -197,7 +197,7 @@ def test_a_daemon_says_at_once_that_its_frames_are_too_large_to_be_sent(tmp_path
     daemon.start()
     try:
         address = f"tcp://127.0.0.1:{daemon.port}"
-        assert cli.main(["record", address, "-o", str(tmp_path / "a"), "--every", "0", "--timeout", "20"]) == 1
+        assert cli.main(["record", address, "-o", str(tmp_path / "a"), "--every", "0", "--timeout", "60"]) == 1
     finally:
         daemon.kill()
     assert "a frame of 8192 x 4097 is larger than the 32 MiB" in capsys.readouterr().err
@@ -233,7 +233,7 @@ def test_a_still_survives_a_line_that_breaks_and_what_the_device_has_spooled_sta
     frame = pb.RawFrame(width=640, height=480, encoding="mono8", pixels=image.tobytes())
     objects = [start(), *(keyframe(i) for i in range(2))]
     with Device(objects, SURVEY, cut_after=100_000, state="surveying", stills=[frame.SerializeToString()]) as device:
-        with Stills(TcpTransport("127.0.0.1", int(device.address.rsplit(":", 1)[1])), 10.0) as stills:
+        with Stills(TcpTransport("127.0.0.1", int(device.address.rsplit(":", 1)[1])), PATIENCE_S) as stills:
             still = stills.take()
         assert device.connections > 1
     np.testing.assert_array_equal(still.image, image)
@@ -244,6 +244,7 @@ def test_a_still_that_was_promised_and_never_comes_is_not_waited_for_for_ever():
     with (
         Device([], SURVEY, state="surveying", stills=[b""]) as device,
         Stills(open_transport(device.address), timeout_s=1.0) as stills,
-        pytest.raises(NoDevice, match="none came"),
     ):
-        stills.take()
+        stills.client.run(lambda: stills.client.up, PATIENCE_S)
+        with pytest.raises(NoDevice, match="none came"):
+            stills.take()
