@@ -109,7 +109,7 @@ def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):
 
 
 def test_the_file_is_the_one_that_arrives_without(objects, tmp_path, capfd):
-    """The same objects, of which up to four are under way at once; plain lines where there is no terminal; a summary."""
+    """The same objects, which may overtake each other; plain lines where there is no terminal; a summary."""
     with Device(objects, SURVEY) as device:
         summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=60, live=True)
     lines = capfd.readouterr().err.splitlines()
