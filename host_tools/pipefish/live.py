@@ -275,6 +275,7 @@ class Live:
     def poll(self) -> list[str]:
         """Warnings that have come since; `progress` and `summary` are the newest."""
         told = []
+        has_ended = not self._process.is_alive()  # asked first: what it said last is here then
         while True:
             try:
                 item = self._outbox.get_nowait()
@@ -288,7 +289,7 @@ class Live:
             else:
                 self.progress = item.get("progress", self.progress)
                 self.summary = item.get("summary", self.summary)
-        if self.summary is None and not self._told_end and not self._process.is_alive():
+        if self.summary is None and not self._told_end and has_ended:
             told.append("the live measurement ended; reception goes on")
             self._told_end = True
         return told

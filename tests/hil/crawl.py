@@ -42,9 +42,17 @@ SETTINGS = {
 }
 
 
+RESERVED: list[socket.socket] = []
+
+
 def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
+    """A port of the loopback that the system gives to nobody else until the tests end: a socket that is bound and does
+    not listen keeps it, and keeps none out who binds it with SO_REUSEADDR, as the daemon and QEMU do."""
+    holder = socket.socket()
+    holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    holder.bind(("127.0.0.1", 0))
+    RESERVED.append(holder)
+    return holder.getsockname()[1]
 
 
 @dataclass
@@ -181,7 +189,7 @@ class Crawl:
         self._note_start()
         board.run("systemctl enable pipefishd && systemctl start pipefishd")
 
-    def wait_for(self, text: str, timeout: float = 80) -> float:
+    def wait_for(self, text: str, timeout: float = 300) -> float:
         """Until the daemon's log of this start has `text`; the seconds that took."""
         start, timeout = time.monotonic(), timeout * self.patience
         log = self.board.share / f"daemon{self.starts - 1}.log"
@@ -191,7 +199,7 @@ class Crawl:
             time.sleep(0.05)
         return time.monotonic() - start
 
-    def wait_until(self, condition, what: str, timeout: float = 120) -> float:
+    def wait_until(self, condition, what: str, timeout: float = 300) -> float:
         """Until condition(status) of the daemon's status file; the seconds that took."""
         start, timeout = time.monotonic(), timeout * self.patience
         while not condition(self.board.status()):
@@ -233,7 +241,7 @@ class Crawl:
     def start_receiver(self, device: str) -> None:
         with (self.folder / "receive.log").open("ab") as log:
             self._receiver = subprocess.Popen(
-                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", str(150 * self.patience)],
+                [PIPEFISH, "receive", device, "-o", self.output, "--timeout", str(300 * self.patience)],
                 env=self.environment,
                 stdout=log,
                 stderr=log,
@@ -243,7 +251,7 @@ class Crawl:
         self._receiver.send_signal(signal.SIGKILL)
         self._receiver.wait()
 
-    def finish(self, timeout: float = 180) -> Survey:
+    def finish(self, timeout: float = 300) -> Survey:
         """Waits for the receiver; the survey it got."""
         try:
             code = self._receiver.wait(timeout * self.patience)
@@ -302,8 +310,8 @@ class Crawl:
             daemon = subprocess.Popen(command, stderr=log)
         try:
             receive = [PIPEFISH, "receive", f"tcp://127.0.0.1:{port}", "-o", folder / "replay.mcap"]
-            subprocess.run(receive, check=True, capture_output=True, timeout=180)
-            daemon.wait(30)
+            subprocess.run(receive, check=True, capture_output=True, timeout=300)
+            daemon.wait(60)
         finally:
             daemon.kill()
         return Survey.open(folder / "replay.mcap")

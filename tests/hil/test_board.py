@@ -158,7 +158,7 @@ def test_the_watchdog_resets_a_board_whose_daemon_hangs_and_no_other(crawl):
     survey.start_daemon()
     survey.wait_for("begins")
     board.run(f"kill -STOP {survey.daemon}")
-    board.wait_for_reset(60)
+    board.wait_for_reset(300)
 
 
 GPIO = {
@@ -215,7 +215,7 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     pull("ESTOP", "up")
     start = time.monotonic()
     while level("LAMP") != "0":
-        assert time.monotonic() - start < 5
+        assert time.monotonic() - start < 60
     recovery = time.monotonic() - start
     pull("ESTOP", "down")
     board.wait(process)

@@ -50,7 +50,7 @@ def test_the_package_brings_the_unit_the_user_and_the_settings(package: Path, tm
         assert (tmp_path / "DEBIAN" / script).stat().st_mode & 0o111
 
 
-@pytest.mark.timeout(1200)  # systemd and dpkg, emulated, on a machine that is busy otherwise
+@pytest.mark.timeout(1500)  # systemd and dpkg, emulated, on a machine that is busy otherwise
 def test_the_package_installed_by_dpkg_and_started_by_systemd_takes_a_survey(package: Path, crawl, note):
     """A killed daemon is started again by systemd and goes on; stopped, it drains. Its unit's fences are up."""
     survey = crawl(has_system=True, **SERIAL, **SIZE)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from crawler import Crawler, write_recording
+from crawler import PATIENCE_S, Crawler, wait_for_log, write_recording
 from pipefish.cli import main
 from pipefish.simulate import Scene
 from rendered_survey import FRAMES, SCENE, rendered_survey
@@ -40,6 +40,35 @@ def crawler(tmp_path: Path) -> Iterator[Crawler]:
     crawler = Crawler(tmp_path)
     yield crawler
     if crawler.process is not None:
+        crawler.kill()
+
+
+@pytest.fixture
+def own_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The keys of this host are the test's own, and a busy machine may take its time over a handshake."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "host"))
+    monkeypatch.setattr("pipefish.transport.CONNECT_TIMEOUT_S", PATIENCE_S)
+
+
+@pytest.fixture
+def device(tmp_path: Path, own_keys: None, request: pytest.FixtureRequest) -> Iterator[Crawler]:
+    """A daemon on a network that serves until it is told to stop, with a small survey in its spool.
+
+    Its parameter is link.keepalive_ms: after four of them in silence a host counts as gone."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    crawler = Crawler(
+        tmp_path,
+        link__transport="tls",
+        link__trust=tmp_path / "trust",
+        link__keepalive_ms=getattr(request, "param", 5000),
+        camera__profile_store=tmp_path / "profiles",
+        daemon__exit_when_done="false",
+        daemon__drain_s=0,
+    )
+    crawler.start()
+    wait_for_log(crawler, "127.0.0.1:")
+    yield crawler
+    if crawler.process.poll() is None:
         crawler.kill()
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import queue
 from pathlib import Path
 
 import numpy as np
@@ -109,7 +110,7 @@ def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):
 
 
 def test_the_file_is_the_one_that_arrives_without(objects, tmp_path, capfd):
-    """The same objects, of which up to four are under way at once; plain lines where there is no terminal; a summary."""
+    """The same objects, which may overtake each other; plain lines where there is no terminal; a summary."""
     with Device(objects, SURVEY) as device:
         summary = receive(open_transport(device.address), tmp_path / "a.mcap", timeout_s=60, live=True)
     lines = capfd.readouterr().err.splitlines()
@@ -141,6 +142,20 @@ def test_an_interrupted_reception_is_measured_from_its_beginning(objects, tmp_pa
     assert document["recovered_objects"] >= 20
     live = document["live"]
     assert live["keyframes"] == 51 and live["from"] < 0.3 and live["d_mean"] == pytest.approx(0.3, rel=0.005)
+
+
+def test_what_the_measuring_process_said_before_it_ended_is_heard():
+    """It may end at any moment while it is listened to."""
+
+    class EndsNow:
+        def is_alive(self) -> bool:
+            live._outbox.put({"summary": {"keyframes": 3}})
+            return False
+
+    live = Live.__new__(Live)
+    live._process, live._outbox = EndsNow(), queue.Queue()
+    live._told_end, live.progress, live.summary = False, {}, None
+    assert live.poll() == [] and live.summary == {"keyframes": 3}
 
 
 def test_a_measurement_that_dies_does_not_end_the_reception(objects, tmp_path, monkeypatch):

@@ -39,7 +39,7 @@ static _Atomic int asked_with_mutex;
 static void check_mutex(void)
 {
     pf_store *s = atomic_load(&watched);
-    for (int i = 0; s != NULL && i < 200; i++) {
+    for (int i = 0; s != NULL && i < 3000; i++) {
         if (pthread_mutex_trylock(&s->mutex) == 0) {
             (void)pthread_mutex_unlock(&s->mutex);
             return;

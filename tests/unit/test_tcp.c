@@ -5,6 +5,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
+#include <netinet/tcp.h>
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -48,7 +49,7 @@ static int connect_client(void)
 static void wait_readable(void)
 {
     struct pollfd p = {line.ops->fd(line.self), POLLIN, 0};
-    TEST_ASSERT_EQUAL_INT(1, poll(&p, 1, 10000));
+    TEST_ASSERT_EQUAL_INT(1, poll(&p, 1, 60000));
 }
 
 static void accept_client(void)
@@ -107,6 +108,20 @@ static void test_connect_disconnect_reconnect(void)
     }
 }
 
+/* Closes a connection, and returns when the other end has been told. */
+static void hang_up(int fd)
+{
+    struct tcp_info info = {0};
+    socklen_t size = sizeof info;
+    TEST_ASSERT_EQUAL_INT(0, shutdown(fd, SHUT_WR));
+    for (int i = 0; i < 60000 && info.tcpi_state != TCP_FIN_WAIT2; i++) {
+        TEST_ASSERT_EQUAL_INT(0, getsockopt(fd, IPPROTO_TCP, TCP_INFO, &info, &size));
+        (void)usleep(1000);
+    }
+    TEST_ASSERT_EQUAL_INT(TCP_FIN_WAIT2, info.tcpi_state);
+    close(fd);
+}
+
 static pf_transport take_visitor(void)
 {
     pf_transport visitor = {NULL, NULL};
@@ -123,7 +138,7 @@ static void expect_bytes(const pf_transport *t, const char *bytes)
 {
     uint8_t got[16];
     size_t n = 0, k, wanted = strlen(bytes);
-    for (int i = 0; i < 1000 && n < wanted; i++, n += k) {
+    for (int i = 0; i < 60000 && n < wanted; i++, n += k) {
         TEST_ASSERT_EQUAL_INT(PF_OK, t->ops->read(t->self, got + n, sizeof got - n, &k));
         if (k == 0)
             (void)usleep(1000);
@@ -159,16 +174,15 @@ static void test_others_look_on(void)
     TEST_ASSERT_EQUAL_INT(PF_OK, visitor[2].ops->write(visitor[2].self, (const uint8_t *)"x", 1, &n));
     TEST_ASSERT_EQUAL_INT(1, recv(client[2], &byte, 1, 0));
     close(client[0]);
-    for (int i = 0; i < 1000 && visitor[0].ops->read(visitor[0].self, &byte, 1, &n) == PF_OK; i++)
+    for (int i = 0; i < 60000 && visitor[0].ops->read(visitor[0].self, &byte, 1, &n) == PF_OK; i++)
         (void)usleep(1000);
     TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, visitor[0].ops->service(visitor[0].self, &fresh));
     for (int i = 0; i < 3; i++)
         visitor[i].ops->close(visitor[i].self);
 
     TEST_ASSERT_EQUAL_INT(4, write(first, "last", 4));
-    close(first);
+    hang_up(first);
     int next = connect_client();
-    (void)usleep(10000);
     TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
     TEST_ASSERT_FALSE(fresh);
     expect_read("last");
