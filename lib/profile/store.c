@@ -175,10 +175,14 @@ static pf_status append_to(pf_profile_store *store, uint32_t log, const pf_profi
 static pf_status append(pf_profile_store *store, pf_profile_store_state *state)
 {
     uint32_t first = store->newest[1] < store->newest[0];
-    state->sequence = store->state.sequence + 1;
-    for (uint32_t log = 0; log < 2; log++)
+    bool is_last = store->state.sequence == INT32_MAX;
+    state->sequence = is_last ? 1 : store->state.sequence + 1;
+    for (uint32_t log = 0; log < 2; log++) {
+        if (is_last) /* the numbers begin anew, with both logs */
+            store->next[log] = store->per_sector;
         if (store->next[log] == store->per_sector)
             state->log_erases[log]++;
+    }
     pf_status status = append_to(store, first, state);
     if (status == PF_OK)
         status = append_to(store, 1 - first, state);

@@ -1,5 +1,6 @@
 /* Invariants: any bytes are parsed or refused with "f:line: what"; a parsed configuration has every number in its range
- * and every text UTF-8, so that printing it and parsing it again changes nothing. */
+ * and every text UTF-8, so that printing it and parsing it again changes nothing; what does not go together in it is
+ * named. */
 #include "config.h"
 #include "utf8.h"
 
@@ -31,5 +32,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
         if (strcmp(line, again) != 0)
             abort();
     }
+    error[0] = '\0';
+    if (pf_config_check(&first, "f", error, sizeof error) != (error[0] == '\0') ||
+        (error[0] != '\0' && strncmp(error, "f: ", 3) != 0))
+        abort();
     return 0;
 }

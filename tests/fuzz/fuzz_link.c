@@ -3,14 +3,15 @@
  * caller does in between.
  * Invariants: an object is handed over only with the size that was offered and accepted and after as many fragments as
  * it has; questions are asked once; events are well formed; what we lent to the link is not written; a deadline that
- * has come has a frame or an event behind it. The workspace has its exact size, so that AddressSanitizer guards its
- * end. */
+ * has come has a frame or an event behind it; what we send are whole frames with their checksums. The workspace has its
+ * exact size, so that AddressSanitizer guards its end. */
 #include "pipefish/link.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_OBJECT = 5000, MAX_LATEST = 3000, SLOTS = 3, NONCE = 0x01020304, PEER = 0x0A0B0C0D };
+/* Small fragments: what a frame does costs more time than its bytes, and what depends on their number is in reach. */
+enum { FRAGMENT = 256, MAX_OBJECT = 1250, MAX_LATEST = 750, SLOTS = 3, NONCE = 0x01020304, PEER = 0x0A0B0C0D };
 
 #define REQUIRE(condition)                                                                                             \
     do {                                                                                                               \
@@ -24,7 +25,10 @@ typedef struct fuzz {
     uint32_t open[SLOTS]; /* 0, PF_LINK_OFFER or PF_LINK_OBJECT */
     uint32_t size[SLOTS];
     uint32_t lent; /* objects under way */
-    uint32_t tx, offered[4];
+    uint32_t tx, offered[4], latest;
+    uint32_t nonce, peer; /* of the session */
+    uint8_t ping[12];     /* number and time of the link's last one */
+    bool is_narrow;       /* the line takes few bytes at once */
 } fuzz;
 
 static uint8_t object[4000];
@@ -44,6 +48,9 @@ static void check_event(fuzz *f, const pf_link_event *e)
         for (uint32_t i = 0; i < e->size; i++)
             sink = e->data[i];
     switch (e->type) {
+    case PF_LINK_UP:
+        f->peer = e->peer_nonce;
+        break;
     case PF_LINK_CONTROL:
         REQUIRE(e->data != NULL && e->size <= PF_LINK_FRAME_MAX);
         break;
@@ -88,7 +95,7 @@ static void feed(fuzz *f, const uint8_t *bytes, size_t n)
 static void feed_frame(fuzz *f, uint8_t type, const uint8_t *body, size_t n)
 {
     uint8_t frame[1100] = {(uint8_t)(type < 0xF0 ? 0x10 | (type & 15) : type), 0}, code[1120];
-    uint32_t tag = (PEER ^ NONCE >> 16) & 0xFFFF;
+    uint32_t tag = (f->peer ^ f->nonce >> 16) & 0xFFFF;
     frame[2] = (uint8_t)tag;
     frame[3] = (uint8_t)(tag >> 8);
     memcpy(frame + 4, body, n);
@@ -101,21 +108,45 @@ static void feed_frame(fuzz *f, uint8_t type, const uint8_t *body, size_t n)
 static void say_hello(fuzz *f)
 {
     uint8_t body[32] = {PF_LINK_HOST, 1, 2, 1};
-    put32(body + 4, PEER);
-    put32(body + 8, NONCE);
-    body[21] = 4; /* fragments of 1024 bytes */
+    put32(body + 4, f->peer);
+    put32(body + 8, f->nonce);
+    body[21] = FRAGMENT >> 8;
     feed_frame(f, 0, body, sizeof body);
+}
+
+static uint32_t get32(const uint8_t *p)
+{
+    return p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
+}
+
+/* What the link sends: whole frames. Its last ping is kept, for the answer. */
+static void check_output(fuzz *f, const uint8_t *bytes, size_t n)
+{
+    uint8_t frame[PF_LINK_FRAME_MAX];
+    for (size_t begin = 0, i = 0; i < n; i++) {
+        size_t size = 0;
+        if (bytes[i] != 0)
+            continue;
+        if (i > begin) {
+            REQUIRE(i - begin < sizeof frame && pf_cobs_decode(bytes + begin, i - begin, frame, &size) == PF_OK);
+            REQUIRE(size >= 8 && pf_crc32c(0, frame, size - 4) == get32(frame + size - 4) && frame[0] >> 4 == 1);
+            if ((frame[0] & 15) == 7)
+                memcpy(f->ping, frame + 4, sizeof f->ping);
+        }
+        begin = i + 1;
+    }
 }
 
 static void talk(fuzz *f)
 {
     static uint8_t out[4096];
     bool due = pf_link_deadline(f->link, f->now) <= f->now;
-    size_t n = pf_link_output(f->link, out, sizeof out, f->now);
+    size_t n = pf_link_output(f->link, out, f->is_narrow ? 1200 : sizeof out, f->now);
     pf_link_event event;
     bool any = pf_link_next_event(f->link, &event);
     REQUIRE(n <= sizeof out && (n == 0 || out[n - 1] == 0));
     REQUIRE(due == (n > 0 || any));
+    check_output(f, out, n);
     if (any)
         check_event(f, &event);
     take_events(f);
@@ -147,10 +178,16 @@ static void act(fuzz *f, uint8_t what)
         pf_link_send_latest(f->link, slot, object, (size_t)what * 10);
         break;
     case 6:
-        pf_link_reset(f->link, f->now);
+        if (what >> 3 & 1) {
+            f->nonce++;
+            pf_link_renew(f->link, f->nonce, f->now);
+        } else {
+            pf_link_reset(f->link, f->now);
+        }
         say_hello(f);
         break;
     default:
+        f->is_narrow = what >> 3 & 1;
         say_hello(f);
         break;
     }
@@ -160,24 +197,24 @@ static void act(fuzz *f, uint8_t what)
  */
 static void feed_likely(fuzz *f, uint8_t op, uint8_t choice)
 {
-    static const uint32_t sizes[8] = {1, 64, 1024, 1025, 3000, 5000, 5001, 0};
-    uint8_t body[1032] = {(uint8_t)(1 + choice % 4)};
+    static const uint32_t sizes[8] = {1, 64, FRAGMENT, FRAGMENT + 1, 750, MAX_OBJECT, MAX_OBJECT + 1, 0};
+    uint8_t body[8 + FRAGMENT] = {(uint8_t)(1 + choice % 4)};
     uint32_t handle = choice % 4, index = choice / 4 % 8;
     switch (op % 4) {
     case 0: /* OFFER */
         f->offered[handle] = sizes[index];
         body[2] = 2;
         put32(body + 4, sizes[index]);
-        body[9] = 4; /* fragments of 1024 bytes */
+        body[9] = FRAGMENT >> 8;
         memset(body + 12, choice / 4, PF_LINK_NAME_SIZE);
         feed_frame(f, 4, body, 44);
         break;
     case 1: { /* DATA */
-        uint32_t rest = f->offered[handle] > index * 1024 ? f->offered[handle] - index * 1024 : 1;
+        uint32_t rest = f->offered[handle] > index * FRAGMENT ? f->offered[handle] - index * FRAGMENT : 1;
         body[2] = (uint8_t)index;
         put32(body + 4, f->tx += 1 + op / 16 % 2);
         memset(body + 8, choice, sizeof body - 8);
-        feed_frame(f, 5, body, 8 + (rest < 1024 ? rest : 1024));
+        feed_frame(f, 5, body, 8 + (rest < FRAGMENT ? rest : FRAGMENT));
         break;
     }
     default: /* ACK */
@@ -190,8 +227,46 @@ static void feed_likely(fuzz *f, uint8_t op, uint8_t choice)
     }
 }
 
-/* Records: 0xxxxxxx act; 10tttttt l: a frame of type t with a body of l bytes; 110xxxxx c: a likely frame; else: raw
- * bytes. */
+/* Likely too, beside bulk: hellos of this peer, of the next and of the last one, latest messages, answers to pings. */
+static void feed_beside(fuzz *f, uint8_t op, uint8_t choice)
+{
+    static const uint32_t sizes[8] = {0, 1, 64, 65, FRAGMENT, FRAGMENT + 1, MAX_LATEST, MAX_LATEST + 1};
+    uint8_t body[12 + FRAGMENT] = {0};
+    switch (op % 4) {
+    case 0: /* HELLO */
+        body[0] = choice & 1 ? PF_LINK_DEVICE : PF_LINK_HOST;
+        body[1] = body[2] = 1;
+        body[3] = choice >> 1 & 1;
+        put32(body + 4, f->peer + choice / 4 % 4 - 1);
+        put32(body + 8, choice & 16 ? f->nonce : choice);
+        body[12] = choice / 32 % 2;
+        put32(body + 20, choice & 64 ? 64 : FRAGMENT);
+        feed_frame(f, choice & 128 ? 0xF0 : 0, body, 32);
+        break;
+    case 1: { /* PONG */
+        memcpy(body, f->ping, sizeof f->ping);
+        body[choice % 16] ^= (uint8_t)(choice >> 4 & 1);
+        body[13] = choice;
+        feed_frame(f, 8, body, 20);
+        break;
+    }
+    default: { /* LATEST */
+        uint32_t size = sizes[choice / 4 % 8], index = choice / 32 % 4;
+        uint32_t rest = size > index * FRAGMENT ? size - index * FRAGMENT : 0;
+        f->latest += op / 4 % 4;
+        body[0] = choice % 4;
+        body[2] = (uint8_t)index;
+        put32(body + 4, f->latest);
+        put32(body + 8, size);
+        memset(body + 12, choice, sizeof body - 12);
+        feed_frame(f, 3, body, 12 + (rest < FRAGMENT ? rest : FRAGMENT));
+        break;
+    }
+    }
+}
+
+/* Records: 0xxxxxxx act; 10tttttt l: a frame of type t with a body of l bytes; 110xxxxx c and 1110xxxx c: a likely
+ * frame; else: raw bytes. */
 static size_t take_record(fuzz *f, const uint8_t *data, size_t n)
 {
     uint8_t op = data[0];
@@ -203,6 +278,10 @@ static size_t take_record(fuzz *f, const uint8_t *data, size_t n)
         return n;
     if (op >= 0xC0 && op < 0xE0) {
         feed_likely(f, op, data[1]);
+        return 2;
+    }
+    if (op >= 0xE0 && op < 0xF0) {
+        feed_beside(f, op, data[1]);
         return 2;
     }
     size_t length = data[1] < n - 2 ? data[1] : n - 2;
@@ -225,7 +304,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
                              .window = 4096};
     size_t size = pf_link_workspace_size(&config);
     void *workspace = malloc(size);
-    fuzz f = {.now = 1000000000};
+    fuzz f = {.now = 1000000000, .nonce = NONCE, .peer = PEER};
     memset(object, 0xEE, sizeof object);
     REQUIRE(workspace != NULL && pf_link_init(&f.link, &config, workspace, size) == PF_OK);
     say_hello(&f);
