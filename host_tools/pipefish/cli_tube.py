@@ -163,7 +163,8 @@ def event_text(e: dict[str, Any]) -> str:
         parts.append(f"{(e['clock'] * 6 / math.pi) % 12:.1f} o'clock")
     if e["kind"] == "bend":
         parts.append(f"{math.degrees(e['angle']):.1f} +- {math.degrees(1.96 * e['angle_sigma']):.1f} degrees")
-        parts.append(f"radius {e['radius']:.2f} m" if e["radius"] else "")
+        if e["radius"]:
+            parts.append(f"radius {e['radius']:.2f} +- {1.96 * e['radius_sigma']:.2f} m")
     for name, what in (
         ("gap", "gap"),
         ("step", "step"),

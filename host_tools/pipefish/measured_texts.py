@@ -56,7 +56,8 @@ def size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
     if e["kind"] == "bend":
         yield f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
         if e.get("radius"):
-            yield f"radius {length_text(e['radius'], unit, metres=True)}"
+            number, word = length_text(e["radius"], unit, metres=True).split()
+            yield f"radius {number} ± {length_text(Z95 * e['radius_sigma'], unit, metres=True).split()[0]} {word}"
         yield f"from {length_text(e['start'], unit, metres=True)} to {length_text(e['end'], unit, metres=True)}"
         return
     for name in ("gap", "step", "height", "length", "width"):

@@ -34,9 +34,10 @@ class DiameterSigma:
     mean_camera: float | None
 
 
-def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0) -> Shared:
+def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0, ellipse: float = 1.0) -> Shared:
     """What the points of a segment share through the poses, at the weights of the adjustment. factor: by which the
-    structure was scaled since."""
+    structure was scaled since; ellipse: share of these weights' variance that counts in ovality, unless residuals show
+    more."""
     first = int(np.searchsorted(structure.point_segment, segment))
     weighed = structure.variance_factor[segment]
 
@@ -47,7 +48,8 @@ def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0) -> S
         return factor**2 * structure.functions_covariance(first + places, rows, systematic=True) - whole(places, rows)
 
     own = structure.own_covariance[structure.point_segment == segment] / weighed
-    return Shared(own, whole, camera if structure.parts[segment][1] is not None else None)
+    known = structure.parts[segment][1] is not None
+    return Shared(own, whole, camera if known else None, max(ellipse, min(1.0, weighed)))
 
 
 def diameter_function(tube: Tube, s: float, diameter: float) -> tuple[np.ndarray, np.ndarray]:

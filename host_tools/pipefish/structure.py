@@ -115,6 +115,7 @@ class Reconstruction:
     camera_change    (segments, n) change of the camera's parameters as estimated with their prior, names in
                      camera_parameters; None where the profile has no covariance. See camera_of()
     cost             sum of half the squared residuals
+    joined           (n,2) int64 tracks that are another's continuation under a name of their own, and that one
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
                      covariance (m,m); poses, points and tracks as they are then; noise, the factor
     """
@@ -150,6 +151,7 @@ class Reconstruction:
     sag: list[Floats] = field(default_factory=list)
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
+    joined: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64), repr=False)
     drift: list[dict[str, Any]] = field(default_factory=list, repr=False)
     shutter: RollingShutter | None = field(default=None, repr=False)
     line_time: tuple[float, float] | None = None
@@ -174,6 +176,13 @@ class Reconstruction:
             place.astype(np.int32),
             np.ascontiguousarray(self.shutter.line_time * (pixels[:, 1] - self.shutter.middle_row)),
         )
+
+    def names(self, track: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Under what name each of these tracks (n,) may have a point in `track`."""
+        out = track.copy()
+        for other, name in self.joined:
+            out[track == other] = name
+        return out
 
     def functions_covariance(
         self, points: npt.ArrayLike, jacobian: npt.ArrayLike, *, systematic: bool = False
@@ -366,7 +375,7 @@ def reconstruct(
             0.0 if shutter is None else shutter.middle_row,
         )
 
-    found, end = run(frames), frames
+    found, end, linked_tracks = run(frames), frames, np.zeros((0, 2), np.int64)
     noise = (
         sigma
         if tracks.covariance is None or not frames
@@ -380,6 +389,8 @@ def reconstruct(
         numbers, before = joined, found
         found = run(end)
         if len(found["segments"]) < len(before["segments"]):
+            moved = joined != np.searchsorted(names, tracks.track)
+            linked_tracks = np.unique(np.column_stack([tracks.track, names[joined]])[moved], axis=0)
             tracks = dataclasses.replace(tracks, track=names[joined])
         else:
             found = before
@@ -388,7 +399,7 @@ def reconstruct(
         out.gaps.append(Gap(int(out.frames[-1]) if len(out.frames) else 0, frames - 1, "zoom", 0))
         out.status = "partial" if len(out.frames) else "failed"
         out.reason = "; ".join(str(gap) for gap in out.gaps[-3:])
-    out.shutter = shutter
+    out.shutter, out.joined = shutter, linked_tracks
     if shutter is not None:
         out.line_time = _line_time(found["segments"], shutter.line_time)
     for part in out.drift:

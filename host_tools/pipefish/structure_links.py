@@ -104,11 +104,13 @@ def linked(
 ) -> Ints | None:
     """The tracks' numbers (n,) with those of a stretch that go on in the next one joined to these; None where none do.
 
-    found: of the engine; frame, track (n,), pixels (n,2): all that was seen; sigma: of pixels; step: metres from each
-    frame to the next, None where nobody counted."""
+    found: of the engine; frame, track (n,) ascending, pixels (n,2): all that was seen; sigma: of pixels; step: metres
+    from each frame to the next, None where nobody counted."""
     used, out, gate = found["frames"].astype(np.int64), track.copy(), max(GATE_SIGMAS * sigma, GATE_LEAST)
 
     def join(name: int, other: int) -> None:
+        # As they are called by now: a track may go on behind several breaks.
+        name, other = (int(out[np.searchsorted(track, k)]) for k in (name, other))
         if not np.isin(frame[out == other], frame[out == name]).any():
             out[out == other] = name
 

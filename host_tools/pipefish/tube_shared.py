@@ -22,11 +22,12 @@ TUKEY_VARIANCE = 1.0526  # of the surface's weights: 95 % efficient
 class Shared:
     """own (N,3,3): covariances of the points by themselves; whole(places (n,), jacobian (m,n,3)) -> (m,m): covariance
     of linear functions of some of them with all that they share; camera: likewise, what the camera's own uncertainty
-    adds, None where it is not known."""
+    adds, None where it is not known; ellipse: as much of the variance of what they share counts in ovality."""
 
     own: np.ndarray
     whole: Callable[[np.ndarray, np.ndarray], np.ndarray]
     camera: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    ellipse: float = 1.0
 
 
 def _positive(found: np.ndarray) -> np.ndarray:
@@ -91,7 +92,7 @@ class Common:
                     places.append(s[i])
                     near, rows = self._ellipse_rows(on)
                     camera = self.shared.camera(self.used[near], rows) if self.shared.camera else np.zeros((2, 2))
-                    values.append((self._covariance(near, rows), _positive(camera)))
+                    values.append((self.shared.ellipse * self._covariance(near, rows), _positive(camera)))
             if places:
                 table = np.array(values)
                 for part, a, b in np.ndindex(2, 2, 2):

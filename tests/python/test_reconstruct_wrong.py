@@ -158,6 +158,20 @@ def test_tracks_that_come_in_from_beyond_the_cameras_model_are_no_error() -> Non
     assert np.abs(scale * rec.centres @ turn.T + move - drive.centres[::-1]).max() < 0.01
 
 
+def test_keyframes_that_came_twice_are_standing_and_nothing_else_changes() -> None:
+    """Each keyframe sent twice: no motion between the two, which makes neither a gap nor a second camera."""
+    drive = tube_drive(63, 1.0)
+    t = drive.tracks
+    twice = pf.Tracks(
+        np.concatenate([2 * t.frame, 2 * t.frame + 1]), np.tile(t.track, 2), np.concatenate([t.pixels, t.pixels])
+    )
+    once = pf.reconstruct(t, drive.camera, drive.driven)
+    rec = pf.reconstruct(twice, drive.camera, np.repeat(drive.driven, 2))
+    assert rec.status == "ok" and len(rec.frames) == len(once.frames) == 21 and len(rec.standing) == 21
+    assert (rec.frames // 2 == once.frames).all() and (rec.track == once.track).all()
+    assert np.abs(rec.centres - once.centres).max() < 1e-3 and np.abs(rec.points - once.points).max() < 0.01
+
+
 @pytest.mark.parametrize("kind", ["mirrored", "one pixel"])
 def test_pictures_that_cannot_be_are_a_status_without_a_wrong_number(kind: str) -> None:
     drive = tube_drive(61, 2.0)

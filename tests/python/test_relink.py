@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import pipefish as pf
+from pipefish.measure import measure
+from pipefish.survey import Survey
+from test_reconstruct_cli import survey_of
 from tube_tracks import Drive, similarity, tube_drive
 
 
@@ -46,6 +52,36 @@ def test_a_drive_whose_tracks_all_broke_off_is_one_stretch_again(seed: int, enco
     lasting = np.intersect1d(tracks.track[tracks.frame == 19], tracks.track[tracks.frame == 20] - count)
     once = np.isin(lasting, rec.track) & ~np.isin(lasting + count, rec.track)
     assert len(lasting) > 20 and once.mean() > 0.6
+
+
+def renamed_at(drive: Drive, *frames: int) -> Drive:
+    """The drive with other names for all tracks from each of these frames on; all corners are found again."""
+    t, points = drive.tracks, np.tile(drive.points, (len(frames) + 1, 1))
+    number = np.searchsorted(frames, t.frame, side="right")
+    tracks = pf.Tracks(t.frame, t.track + number * len(drive.points), t.pixels)
+    return dataclasses.replace(drive, tracks=tracks, points=points)
+
+
+def test_a_corner_that_is_in_sight_over_two_breaks_is_one() -> None:
+    drive = tube_drive(82, 2.0, limits=(12.0, 89.0))
+    count, seen = len(drive.points), drive.tracks
+    rec = pf.reconstruct(renamed_at(drive, 18, 22).tracks, drive.camera, drive.driven)
+    assert rec.status == "ok" and len(rec.frames) == 41
+    over = np.intersect1d(seen.track[seen.frame == 17], seen.track[seen.frame == 22])
+    once = np.isin(over, rec.track) & ~np.isin(over + count, rec.track) & ~np.isin(over + 2 * count, rec.track)
+    assert len(over) > 200 and once.mean() > 0.6
+
+
+def test_what_joined_tracks_saw_is_in_the_residuals(tmp_path: Path) -> None:
+    """And with them in the report's charts and the COLMAP model."""
+    drive = renamed_at(tube_drive(82, 2.0), 20)
+    m = measure(Survey.open(survey_of(drive, tmp_path / "a.mcap")), pictures=False)
+    assert m.structure.status == "ok" and len(m.structure.joined) > 50
+    of_joined = np.isin(m.tracks.track, m.structure.joined[:, 0])
+    there = np.isin(np.flatnonzero(of_joined), m.residuals.item)
+    assert of_joined.sum() > 200 and there.mean() > 0.95
+    joined = np.isin(m.residuals.item, np.flatnonzero(of_joined))
+    assert m.residuals.inlier[joined].mean() > 0.98
 
 
 @pytest.mark.parametrize("seed", [83, 84])

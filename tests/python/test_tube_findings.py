@@ -35,8 +35,17 @@ def test_bends_have_their_angle_radius_and_side(degrees: float) -> None:
     assert abs(math.degrees(bend["angle"]) - degrees) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
     assert abs(bend["start"] - 1.5) < 0.15 and abs(bend["end"] - 1.5 - 0.9 * math.radians(degrees)) < 0.15
     assert bend["clock"] == pytest.approx(math.pi / 2, abs=0.1)  # to the right: three o'clock
+    # Between the first and the last kink of the smooth axis the arc was 10 to 27 % too short.
+    assert abs(bend["radius"] - 0.9) < min(2 * bend["radius_sigma"], 0.9 * 1.35 / degrees)
     truth, _ = pipe.axis(np.linspace(0.3, 3.7, 60))
     assert np.abs(tube.project(truth)["r"]).max() < 0.005 * pipe.diameter
+
+
+def test_a_bend_too_short_to_be_told_from_a_kink_has_no_radius() -> None:
+    pipe = Pipe(length=4, bend=(1.5, math.radians(8), 0.3), seed=3)
+    bend = of_kind(pf.fit_tube(pipe.points(2400), pipe.noise, pipe.cameras()), "bend")
+    assert abs(math.degrees(bend["angle"]) - 8) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
+    assert abs(bend["s"] - 1.52) < 0.03 and bend["radius"] is None and bend["radius_sigma"] is None
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
