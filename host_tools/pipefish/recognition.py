@@ -23,7 +23,7 @@ from .segmentation import planes
 THRESHOLD = 0.05
 MAX_PIXELS = 400_000
 REGIONS = 3000  # of a picture, before orientations
-LEAST = 30  # vertices of a group: 750 pixels of the model's picture
+LEAST = 6  # vertices of a group; whether it counts is a matter of how well they agree
 
 Floats = NDArray[np.float64]
 
@@ -79,6 +79,7 @@ class Segment:
     area            of the segment in the model's picture, as a share of the model
     coverage        share of its textured pixels that are matched, counted in the coarser picture
     correlation     mean of (zncc - 0.5) / 0.5
+    evidence        that its neighbours agree by more than chance, nats
     matches         pixels
     centre          x, y of its middle in the scene
     view            label of the model's picture
@@ -89,6 +90,7 @@ class Segment:
     area: float
     coverage: float
     correlation: float
+    evidence: float
     matches: int
     centre: tuple[float, float]
     view: str

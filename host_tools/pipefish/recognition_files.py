@@ -151,7 +151,7 @@ def as_table(found: Sequence[Recognition], scenes: Sequence[str]) -> str:
     for r in found:
         box = r.box()
         corners = ["" if box is None else f"{v:.1f}" for v in box or (0, 0, 0, 0)]
-        numbers = (f"{r.score:.4f}", f"{r.sum_score:.4f}", int(r.present), r.view, len(r.segments), r.matches, r.seeds)
+        numbers = (f"{r.score:.4g}", f"{r.sum_score:.4g}", int(r.present), r.view, len(r.segments), r.matches, r.seeds)
         out.writerow((scenes[r.scene], r.object, *numbers, *corners))
     return text.getvalue()
 
@@ -170,7 +170,10 @@ def as_document(found: Sequence[Recognition], scenes: Sequence[str]) -> list[dic
         row["scene"], row["box"], row["extent"] = scenes[r.scene], r.box(), lines(r.extent)
         row["outline"] = lines(r.outline)
         row["segments"] = [
-            {name: getattr(s, name) for name in ("score", "area", "coverage", "correlation", "matches", "view")}
+            {
+                name: getattr(s, name)
+                for name in ("score", "area", "coverage", "correlation", "evidence", "matches", "view")
+            }
             | {"model_contours": lines(s.model_contours), "scene_contours": lines(s.scene_contours)}
             for s in r.segments
         ]

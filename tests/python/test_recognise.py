@@ -142,14 +142,27 @@ def test_what_is_farther_away_than_the_object_is_large_is_no_part_of_it() -> Non
         assert r.view != "view 1" or len(r.segments) == 1
 
 
-def test_a_piece_of_few_pixels_in_the_scene_is_no_evidence() -> None:
-    """45 x 45 pixels of a model are some 60 cells at any size, a quarter of the pixels in a scene of half the size."""
+def test_a_small_piece_counts_where_it_fits_and_not_where_chance_matches_as_many() -> None:
+    """18 x 18 pixels of the rose show. Elsewhere larger groups match by chance: their neighbours agree less."""
+    picture, _ = model_picture("rose")
+    shown = scene(None)[0].copy()
+    shown[60:78, 100:118] = picture[60:78, 60:78]
+    rose, thorn = pf.recognise(models(), [shown])
+    (piece,) = rose.segments
+    assert np.hypot(piece.centre[0] - 108.5, piece.centre[1] - 68.5) < 5 and piece.evidence >= 6
+    assert rose.score > 0.02
+    assert thorn.matches > 50 and thorn.segments == []
+    assert 0 < thorn.score < 0.001  # ranked all the same: what is absent does not tie with what is hardly seen
+
+
+def test_evidence_is_that_of_the_smaller_picture() -> None:
+    """45 x 45 pixels are 80 cells of a model at any size, which crowd at half the size: a quarter of the pixels."""
     picture, mask = model_picture("rose")
     mask = np.pad(mask[30:75, 40:85], ((30, mask.shape[0] - 75), (40, mask.shape[1] - 85)))
     piece, large = pf.ObjectModel("piece", [(picture, mask)]), scene("rose")[0]
     same, half = pf.recognise([piece], [large, large.reshape(H // 2, 2, W // 2, 2).mean(axis=(1, 3))])
-    assert same.present
-    assert half.score == 0
+    assert same.present and half.present
+    assert 6 <= half.segments[0].evidence < 0.35 * same.segments[0].evidence
 
 
 def _whole(r: pf.Recognition) -> NDArray[np.bool_]:

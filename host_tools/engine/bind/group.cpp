@@ -60,6 +60,7 @@ nb::dict to_python(const Recognition &r)
         d["area"] = s.area;
         d["coverage"] = s.coverage;
         d["correlation"] = s.correlation;
+        d["evidence"] = s.evidence;
         d["matches"] = s.matches;
         d["centre"] = nb::make_tuple(s.centre.x, s.centre.y);
         d["model_contours"] = to_python(s.model);
@@ -148,6 +149,7 @@ void bind_group(nb::module_ &m)
         .def_rw("grouping", &RecogniseOptions::grouping)
         .def_rw("seeds", &RecogniseOptions::seeds)
         .def_rw("least", &RecogniseOptions::least)
+        .def_rw("evidence", &RecogniseOptions::evidence)
         .def_rw("reach", &RecogniseOptions::reach);
     nb::class_<Prepared>(m, "Prepared", "A model's picture or a scene, made ready for recognise().")
         .def("__init__", &prepare_at, nb::arg("image"), nb::arg("mask").none(), nb::arg("max_pixels"),

@@ -263,4 +263,34 @@ Groups group_matches(const std::vector<Match> &matches, const Options &o)
     return out;
 }
 
+std::vector<double> evidence(const std::vector<Match> &matches, const Groups &groups)
+{
+    // Of a neighbour from where its map has it, as a share of the distance: mean of groups of unrelated pictures, of
+    // which 0.05 (small ones) to 0.29 were seen. Those of one surface have 0.02 to 0.11.
+    constexpr double by_chance = 0.15;
+    const size_t n = static_cast<size_t>(groups.count);
+    std::vector<double> off(n, 0), triangles(n, 0), weight(n, 0);
+    for (const Triangle &t : groups.triangles) {
+        const size_t g = static_cast<size_t>(t.group);
+        std::array<Local, 3> at;
+        for (size_t k = 0; k < 3; k++)
+            at[k] = local(matches[static_cast<size_t>(t.vertex[k])]);
+        for (size_t k = 0; k < 3; k++) {
+            const Local &from = at[k], &to = at[(k + 1) % 3];
+            const Vector2d edge = to.one - from.one;
+            off[g] += (from.back * (to.two - from.two) - edge).norm() / (3 * edge.norm());
+        }
+        triangles[g]++;
+        weight[g] += std::min(1.0, std::abs(at[0].det)); // cells of image 1 crowd in a smaller image 2
+    }
+    // Normal distributions in the plane, of deviations s and s0: ln(s0 / s)^2 - 1 + (s / s0)^2 for each independent
+    // edge, of which a mesh has one a vertex, that is one for two triangles.
+    std::vector<double> out(n, 0);
+    for (size_t g = 0; g < n; g++) {
+        const double ratio = std::clamp(off[g] / (std::max(1.0, triangles[g]) * by_chance), 1e-3, 1.0);
+        out[g] = weight[g] * (-std::log(ratio) - 0.5 * (1 - ratio * ratio));
+    }
+    return out;
+}
+
 } // namespace pipefish::group

@@ -33,4 +33,8 @@ struct Groups {
 // Depends on the matches and their order alone. O(n log n).
 Groups group_matches(const std::vector<match::Match> &matches, const Options &options);
 
+// How much better the agreement of each group's neighbours is explained by one surface than by chance: log likelihood
+// ratio, nats, at least 0. What matches by chance passes the test of agreement just so.
+std::vector<double> evidence(const std::vector<match::Match> &matches, const Groups &groups);
+
 } // namespace pipefish::group

@@ -19,7 +19,6 @@ constexpr int kMargin = 24;        // pixels kept around a mask, so that windows
 constexpr double kTexture = 0.01;  // as match::Options
 constexpr double kLeastArea = 100; // pixels of a model
 constexpr double kBeyond = 1.25;   // radii of the object's circle: its map is known where it was matched only
-constexpr double kEvidence = 0.5;  // pixels matched of a group's least vertices' cells, in the coarser picture
 
 // What is outside the mask becomes a smooth continuation of what is inside: the mask's edge is no edge then, and no
 // background is learned.
@@ -233,19 +232,20 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
     out.seeds = static_cast<int>(seeds.size());
     out.matches = static_cast<int>(matches.size());
     const Groups groups = group_matches(matches, options.grouping);
+    const std::vector<double> evident = evidence(matches, groups);
     std::vector<Candidate> found;
     for (int g = 0; g < groups.count; g++)
-        found.push_back(measure(matches, groups, g, model, scene, options.reach));
+        if (evident[static_cast<size_t>(g)] >= options.evidence) {
+            found.push_back(measure(matches, groups, g, model, scene, options.reach));
+            found.back().segment.evidence = evident[static_cast<size_t>(g)];
+        }
     std::stable_sort(found.begin(), found.end(),
                      [](const Candidate &a, const Candidate &b) { return a.segment.score > b.segment.score; });
     Mask taken(scene.mask().size(), 0);
     Fit fit;
-    // Vertices are cells of the model's picture. In a smaller scene as many stand on fewer pixels, and match by chance.
-    const double evidence = kEvidence * options.grouping.least * options.grouping.cell * options.grouping.cell;
     for (Candidate &c : found) {
         const int area = cv::countNonZero(c.scene);
-        if (c.segment.score < options.least || c.segment.matches < evidence ||
-            2 * cv::countNonZero(c.scene & taken) > area)
+        if (c.segment.score < options.least || 2 * cv::countNonZero(c.scene & taken) > area)
             continue;
         if (out.segments.empty())
             out.place = place_of(c.fit.map(), model, scene);
@@ -256,8 +256,14 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
         fit.add(c.fit);
         out.segments.push_back(std::move(c.segment));
     }
-    if (!out.segments.empty())
+    if (!out.segments.empty()) {
         out.extent = extent(fit.map(), model, scene);
+    } else if (groups.count > 0) {
+        const auto most = std::max_element(evident.begin(), evident.end());
+        const Candidate c =
+            measure(matches, groups, static_cast<int>(most - evident.begin()), model, scene, options.reach);
+        out.score = c.segment.score * std::exp(std::min(0.0, *most - options.evidence));
+    }
     return out;
 }
 

@@ -41,6 +41,7 @@ struct Segment {
     double area = 0;        // of the support, as a share of the model
     double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
     double correlation = 0; // mean of (zncc - 0.5) / 0.5
+    double evidence = 0;    // that it is no chance: nats
     int matches = 0;
     cv::Point2d centre;                                 // of its support in the scene
     std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
@@ -55,7 +56,7 @@ struct Place {
 
 struct Recognition {
     int seeds = 0, matches = 0;    // before grouping
-    double score = 0;              // sum over `segments`, at most 1
+    double score = 0;              // sum over `segments`, at most 1; without any: see RecogniseOptions::evidence
     std::vector<Segment> segments; // best first; none overlaps a better one by half, all are in `place`
     Place place;                   // by the best segment's map
     // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
@@ -68,7 +69,10 @@ struct RecogniseOptions {
     Options grouping;
     int seeds = 300;
     double least = 0.002; // score of a segment
-    double reach = 3;     // pixels of the coarser image by which supports go beyond their triangles
+    // Nats from which a group is a segment: some 20 groups form by chance in a pair, the best of all had 4. Where none
+    // has them the score is that of the group with most, made smaller by the factor exp(what it lacks).
+    double evidence = 6;
+    double reach = 3; // pixels of the coarser image by which supports go beyond their triangles
 };
 
 Recognition recognise(const Prepared &model, const Prepared &scene, const RecogniseOptions &options);
