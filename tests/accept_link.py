@@ -1,4 +1,4 @@
-"""Link and daemon for long: what takes hours, in pieces that are kept.
+"""Link and daemon for long, in pieces that are kept: 12 minutes of CPU time for the sessions, 6 for the soak.
 
 sessions    10,000 seeded sessions of two links over lines with faults of every kind at once (test_link_channel.c says
             which): every object once, whole and identical, or the session has failed
