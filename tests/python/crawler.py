@@ -23,7 +23,7 @@ from pipefish.transport import TcpTransport, TransportClosed
 ROOT = Path(__file__).resolve().parents[2]
 START, KEYFRAME, END = 1, 2, 3
 SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
-PATIENCE_S = 60.0  # for what a busy machine may delay at will: only what will never come is waited for so long
+PATIENCE_S = 60  # for what a busy machine may delay at will: only what will never come is waited for so long
 WIDTH, HEIGHT = 192, 160
 COUNTS_PER_FRAME = 10
 RESET_GAP = 5  # tracker.reset_gap's default
