@@ -202,10 +202,10 @@ def serve(crawler: Crawler, client: Client, until: Callable[[], object]) -> None
             return
 
 
-def wait_for_log(crawler: Crawler, text: str) -> None:
-    """Until the daemon has logged `text`."""
+def wait_for_log(crawler: Crawler, text: str, times: int = 1) -> None:
+    """Until the daemon has logged `text` so often."""
     end = time.monotonic() + PATIENCE_S
-    while text not in crawler.text():
+    while crawler.text().count(text) < times:
         assert time.monotonic() < end, crawler.text()
         time.sleep(0.02)
 
