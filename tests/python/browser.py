@@ -42,7 +42,7 @@ def ask_page(page: Path, script: str, width: int, folder: Path, height: int = 12
     command = [browser, "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     command += ["--virtual-time-budget=20000", f"--window-size={max(width, 500)},{height}", "--dump-dom"]
     command += [f"--user-data-dir={folder / 'profile'}", frame.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     found = re.search(r'<pre id="answer">(.*?)</pre>', done.stdout, re.S)
     assert found, f"the page did not answer:\n{done.stderr[-2000:]}"
     answer = json.loads(html.unescape(found[1]))

@@ -23,7 +23,7 @@ from pipefish.transport import TcpTransport, TransportClosed
 ROOT = Path(__file__).resolve().parents[2]
 START, KEYFRAME, END = 1, 2, 3
 SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
-PATIENCE_S = 60.0  # for what a busy machine may delay at will: only what will never come is waited for so long
+PATIENCE_S = 60  # for what a busy machine may delay at will: only what will never come is waited for so long
 WIDTH, HEIGHT = 192, 160
 COUNTS_PER_FRAME = 10
 RESET_GAP = 5  # tracker.reset_gap's default
@@ -202,10 +202,10 @@ def serve(crawler: Crawler, client: Client, until: Callable[[], object]) -> None
             return
 
 
-def wait_for_log(crawler: Crawler, text: str) -> None:
-    """Until the daemon has logged `text`."""
+def wait_for_log(crawler: Crawler, text: str, times: int = 1) -> None:
+    """Until the daemon has logged `text` so often."""
     end = time.monotonic() + PATIENCE_S
-    while text not in crawler.text():
+    while crawler.text().count(text) < times:
         assert time.monotonic() < end, crawler.text()
         time.sleep(0.02)
 

@@ -143,7 +143,7 @@ def test_debug_shows_where(tmp_path):
 
 def test_receive_and_status_from_the_command_line(tmp_path, capsys):
     with Device(survey_objects(4), SURVEY) as device:
-        assert cli.main(["status", device.address, "--json"]) == 0
+        assert cli.main(["status", device.address, "--timeout", "60", "--json"]) == 0
         status = json.loads(capsys.readouterr().out)
         assert status["info"]["software"] == "test device" and status["status"]["spool"]["objects"] == "6"
         assert len(device.spool) == 6, "asking takes nothing from the device"

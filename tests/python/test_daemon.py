@@ -249,8 +249,9 @@ def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_
     os.close(master)
     os.close(slave)
     wait_for_log(crawler, f"{device}: hung up")
+    wait_for_log(crawler, missing, 2)  # before it came, and after it went
     time.sleep(1)  # four tries
-    assert crawler.text().count(missing) == 2  # before it came, and after it went
+    assert crawler.text().count(missing) == 2
     assert crawler.text().count("hung up") == 1
 
 

@@ -40,6 +40,7 @@ def camera(name: str, **changes: object) -> pf.Camera:
     return dataclasses.replace(cam, **changes)
 
 
+PATIENT = ("--timeout", str(PATIENCE_S))
 OLD, NEW = camera("old"), camera("new", f_u=61)
 
 
@@ -74,7 +75,7 @@ def restart(crawler: Crawler) -> pb.ProfileState:
 
 def flash(crawler: Crawler, capsys, *arguments: object) -> dict:
     """`pipefish flash ... --json`."""
-    code = cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", *map(str, arguments), "--json"])
+    code = cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", *map(str, arguments), *PATIENT, "--json"])
     out, err = capsys.readouterr()
     assert code == 0, err
     return json.loads(out)
@@ -115,7 +116,7 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
     assert OLD.to_binary() in [s.profile for s in store.starts]
     assert status.profile == state.in_use == store.statuses[-1].profile
     assert wait_for_status(crawler, lambda s: s["profile"])["profile"]["sha256"] == status.profile.sha256.hex()
-    assert cli.main(["status", f"tcp://127.0.0.1:{crawler.port}"]) == 0
+    assert cli.main(["status", f"tcp://127.0.0.1:{crawler.port}", *PATIENT]) == 0
     assert "old, serial S1" in capsys.readouterr().out
 
 
@@ -128,13 +129,13 @@ def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawl
     state = restart(crawler)  # one start on trial: camera.trial_starts
     assert state.in_use.name == "new" and state.in_use.trial and state.in_use.starts_left == 0
     address = f"tcp://127.0.0.1:{crawler.port}"
-    assert cli.main(["flash", address]) == 0  # tells, changes nothing
+    assert cli.main(["flash", address, *PATIENT]) == 0  # tells, changes nothing
     text = capsys.readouterr().out
     assert text.count("on trial, 0 more starts") == 2 and f"if it is good: pipefish flash {address} --confirm" in text
     assert restart(crawler).in_use.name == "old"
 
     flash(crawler, capsys, tmp_path / "new.json")
-    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", "--confirm"]) == 1
+    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", "--confirm", *PATIENT]) == 1
     assert "not in use yet: restart the device" in capsys.readouterr().err
     restart(crawler)
     document = flash(crawler, capsys, "--confirm")
@@ -150,7 +151,7 @@ def test_flash_says_what_to_do_next_and_a_trial_can_be_dropped(tmp_path: Path, c
     install(crawler, OLD)
     NEW.save(tmp_path / "new.json")
     address = f"tcp://127.0.0.1:{crawler.port}"
-    assert cli.main(["flash", address, str(tmp_path / "new.json")]) == 0
+    assert cli.main(["flash", address, str(tmp_path / "new.json"), *PATIENT]) == 0
     assert f"restart the device, then: pipefish flash {address} --confirm" in capsys.readouterr().out
     assert name_of(flash(crawler, capsys, "--revert")["stored"]) == "old"
     flash(crawler, capsys, tmp_path / "new.json")
@@ -231,7 +232,7 @@ def test_a_device_without_a_store_says_so(tmp_path: Path, crawler: Crawler, caps
     crawler.start("--set", "camera.profile_store=")
     wait_for_log(crawler, "; survey ")
     NEW.save(tmp_path / "new.json")
-    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", str(tmp_path / "new.json")]) == 1
+    assert cli.main(["flash", f"tcp://127.0.0.1:{crawler.port}", str(tmp_path / "new.json"), *PATIENT]) == 1
     assert "camera.profile_store is not set" in capsys.readouterr().err
     done = run("--config", crawler.config, "--check-config", "--set", "camera.profile=x")
     assert done.returncode == 1 and "camera.profile_store: not together with camera.profile" in done.stderr

@@ -193,7 +193,7 @@ def test_a_converted_profile_goes_into_a_pipe_through_a_link_and_never_over_its_
     os.mkfifo(fifo)
     with subprocess.Popen(["cat", str(fifo)], stdout=subprocess.PIPE) as reader:
         assert subprocess.run([*command, str(fifo), "--to", "json"], check=False).returncode == 0
-        assert json.loads(reader.communicate(timeout=30)[0])["format"] == "pipefish-profile"
+        assert json.loads(reader.communicate(timeout=60)[0])["format"] == "pipefish-profile"
     assert fifo.is_fifo()
     before = source.read_bytes()
     assert subprocess.run([*command, str(source)], check=False).returncode == 2

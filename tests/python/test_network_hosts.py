@@ -141,7 +141,7 @@ def test_others_look_on_while_a_host_receives_and_can_change_nothing(device: Cra
 def test_the_same_host_looks_on_while_it_receives(device: Crawler, capsys):
     let_in(device, "operator")
     with receiving(device):
-        assert main(["status", f"tls://127.0.0.1:{device.port}"]) == 0
+        assert main(["status", f"tls://127.0.0.1:{device.port}", "--timeout", str(PATIENCE_S)]) == 0
         assert "looks on" in capsys.readouterr().out
 
 

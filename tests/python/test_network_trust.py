@@ -284,13 +284,14 @@ def test_pairing_by_the_cable_lets_a_host_in_and_remembers_the_device(tmp_path: 
     try:
         wait_for_log(crawler, "127.0.0.1:")
         cable = f"tcp://127.0.0.1:{crawler.port}"  # loopback: as trusted as the cable
-        assert main(["pair", cable, "--role", "viewer", "--device-name", "probe", "--name", "me and you"]) == 0
+        pair = ["pair", cable, "--timeout", str(PATIENCE_S)]
+        assert main([*pair, "--role", "viewer", "--device-name", "probe", "--name", "me and you"]) == 0
         line = (tmp_path / "trust" / "peers").read_text()
         assert line == f"viewer {keys.host_key()} me and you\n"
         assert list(keys.known_devices().values()) == ["probe"]
-        assert main(["pair", cable, "--revoke", keys.host_key()]) == 0
+        assert main([*pair, "--revoke", keys.host_key()]) == 0
         assert (tmp_path / "trust" / "peers").read_text().startswith("revoked ")
-        assert main(["pair", cable, "--name", "again"]) == 1
+        assert main([*pair, "--name", "again"]) == 1
         assert "revoked" in capsys.readouterr().err
     finally:
         crawler.kill()
