@@ -191,7 +191,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         return 0;
     if (data[0] % 32 == 0) {
         const pf_camera camera = moved_camera(data, size);
-        try_camera(&camera, data[0] == 0 && data[size - 1] % 32 == 0);
+        uint32_t sum = 0; /* any change may make a camera that is tried whole, and most do not */
+        for (size_t i = 0; i < size; i++)
+            sum += data[i];
+        try_camera(&camera, data[0] == 0 && sum % 16 == 0);
         return 0;
     }
     try_bytes(data, size);
