@@ -9,6 +9,7 @@
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/drivers/spool.h"
 
+#include <sanitizer/asan_interface.h>
 #include <sqlite3.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -38,6 +39,74 @@ static void require(bool holds)
 {
     if (!holds)
         abort();
+}
+
+/* ---- SQLite's memory, guarded as the sanitizer's own is, and four times as quick: each piece lies between poisoned
+ * ones, and is poisoned when it is freed until the input has ended */
+
+enum { HEAP = 1 << 25, GUARD = 16 };
+
+static _Alignas(16) uint8_t heap[HEAP];
+static size_t heap_used, heap_kept; /* kept: what SQLite took when it began */
+static int32_t pieces, pieces_kept;
+
+__attribute__((no_sanitize("address"))) static int piece_size(void *piece)
+{
+    return *(const int *)(const void *)((const uint8_t *)piece - GUARD);
+}
+
+__attribute__((no_sanitize("address"))) static void *take_piece(int n)
+{
+    size_t size = ((size_t)n + 15) / 16 * 16 + GUARD;
+    if (size > HEAP - heap_used)
+        return NULL;
+    uint8_t *piece = heap + heap_used + GUARD;
+    *(int *)(void *)(piece - GUARD) = n;
+    heap_used += size;
+    pieces++;
+    ASAN_UNPOISON_MEMORY_REGION(piece, (size_t)n);
+    return piece;
+}
+
+static void free_piece(void *piece)
+{
+    pieces--;
+    ASAN_POISON_MEMORY_REGION(piece, (size_t)piece_size(piece));
+}
+
+static void *change_piece(void *piece, int n)
+{
+    int had = piece_size(piece);
+    void *other = take_piece(n);
+    if (other != NULL) {
+        memcpy(other, piece, (size_t)(had < n ? had : n));
+        free_piece(piece);
+    }
+    return other;
+}
+
+static int round_up(int n)
+{
+    return (n + 7) / 8 * 8;
+}
+
+static int open_heap(void *nothing)
+{
+    (void)nothing;
+    ASAN_POISON_MEMORY_REGION(heap, sizeof heap);
+    return SQLITE_OK;
+}
+
+static void close_heap(void *nothing)
+{
+    (void)nothing;
+}
+
+static void reset_heap(void)
+{
+    require(pieces == pieces_kept); /* nothing was leaked */
+    ASAN_POISON_MEMORY_REGION(heap + heap_kept, heap_used - heap_kept);
+    heap_used = heap_kept;
 }
 
 /* ---- a file system in memory: SQLite's interface */
@@ -362,9 +431,18 @@ static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
 
 static void begin(void)
 {
+    static const sqlite3_mem_methods memory_methods = {.xMalloc = take_piece,
+                                                       .xFree = free_piece,
+                                                       .xRealloc = change_piece,
+                                                       .xSize = piece_size,
+                                                       .xRoundup = round_up,
+                                                       .xInit = open_heap,
+                                                       .xShutdown = close_heap};
     pf_spool spool;
     require(sqlite3_config(SQLITE_CONFIG_SINGLETHREAD) == SQLITE_OK);
     require(sqlite3_config(SQLITE_CONFIG_MEMSTATUS, 0) == SQLITE_OK);
+    require(sqlite3_config(SQLITE_CONFIG_LOOKASIDE, 0, 0) == SQLITE_OK);
+    require(sqlite3_config(SQLITE_CONFIG_MALLOC, &memory_methods) == SQLITE_OK);
     require(sqlite3_vfs_register(&memory, 1) == SQLITE_OK);
     require(open_spool(&spool));
     for (uint32_t id = 0; id < OBJECTS; id++)
@@ -375,6 +453,8 @@ static void begin(void)
     crashed[LOG] = disk[LOG];
     spool.ops->close(spool.self);
     closed = disk[DATABASE];
+    heap_kept = heap_used;
+    pieces_kept = pieces;
 }
 
 /* ---- what the input does to them */
@@ -454,7 +534,7 @@ static void lay(const image *from, const char *name)
     i->n = from->n;
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+static void try_files(const uint8_t *data, size_t size)
 {
     pf_spool spool;
     pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
@@ -462,11 +542,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     uint32_t count;
     size_t n;
     bool is_there, is_whole = true;
-    if (!closed.is_there)
-        begin();
-    if (size < 1)
-        return 0;
-
     for (uint32_t i = 0; i < FILES; i++)
         forget(&disk[i]);
     const uint8_t how = data[0];
@@ -484,7 +559,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         repair_log(&disk[LOG]);
     if (!open_spool(&spool)) {
         require(!is_whole);
-        return 0;
+        return;
     }
     uint32_t intact = walk(&spool, name, &is_there);
     require(!is_whole || intact == OBJECTS - 1);
@@ -493,11 +568,23 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     (void)spool.ops->remove(spool.self, 2);
     pf_status status = put(&spool, 100 + how % 7u, name);
     require(!is_whole || status == PF_OK);
+    if (status != PF_OK) /* damage that was found in storing; the next survey is stored */
+        status = put(&spool, 100 + how % 7u, name);
+    require(status == PF_OK || status == PF_ERR_SPACE);
     spool.ops->close(spool.self);
     if (open_spool(&spool)) {
         (void)walk(&spool, name, &is_there);
         require(is_there || !is_whole);
         spool.ops->close(spool.self);
     }
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    if (!closed.is_there)
+        begin();
+    if (size >= 1)
+        try_files(data, size);
+    reset_heap();
     return 0;
 }
