@@ -19,7 +19,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke cross proof size pytest hil
+.PHONY: build demo test bench accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke fuzz-coverage cross proof size pytest hil
 
 build: native $(STAMP)/python
 
@@ -124,7 +124,13 @@ deb-arm64: packages-board
 cpack = mkdir -p build/deb && (cd build/$(1) && cpack --config CPackConfig.cmake -B $(CURDIR)/build/deb \
 	-D CPACK_VERBOSE=0 >$(CURDIR)/build/deb/log) || { cat build/deb/log; exit 1; }; rm -rf build/deb/_CPack_Packages
 
-accept: build unit fuzz-build cross $(STAMP)/venv-peers
+# The fuzz targets once more, counting the lines that their inputs reach.
+fuzz-coverage: packages-test
+	@tools/install-packages accept
+	@test -f build/coverage/build.ninja || cmake --preset coverage
+	@cmake --build --preset coverage
+
+accept: build unit fuzz-build fuzz-coverage cross $(STAMP)/venv-peers
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv

@@ -2,7 +2,8 @@
 
 Each piece begins from the corpus that the pieces before left in build/accept/corpus, and keeps what it finds there. A
 piece's figures hold for one build of its target. Pieces that would begin after --minutes are left out: the row then
-tells the count so far, and does not hold.
+tells the count so far, and does not hold. What the corpora reach is told twice: as the edges that steer the fuzzer, and
+as lines of the rooms that the target is there for, by the same targets built to count them (build/coverage).
 
     python tests/accept_fuzz.py                   prints one JSON list of {name, value, bound, holds}
     python tests/accept_fuzz.py spool --minutes 10
@@ -11,30 +12,52 @@ tells the count so far, and does not hold.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from accept_link import ROOT, pieces
 from accept_rows import Row, exactly, figure, print_rows
 
 TARGETS = ROOT / "build/clang/tests/fuzz"
+COUNTING = ROOT / "build/coverage/tests/fuzz"
 RUNS, PIECE = 10_000_000, 500_000
+ROOMS = {
+    "csv": r"drivers/camera_replay/csv\.c",
+    "ini": r"firmware/(config|ini|utf8)\.c",
+    "link": r"lib/link/(?!messages)\w+\.c",
+    "messages": r"lib/link/messages\.c",
+    "peers": r"drivers/trust/peers\.c",
+    "picture": r"drivers/camera_replay/picture\.c",
+    "profile": r"lib/(profile/(profile|vectors|integers)|camera/(real|fixed)/\w+)\.c",
+    "profile_store": r"lib/profile/store\.c",
+    "spool": r"drivers/spool/\w+\.c",
+    "y4m": r"drivers/camera_replay/y4m\.c",
+}
+
+
+def corpora(name: str) -> list[Path]:
+    """Of a target: where what is found is kept, and what the project has."""
+    kept, given = ROOT / "build/accept/corpus" / name, ROOT / "tests/fuzz/corpus" / name
+    kept.mkdir(parents=True, exist_ok=True)
+    return [kept, *([given] if given.is_dir() else [])]
 
 
 def run_piece(target: Path, piece: int) -> dict:
     """PIECE inputs: whether something was found, how many were run, and how many edges the corpus reaches."""
     name = target.name.removeprefix("fuzz_")
-    kept, given = ROOT / "build/accept/corpus" / name, ROOT / "tests/fuzz/corpus" / name
-    kept.mkdir(parents=True, exist_ok=True)
-    corpora = [kept, *([given] if given.is_dir() else [])]
     flags = [f"-runs={PIECE}", "-max_len=4096", f"-seed={piece + 1}", "-print_final_stats=1"]
     found = ROOT / "build/accept/found"
     found.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
-        [target, *flags, f"-artifact_prefix={found}/{name}-", *corpora], capture_output=True, text=True, check=False
+        [target, *flags, f"-artifact_prefix={found}/{name}-", *corpora(name)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode != 0:
         print(done.stderr[-3000:], file=sys.stderr)
@@ -47,13 +70,32 @@ def run_piece(target: Path, piece: int) -> dict:
     }
 
 
+def count_lines(name: str) -> tuple[int, int]:
+    """Lines of the target's rooms that its corpora reach, and all of them."""
+    target = COUNTING / f"fuzz_{name}"
+    if not target.exists():
+        raise SystemExit(f"no {target}: `make fuzz-coverage` builds it")
+    with tempfile.TemporaryDirectory() as folder:
+        raw, merged = Path(folder) / "raw", Path(folder) / "merged"
+        run = [target, "-runs=0", "-max_len=4096", *corpora(name)]
+        subprocess.run(run, env={**os.environ, "LLVM_PROFILE_FILE": str(raw)}, capture_output=True, check=True)
+        subprocess.run(["llvm-profdata", "merge", raw, "-o", merged], check=True)
+        export = ["llvm-cov", "export", target, f"-instr-profile={merged}", "-summary-only"]
+        told = json.loads(subprocess.run(export, capture_output=True, check=True).stdout)
+    files = {os.path.relpath(f["filename"], ROOT): f["summary"]["lines"] for f in told["data"][0]["files"]}
+    lines = [count for path, count in files.items() if re.fullmatch(ROOMS[name], path)]
+    return sum(line["covered"] for line in lines), sum(line["count"] for line in lines)
+
+
 def check(target: Path, minutes: float) -> list[Row]:
     name = target.name.removeprefix("fuzz_")
     done = list(pieces(f"fuzz-{name}", target, RUNS // PIECE, minutes, lambda piece: run_piece(target, piece)))
+    reached, lines = count_lines(name)
     return [
         exactly(f"fuzz.{name}_runs", sum(p["runs"] for p in done), RUNS),
         exactly(f"fuzz.{name}_findings", sum(p["findings"] for p in done), 0),
         figure(f"fuzz.{name}_edges", max((p["edges"] for p in done), default=0), "> 0", any(p["edges"] for p in done)),
+        figure(f"fuzz.{name}_lines", reached, f"> 0 of {lines}", reached > 0),
     ]
 
 

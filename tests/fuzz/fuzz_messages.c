@@ -1,5 +1,8 @@
-/* Invariants: any bytes decode to a known request or PF_ERR_FORMAT; a keyframe of any contents encodes within
- * PF_MSG_KEYFRAME_MAX, and with PF_ERR_SPACE into every smaller buffer. */
+/* Invariants: any bytes decode to a known request, with texts that end, or PF_ERR_FORMAT; any bytes that are looked
+ * into for the survey and the number of a keyframe have them or are refused; a keyframe of any contents encodes within
+ * PF_MSG_KEYFRAME_MAX, and with PF_ERR_SPACE into every smaller buffer, and shows the survey and the number it was
+ * given.
+ */
 #include "pipefish/messages.h"
 
 #include <stdlib.h>
@@ -45,6 +48,12 @@ static void encode(const uint8_t *data, size_t n)
     k.jpeg_size = jpeg_size;
     if (pf_msg_encode_keyframe(&k, out, PF_MSG_KEYFRAME_MAX(k.n_tracks, jpeg_size), &size) != PF_OK)
         abort();
+    uint8_t survey_id[16];
+    uint32_t index;
+    static const uint8_t none[16];
+    if (memcmp(k.survey_id, none, 16) != 0 && (pf_msg_peek_keyframe(out, size, survey_id, &index) != PF_OK ||
+                                               memcmp(survey_id, k.survey_id, 16) != 0 || index != k.index))
+        abort();
     if (has_break && pf_msg_append_break("gap", out, PF_MSG_KEYFRAME_MAX(k.n_tracks, jpeg_size), &size) != PF_OK)
         abort();
     if (small < size && !has_break && pf_msg_encode_keyframe(&k, out, small, &unused) != PF_ERR_SPACE)
@@ -56,12 +65,22 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
     pf_msg_request request;
     pf_status status = pf_msg_decode_request(data, n, &request);
     if (status == PF_OK) {
-        if (request.what != PF_REQUEST_UNKNOWN &&
+        if (request.what != PF_REQUEST_UNKNOWN && request.what != PF_REQUEST_PAIR &&
             (request.what < PF_REQUEST_GET_STATUS || request.what > PF_REQUEST_GET_STILL))
+            abort();
+        if (request.what == PF_REQUEST_PAIR && (memchr(request.pair.role, 0, sizeof request.pair.role) == NULL ||
+                                                memchr(request.pair.name, 0, sizeof request.pair.name) == NULL))
             abort();
     } else if (status != PF_ERR_FORMAT) {
         abort();
     }
+    uint8_t survey_id[16];
+    uint32_t index;
+    status = pf_msg_peek_keyframe(data, n, survey_id, &index);
+    if (status != PF_OK && status != PF_ERR_FORMAT)
+        abort();
+    if (status == PF_OK && pf_msg_peek_survey_end(data, n, survey_id) != PF_OK)
+        abort();
     encode(data, n);
     return 0;
 }

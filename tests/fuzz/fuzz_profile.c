@@ -157,7 +157,7 @@ static pf_camera moved_camera(const uint8_t *data, size_t size)
     return camera;
 }
 
-/* `whole`: with its profile and self-tests, three of them and as many proofs. */
+/* `whole`: with its profile and self-tests, three of them and as many proofs: ten times the work. */
 static void try_camera(const pf_camera *camera, bool whole)
 {
     static _Alignas(16) uint8_t workspace[PF_CAMERA_FIXED_WORKSPACE_MAX];
@@ -191,7 +191,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         return 0;
     if (data[0] % 32 == 0) {
         const pf_camera camera = moved_camera(data, size);
-        try_camera(&camera, data[0] == 0);
+        uint32_t sum = 0; /* any change may make a camera that is tried whole, and most do not */
+        for (size_t i = 0; i < size; i++)
+            sum += data[i];
+        try_camera(&camera, data[0] == 0 && sum % 16 == 0);
         return 0;
     }
     try_bytes(data, size);
