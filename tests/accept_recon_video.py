@@ -13,16 +13,18 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from accept_recon import FOLDER
 
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.errors import PipefishError
 from pipefish.measure import Measurement, measure
 from pipefish.measured_remarks import not_measured
-from pipefish.measuretruth import against_truth
+from pipefish.measuretruth import against_truth, bare
 from pipefish.simcamera import calibrated
 from pipefish.simulate import Scene, simulate
 from pipefish.survey import Survey
+from pipefish.tube_findings import LEAST_HEIGHT
 
 LEFT, UP_RIGHT = -math.pi / 2, 0.6
 SCENES: dict[str, dict[str, Any]] = {
@@ -77,6 +79,14 @@ def size_error(found: float, true: float) -> float:
     return abs(found - true) / max(0.2 * true, 0.002)
 
 
+def visible_length(scene: Scene, deposit: dict[str, Any]) -> float:
+    """Of a heap that falls off to nothing: as far as it is as high as what counts as one."""
+    pipe, places = bare(scene), deposit["s"] + np.linspace(-0.5, 0.5, 201) * deposit["length"]
+    height = [np.linalg.norm(scene.wall(s, deposit["clock"]) - pipe.wall(s, deposit["clock"])) for s in places]
+    high = places[np.array(height) > LEAST_HEIGHT * scene.spec["diameter"]]
+    return float(high[-1] - high[0])
+
+
 def findings(measured: Measurement, scene: Scene) -> list[Limits]:
     """What was found where the scene has a bend, a joint, a deposit; what was found beside them."""
     events = [e for stretch in measured.measured for e in stretch.tube.events]
@@ -89,6 +99,7 @@ def findings(measured: Measurement, scene: Scene) -> list[Limits]:
     for kind, sizes, truth in (
         ("joint", "step", [math.hypot(j["step_down"], j["step_right"]) for j in scene.spec["joints"]]),
         ("deposit", "height", [d["height"] for d in scene.spec["deposits"]]),
+        ("deposit", "length", [visible_length(scene, d) for d in scene.spec["deposits"]]),
     ):
         found = [e[sizes] for e in events if e["kind"] == kind]
         if truth and len(found) == len(truth):

@@ -27,6 +27,7 @@ SIZE = ["length", "width", "size_sigma", "height", "height_sigma", "area", "poin
 JOINT = ["step", "step_sigma", "diameter_step", "diameter_step_sigma", "gap", "gap_sigma", "chi2"]
 COLUMNS = [*PLACE, *SIZE, *JOINT, "angle", "angle_sigma", "radius", "radius_sigma"]
 FALSE_ALARMS = 0.01  # of one fit
+CHI2_7_MEDIAN = 6.346
 GROSS = 4.0  # standard deviations
 # Of the diameter. Neighbouring tracks see the same relief in the same changing light and go astray together, which no
 # point's own sigma knows: heaps of 0.7 to 1.2 mm were found in a smooth DN300.
@@ -35,6 +36,9 @@ LEAST_HEIGHT = 0.005
 # too short by 0.02 to 0.06, of 0.8 by 0.1; one of 0.3 came out as 0.55.
 BEND_ENDS = 0.1
 BEND_LEAST = 0.6  # shorter ones are kinks for all that can be told
+# The flank of a heap that looks away from the camera shows few points: where most of a point's nearest FEW stand out, a
+# patch goes on over REACH times what the nearest k of its median take.
+FEW, REACH = 7, 1.5
 SURELY = 1.645  # of its own sigmas by which a patch has to stand out further than that: 95 %, one-sided
 
 
@@ -53,8 +57,11 @@ def break_candidates(coarse: Any, nodes: np.ndarray, diameter: float) -> list[fl
     if not len(rows):
         return []
     # A window is one diameter each way; places a quarter of it apart are almost independent.
-    limit = max(16.0, chi2_limit(FALSE_ALARMS * 0.25 * diameter / length, 7) * coarse.correlation)
+    # How much more than chance they scatter everywhere, as the wall's relief makes them; what joints and bends
+    # leave of the stiff surface is none of it.
     s, chi2 = rows[:, 0], rows[:, 1].copy()
+    relief = min(coarse.correlation, max(1.0, float(np.median(chi2)) / CHI2_7_MEDIAN))
+    limit = max(16.0, chi2_limit(FALSE_ALARMS * 0.25 * diameter / length, 7) * relief)
     found = []
     while chi2.max() > limit:
         k = int(chi2.argmax())
@@ -336,8 +343,9 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     k = next((k for k in range(9, 62, 2) if tests * _majority(float(worst), k) < FALSE_ALARMS / 4), 61)
     spacing = math.sqrt(d * tube.length * k / tests)
     # `used` are the points that the surface knows: the finite ones.
-    median = np.full(len(p["s"]), np.nan)
+    median, near = np.full((2, len(p["s"])), np.nan)
     median[p["known"]] = tube.surface.medians(radius, k, every, 2.5 * spacing, 1.0 * d)
+    near[p["known"]] = tube.surface.medians(radius, FEW, every, 2.5 * spacing, 1.0 * d)
     rows = rows[np.isfinite(median[rows])]
     if len(rows) < 60:
         return []
@@ -350,7 +358,8 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
         limit = np.maximum(gauss, _limit(sign * z, k, tests) * p["sigma"][rows])
         flagged = rows[sign * (value - centre) > limit]
         for seed in _clusters(p, flagged, radius, spacing):
-            cluster = _grown(p, seed, sign, radius, spacing, float(np.abs(median[seed]).max()))
+            height = float(np.nanmax([*(sign * median[seed]), *(sign * near[seed])]))
+            cluster = _grown(p, seed, near, sign, radius, spacing, height)
             if len(cluster) >= 4:
                 event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
                 if event["height"] - SURELY * event["height_sigma"] < LEAST_HEIGHT * d:
@@ -386,33 +395,42 @@ def _clusters(p: dict[str, np.ndarray], rows: np.ndarray, radius: float, link: f
 
 
 def _grown(
-    p: dict[str, np.ndarray], cluster: np.ndarray, sign: int, radius: float, link: float, height: float
+    p: dict[str, np.ndarray],
+    cluster: np.ndarray,
+    near: np.ndarray,
+    sign: int,
+    radius: float,
+    link: float,
+    height: float,
 ) -> np.ndarray:
-    """The cluster with the points around it that stand out to the same side."""
+    """The cluster with the points around it that stand out to the same side. near (N,): median of each point's nearest
+    few; where they stand out as well, the patch goes on."""
     away = sign * p["distance"]
-    standing = np.flatnonzero((p["piece"] >= 0) & (away > 2.5 * p["sigma"]) & (away < 1.5 * height + 3 * p["sigma"]))
-    near = standing[
-        (p["s"][standing] > p["s"][cluster].min() - link) & (p["s"][standing] < p["s"][cluster].max() + link)
-    ]
-    s, clock = p["s"][cluster], p["clock"][cluster]
-    keep = []
-    for row in near.tolist():
-        around = (p["clock"][row] - clock + np.pi) % (2 * np.pi) - np.pi
-        if (np.hypot(p["s"][row] - s, around * radius) < link).any():
-            keep.append(row)
-    return np.array(keep, dtype=int)
+    left = np.flatnonzero((p["piece"] >= 0) & (away > 2.5 * p["sigma"]) & (away < 1.5 * height + 3 * p["sigma"]))
+    inner = sign * near[left] > 2.5 * p["sigma"][left]
+    out, rim = [], cluster
+    while len(rim):
+        s, clock = p["s"][rim], p["clock"][rim]
+        joins = np.zeros(len(left), bool)
+        reach = np.where(inner, REACH, 1.0) * link
+        for i in np.flatnonzero((p["s"][left] > s.min() - reach) & (p["s"][left] < s.max() + reach)).tolist():
+            around = (p["clock"][left[i]] - clock + np.pi) % (2 * np.pi) - np.pi
+            joins[i] = (np.hypot(p["s"][left[i]] - s, around * radius) < reach[i]).any()
+        out.append(left[joins])
+        rim, left, inner = left[joins & inner], left[~joins], inner[~joins]
+    return np.sort(np.concatenate(out))
 
 
 def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any]:
     p, d = tube.points, tube.summary["d_mean"]
     s, value = p["s"][cluster], np.abs(p["distance"][cluster])
-    weight = np.full(len(cluster), 1 / len(cluster))
     clock = float(np.angle(np.exp(1j * p["clock"][cluster]).mean()) % (2 * np.pi))
     off = (p["clock"][cluster] - clock + np.pi) % (2 * np.pi) - np.pi
     n = len(cluster)
     # The outermost of n points miss the rim of a patch by about its size over n.
     length = float(np.ptp(s)) * (n + 1) / (n - 1)
     width = float(np.ptp(off)) * 0.5 * d * (n + 1) / (n - 1)
+    end_sigma = max(length, width) / (n + 1) + spacing / 2
     # Near the top, but not the farthest point, which may be gross: most points of a heap lie on its flanks.
     height = float(np.quantile(value, max(0.9, 1.0 - 1.5 / len(value))))
     kind = "deposit"
@@ -422,13 +440,13 @@ def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dic
             kind = "lateral" if height > 0.12 * d and min(length, width) > 0.15 * d else "hole"
     return {
         "kind": kind,
-        "s": float(s @ weight),
-        "s_sigma": float(max(spacing, length / math.sqrt(12)) / math.sqrt(n)),
-        "clock": clock,
-        "clock_sigma": float(max(spacing, width / math.sqrt(12)) / math.sqrt(n) / (0.5 * d)),
+        "s": 0.5 * float(s.min() + s.max()),  # the middle of what stands out, not of the points: its sides have more
+        "s_sigma": end_sigma / math.sqrt(2),
+        "clock": float((clock + 0.5 * (off.min() + off.max())) % (2 * math.pi)),
+        "clock_sigma": end_sigma / math.sqrt(2) / (0.5 * d),
         "length": length,
         "width": width,
-        "size_sigma": float(max(length, width) * math.sqrt(2) / (n + 1) + spacing / 2),
+        "size_sigma": end_sigma * math.sqrt(2),
         "height": height,
         "height_sigma": float(np.median(p["sigma"][cluster]) / math.sqrt(max(1.0, 0.2 * n))),
         "area": length * width * math.pi / 4,

@@ -57,6 +57,17 @@ def test_a_displaced_joint_is_found_with_its_step(seed: int) -> None:
     assert min(joint["clock"], 2 * math.pi - joint["clock"]) < 0.3  # upwards: twelve o'clock
 
 
+def test_a_small_step_is_found_in_a_pipe_that_also_bends() -> None:
+    """What the bend leaves of the stiff surface is no relief that hides the joint."""
+    pipe = Pipe(
+        diameter=0.4, length=5.5, bend=(2.4, math.radians(25), 1.2), joint=(1.6, 0.0045, 0.0), noise=0.001, seed=1
+    )
+    tube = pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras())
+    joint = of_kind(tube, "joint")
+    assert abs(joint["s"] - 1.6) < 0.03 and abs(joint["step"] - 0.0045) < 0.0009
+    assert [e["kind"] for e in tube.events] == ["joint", "bend"]
+
+
 def test_an_open_joint_is_found_with_its_gap() -> None:
     pipe = Pipe(ring=(1.2, 0.03), seed=4)
     joint = of_kind(pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras()), "joint")
@@ -81,3 +92,14 @@ def test_deposits_and_holes_have_place_height_and_kind(clock: float, height: flo
     assert abs((found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi) * 0.15 < 0.02
     assert abs(found["height"] - abs(height)) < max(0.2 * abs(height), 0.002)
     assert abs(found["length"] - 0.15) < 0.05 and abs(found["width"] - 0.15) < 0.05
+
+
+def test_a_heap_whose_far_flank_shows_few_points_is_told_at_its_middle() -> None:
+    """As a camera sees it that looks over it: one in five of the points behind the top."""
+    pipe = Pipe(deposit=(1.4, 3.0, 0.3, 0.012), noise=0.0005, seed=5)
+    points = pipe.points(3000)
+    behind = (points[:, 2] > 1.4) & (points[:, 2] < 1.57) & (points[:, 1] > 0)
+    points = points[~behind | (np.arange(len(points)) % 5 == 0)]
+    found = of_kind(pf.fit_tube(points, pipe.noise, pipe.cameras()), "deposit")
+    assert abs(found["s"] - 1.4) < 0.015 and abs(found["length"] - 0.3) < 0.04
+    assert abs(found["height"] - 0.012) < 0.002
