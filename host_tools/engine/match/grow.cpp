@@ -19,6 +19,7 @@ namespace
 
 constexpr float kFitted = 0.8F; // least correlation of what is fitted: below, a step goes anywhere
 constexpr int kBlockMost = 2 * (kReach + 4 * (kRadiusMost + 1)) + 1; // steps of at most 4
+constexpr size_t kStride = kBlockMost + 3;                           // of the block's rows, in whole Float4s
 
 // Best first, in constant time: classes of correlation, and within a class last in first out, which keeps to one part
 // of the images and so to the cache.
@@ -59,24 +60,39 @@ bool take(Window &window, const float *from, size_t stride, int step, int radius
 {
     const int side = window.side = 2 * radius + 1;
     const int vectors = window.vectors = (side + 3) / 4;
-    float sum = 0;
-    for (int j = 0; j < side; j++)
-        for (int i = 0; i < side; i++)
-            sum += from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)];
-    const float mean = sum / static_cast<float>(side * side);
-    float squares = 0;
+    const Float4 rest = first_of(side - 4 * (vectors - 1));
+    Float4 sum = {};
     for (int j = 0; j < side; j++) {
-        float *row = window.v + j * 4 * vectors;
-        store(row + 4 * vectors - 4, Float4{});
-        for (int i = 0; i < side; i++) {
-            row[i] = from[static_cast<size_t>(j * step) * stride + static_cast<size_t>(i * step)] - mean;
-            squares += row[i] * row[i];
+        const float *row = from + static_cast<size_t>(j * step) * stride;
+        float *to = window.v + j * 4 * vectors;
+        for (int k = 0; k < vectors; k++, row += 4 * step) {
+            Float4 v = step == 1 ? load(row) : Float4{row[0], row[step], row[2 * step], row[3 * step]};
+            v = k + 1 < vectors ? v : v * rest;
+            store(to + 4 * k, v);
+            sum += v;
         }
     }
     const auto count = static_cast<float>(side * side);
-    window.inverse_sigma = 1 / std::sqrt(squares);
-    return squares >= static_cast<float>(sigma_min * sigma_min) * count;
+    const float mean = total(sum) / count;
+    Float4 squares = {};
+    for (int j = 0; j < side; j++)
+        for (int k = 0; k < vectors; k++) {
+            float *at = window.v + 4 * (j * vectors + k);
+            const Float4 v = k + 1 < vectors ? load(at) - mean : (load(at) - mean) * rest;
+            store(at, v);
+            squares += v * v;
+        }
+    window.inverse_sigma = 1 / std::sqrt(total(squares));
+    return total(squares) >= static_cast<float>(sigma_min * sigma_min) * count;
 }
+
+// What is looked at around a match: offsets from it.
+struct Box {
+    int left = kReach, top = kReach, right = -kReach, bottom = -kReach;
+};
+struct Neighbour {
+    int order, dx, dy;
+};
 
 class Grower
 {
@@ -205,8 +221,9 @@ private:
         return epipolar_ && (!line || line->distance() > options_.epipolar_px);
     }
 
-    // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once: all windows of
-    // all neighbours are then windows of two small pictures. Where image 1 is the finer one, samples are `step` apart.
+    // The best of 3 x 3 predicted places for each free neighbour. Both surroundings are resampled once, as far as these
+    // neighbours ask: all their windows are then windows of two small pictures. Where image 1 is the finer one, samples
+    // are `step` apart.
     void look_around(const Match &m, std::vector<Candidate> &found)
     {
         uint64_t free = 0;
@@ -215,64 +232,93 @@ private:
         if (!free)
             return;
         const Sampling s = sampling_for(first_, second_, m.a);
-        const int half = kReach + s.step * (options_.radius + 1), side = 2 * half + 1;
-        sample_block(m, s, half, side);
+        near_.clear();
+        Box box;
         int order = 0;
         for (int dy = -kReach; dy <= kReach; dy++)
             for (int dx = -kReach; dx <= kReach; dx++, order++)
-                if (is_free(m.x + dx, m.y + dy))
-                    try_neighbour(m, s, half, dx, dy, order, found);
+                if (is_free(m.x + dx, m.y + dy) && worth_trying(m, s.step, dx, dy)) {
+                    near_.push_back({order, dx, dy});
+                    box = {std::min(box.left, dx), std::min(box.top, dy), std::max(box.right, dx),
+                           std::max(box.bottom, dy)};
+                }
+        if (near_.empty())
+            return;
+        const int half = kReach + s.step * (options_.radius + 1);
+        sample_block(m, s, half, box);
+        for (const Neighbour &n : near_)
+            try_neighbour(m, s, half, n, found);
     }
 
-    void sample_block(const Match &m, const Sampling &s, int half, int side)
+    // Whether a neighbour's patch is within image 1, and its place in image 2 may be free.
+    bool worth_trying(const Match &m, int step, int dx, int dy)
     {
-        stride_ = static_cast<size_t>(side + 4);
-        block_.assign(stride_ * static_cast<size_t>(side + 1), 0.0F);
-        const Eigen::Vector2f start = m.centre - static_cast<float>(half) * (m.a.col(0) + m.a.col(1));
-        const float middle = bilinear(*s.second, m.centre.x(), m.centre.y());
-        for (int j = 0; j < side; j++) {
-            const Eigen::Vector2f row = start + m.a.col(1) * static_cast<float>(j);
-            float *out = block_.data() + static_cast<size_t>(j) * stride_;
-            for (int i = 0; i < side; i++) {
-                const auto t = static_cast<float>(i);
-                out[i] = bilinear(*s.second, row.x() + m.a(0, 0) * t, row.y() + m.a(1, 0) * t) - middle;
+        const int reach = reach_of(step), x = m.x + dx, y = m.y + dy;
+        if (x < reach || y < reach || x + reach >= first_.width() || y + reach >= first_.height())
+            return false;
+        if (any_free_2(m.centre + m.a * Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)),
+                       m.a * static_cast<float>(step)))
+            return true;
+        out_.taken++;
+        return false;
+    }
+
+    // Of the patch that is fitted next, with its rim.
+    int reach_of(int step) const { return (options_.radius + 2) * step; }
+
+    // Image 2 around the match, brought into the frame of image 1: what the windows of the neighbours in `box` need,
+    // the match itself at (half, half).
+    void sample_block(const Match &m, const Sampling &s, int half, const Box &box)
+    {
+        const int rim = s.step * (options_.radius + 1);
+        const Float4 middle = bilinear(*s.second, Float4{} + m.centre.x(), Float4{} + m.centre.y());
+        for (int j = box.top - rim; j <= box.bottom + rim; j++) {
+            const Eigen::Vector2f row = m.centre + m.a.col(1) * static_cast<float>(j);
+            float *out = block_ + static_cast<size_t>(j + half) * kStride + half;
+            for (int i = box.left - rim; i <= box.right + rim; i += 4) {
+                const Float4 t = counted(i);
+                store(out + i, bilinear(*s.second, row.x() + m.a(0, 0) * t, row.y() + m.a(1, 0) * t) - middle);
             }
         }
         if (s.step == 1)
-            box_sums(side);
+            box_sums(box);
         else
             std::fill(std::begin(known_), std::end(known_), false);
     }
 
-    // Sums over all windows of a block of samples one apart, by running sums.
-    void box_sums(int side)
+    // Sums over all windows of a block of samples one apart: those of columns, from one row of places to the next, and
+    // along them.
+    void box_sums(const Box &box)
     {
-        constexpr int kPlaces = 2 * (kReach + 1) + 1;
-        const int n = 2 * options_.radius + 1;
-        float sums[kBlockMost][kPlaces], squares[kBlockMost][kPlaces];
-        for (int j = 0; j < side; j++) {
-            const float *row = block_.data() + static_cast<size_t>(j) * stride_;
-            float sum = 0, square = 0;
-            for (int i = 0; i < n; i++) {
-                sum += row[i];
-                square += row[i] * row[i];
-            }
-            for (int i = 0; i < kPlaces; i++) {
-                sums[j][i] = sum;
-                squares[j][i] = square;
-                sum += row[i + n] - row[i];
-                square += row[i + n] * row[i + n] - row[i] * row[i];
-            }
-        }
-        for (int j = 0; j < kPlaces; j++) {
-            float sum[kPlaces] = {}, square[kPlaces] = {};
-            for (int v = j; v < j + n; v++)
-                for (int i = 0; i < kPlaces; i++) {
-                    sum[i] += sums[v][i];
-                    square[i] += squares[v][i];
+        const int n = 2 * options_.radius + 1, begin = box.left + kReach, end = box.right + kReach + n + 2;
+        alignas(16) float sums[kStride] = {}, squares[kStride] = {};
+        for (int j = box.top + kReach; j <= box.bottom + kReach + 2; j++) {
+            const bool fresh = j == box.top + kReach;
+            for (int i = begin; i < end; i += 4) {
+                Float4 sum = load(sums + i), square = load(squares + i);
+                for (int v = fresh ? j : j + n - 1; v < j + n; v++) {
+                    const Float4 come = load(block_ + static_cast<size_t>(v) * kStride + i);
+                    sum += come;
+                    square += come * come;
                 }
-            for (int i = 0; i < kPlaces; i++)
-                keep(j, i, sum[i], square[i]);
+                if (!fresh) {
+                    const Float4 go = load(block_ + static_cast<size_t>(j - 1) * kStride + i);
+                    sum -= go;
+                    square -= go * go;
+                }
+                store(sums + i, sum);
+                store(squares + i, square);
+            }
+            float sum = 0, square = 0;
+            for (int i = begin; i < end; i++) {
+                sum += sums[i];
+                square += squares[i];
+                if (i + 1 < begin + n)
+                    continue;
+                keep(j, i + 1 - n, sum, square);
+                sum -= sums[i + 1 - n];
+                square -= squares[i + 1 - n];
+            }
         }
     }
 
@@ -295,7 +341,7 @@ private:
             const int n = 2 * options_.radius + 1;
             float sum = 0, squares = 0;
             for (int v = 0; v < n; v++) {
-                const float *row = block_.data() + static_cast<size_t>(j + v * step) * stride_ + i;
+                const float *row = block_ + static_cast<size_t>(j + v * step) * kStride + i;
                 for (int u = 0; u < n; u++) {
                     sum += row[u * step];
                     squares += row[u * step] * row[u * step];
@@ -306,18 +352,9 @@ private:
         return inverse_[key];
     }
 
-    void try_neighbour(const Match &m, const Sampling &s, int half, int dx, int dy, int order,
-                       std::vector<Candidate> &found)
+    void try_neighbour(const Match &m, const Sampling &s, int half, const Neighbour &n, std::vector<Candidate> &found)
     {
-        const int r = options_.radius, k = s.step, x = m.x + dx, y = m.y + dy;
-        const int reach = (r + 2) * k; // of the patch that is fitted next, with its rim
-        if (x < reach || y < reach || x + reach >= first_.width() || y + reach >= first_.height())
-            return;
-        if (!any_free_2(m.centre + m.a * Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)),
-                        m.a * static_cast<float>(k))) {
-            out_.taken++;
-            return;
-        }
+        const int r = options_.radius, k = s.step, dx = n.dx, dy = n.dy, x = m.x + dx, y = m.y + dy;
         out_.tried++;
         Window window;
         if (!take(window, (*s.first)[y - r * k] + x - r * k, s.first->step1(), k, r, options_.sigma_min))
@@ -329,7 +366,7 @@ private:
                 const Eigen::Vector2f offset(static_cast<float>(dx + ei * k), static_cast<float>(dy + ej * k));
                 float &out = z[ej + 1][ei + 1];
                 out = -1;
-                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(reach)))
+                if (!inside(*s.second, m.centre + m.a * offset, m.a, static_cast<float>(reach_of(k))))
                     continue;
                 const float scale = inverse_sigma_at(i, j, k);
                 if (scale > 0)
@@ -344,19 +381,19 @@ private:
         }
         const Eigen::Vector2f offset =
             Eigen::Vector2f(static_cast<float>(dx), static_cast<float>(dy)) + peak.at * static_cast<float>(k);
-        found.push_back({order, x, y, m.centre + m.a * offset, peak.zncc, peak.at_border});
+        found.push_back({n.order, x, y, m.centre + m.a * offset, peak.zncc, peak.at_border});
     }
 
     float product(const Window &window, int i, int j, int step)
     {
-        const float *from = block_.data() + static_cast<size_t>(j) * stride_ + i;
+        const float *from = block_ + static_cast<size_t>(j) * kStride + i;
         if (step == 1)
-            return window.dot(from, stride_);
+            return window.dot(from, kStride);
         float sum = 0;
         for (int v = 0; v < window.side; v++)
             for (int u = 0; u < window.side; u++)
                 sum += window.v[v * 4 * window.vectors + u] *
-                       from[static_cast<size_t>(v * step) * stride_ + static_cast<size_t>(u * step)];
+                       from[static_cast<size_t>(v * step) * kStride + static_cast<size_t>(u * step)];
         return sum;
     }
 
@@ -427,8 +464,8 @@ private:
     Queue queue_;
     Growth out_;
     std::optional<WholeSearch> whole_; // for translation
-    std::vector<float> block_;
-    size_t stride_ = 0;
+    std::vector<Neighbour> near_;
+    alignas(16) float block_[kBlockMost * kStride] = {};
     bool known_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
     float inverse_[(2 * (kReach + 4) + 1) * (2 * (kReach + 4) + 1)] = {};
 };

@@ -12,8 +12,11 @@ void sample_first(const Sampling &s, int x, int y, int r, Patch &out)
 {
     for (int j = 0; j < 2 * r + 3; j++) {
         const float *row = (*s.first)[y + (j - r - 1) * s.step] + x - (r + 1) * s.step;
-        for (int i = 0; i < 2 * r + 3; i++)
-            out.v[j][i] = row[i * s.step];
+        if (s.step == 1)
+            std::copy_n(row, 2 * r + 3, out.v[j]);
+        else
+            for (int i = 0; i < 2 * r + 3; i++)
+                out.v[j][i] = row[i * s.step];
         store(&out.v[j][2 * r + 3], Float4{}); // read by sum_row, with weight 0
     }
 }
@@ -21,11 +24,13 @@ void sample_first(const Sampling &s, int x, int y, int r, Patch &out)
 void sample_second(const Sampling &s, const Local &at, int r, Patch &out, int rim)
 {
     const Eigen::Matrix2f a = at.a * static_cast<float>(s.step);
-    for (int j = 1 - rim; j < 2 * r + 2 + rim; j++) {
+    const int last = 2 * r + 1 + rim;
+    for (int j = 1 - rim; j <= last; j++) {
         const Eigen::Vector2f start = at.centre + a.col(1) * static_cast<float>(j - r - 1);
-        for (int i = 1 - rim; i < 2 * r + 2 + rim; i++) {
-            const Eigen::Vector2f p = start + a.col(0) * static_cast<float>(i - r - 1);
-            out.v[j][i] = spline(*s.spline, p.x(), p.y());
+        for (int i = 1 - rim; i <= last; i += 4) {
+            Float4 along = counted(i - r - 1); // not beyond the row: it may end at the image's rim
+            along = along < static_cast<float>(last - r - 1) ? along : Float4{} + static_cast<float>(last - r - 1);
+            store(&out.v[j][i], spline(*s.spline, start.x() + a(0, 0) * along, start.y() + a(1, 0) * along));
         }
         store(&out.v[j][2 * r + 3], Float4{});
     }
@@ -42,25 +47,36 @@ Level level_of(const Patch &p, int r)
 {
     const int n = 2 * r + 1;
     const float origin = p.v[r + 1][r + 1];
-    float sum = 0, squares = 0;
-    for (int j = 1; j <= n; j++)
-        for (int i = 1; i <= n; i++) {
-            const float d = p.v[j][i] - origin;
+    const Float4 rest = first_of(n % 4);
+    Float4 sum = {}, squares = {};
+    for (int j = 1; j <= n; j++) {
+        int i = 1;
+        for (; i + 3 <= n; i += 4) {
+            const Float4 d = load(&p.v[j][i]) - origin;
             sum += d;
             squares += d * d;
         }
+        const Float4 d = (load(&p.v[j][i]) - origin) * rest;
+        sum += d;
+        squares += d * d;
+    }
     const auto count = static_cast<float>(n * n);
-    const float mean = sum / count;
-    return {mean + origin, std::sqrt(std::max(0.0F, squares / count - mean * mean))};
+    const float mean = total(sum) / count;
+    return {mean + origin, std::sqrt(std::max(0.0F, total(squares) / count - mean * mean))};
 }
 
 float correlate(const Patch &p, Level lp, const Patch &q, Level lq, int r)
 {
-    float sum = 0;
-    for (int j = 1; j <= 2 * r + 1; j++)
-        for (int i = 1; i <= 2 * r + 1; i++)
-            sum += (p.v[j][i] - lp.mean) * (q.v[j][i] - lq.mean);
-    return sum / (lp.sigma * lq.sigma * static_cast<float>((2 * r + 1) * (2 * r + 1)));
+    const int n = 2 * r + 1;
+    const Float4 rest = first_of(n % 4);
+    Float4 sum = {};
+    for (int j = 1; j <= n; j++) {
+        int i = 1;
+        for (; i + 3 <= n; i += 4)
+            sum += (load(&p.v[j][i]) - lp.mean) * (load(&q.v[j][i]) - lq.mean);
+        sum += (load(&p.v[j][i]) - lp.mean) * (load(&q.v[j][i]) - lq.mean) * rest;
+    }
+    return total(sum) / (lp.sigma * lq.sigma * static_cast<float>(n * n));
 }
 
 Sampling sampling_for(const ScaleStack &first, const ScaleStack &second, const Eigen::Matrix2f &a)

@@ -37,8 +37,13 @@ const Weights &weights_of(int r)
     return kept;
 }
 
-// Sums for the normal equations of one row, powers of the column as the second index.
 enum Sum { kXX, kXY, kYY, kXA, kYA, kX1, kY1, kXE, kYE, kAA, kA1, k11, kAE, k1E, kSums };
+
+// How many powers of the row a sum is asked for with: those of a product of two gradients 0 to 2, of one 0 and 1.
+constexpr int powers_of(int sum)
+{
+    return sum <= kYY ? 3 : sum <= kYE ? 2 : 1;
+}
 
 // Normal equations in the order tx, ty, c00, c01, c10, c11, gain, offset.
 struct Normal {
@@ -46,49 +51,51 @@ struct Normal {
     Eigen::Matrix<double, 8, 1> g;
 };
 
-// Row j of both patches: residual e = a - b, mean gradient, weighted and summed over the columns.
-void sum_row(const Patch &p, Level lp, const Patch &q, Level lq, int j, const Weights &window, double (&out)[kSums][3])
+// Columns i to i + 3 of both patches: residual e = a - b, mean gradient, weighted and summed over the rows, powers of
+// the row as the second index.
+void sum_columns(const Patch &p, Level lp, const Patch &q, Level lq, int i, const Weights &window,
+                 Float4 (&out)[kSums][3])
 {
-    Float4 s[kSums][3] = {};
     const float sp = 1 / lp.sigma, sq = 1 / lq.sigma;
-    for (int i = 0; i < 2 * window.r + 1; i += 4) {
-        const Float4 w = load(window.w + i), v = load(window.at + i);
+    const Float4 column = load(window.w + i);
+    for (int j = 1; j <= 2 * window.r + 1; j++) {
+        const Float4 w = column * window.w[j - 1];
         const Float4 a = (load(&p.v[j][i + 1]) - lp.mean) * sp, b = (load(&q.v[j][i + 1]) - lq.mean) * sq;
         const Float4 gx =
             0.25F * ((load(&p.v[j][i + 2]) - load(&p.v[j][i])) * sp + (load(&q.v[j][i + 2]) - load(&q.v[j][i])) * sq);
         const Float4 gy = 0.25F * ((load(&p.v[j + 1][i + 1]) - load(&p.v[j - 1][i + 1])) * sp +
                                    (load(&q.v[j + 1][i + 1]) - load(&q.v[j - 1][i + 1])) * sq);
-        const Float4 e = a - b, x = w * gx, y = w * gy;
-        const Float4 terms[kSums] = {x * gx, x * gy, y * gy,    x * a, y * a, x,         y,
-                                     x * e,  y * e,  w * a * a, w * a, w,     w * a * e, w * e};
-        for (int k = 0; k < kSums; k++)
-            s[k][0] += terms[k];
-        for (int k = 0; k <= kYE; k++)
-            s[k][1] += terms[k] * v;
-        for (int k = 0; k <= kYY; k++)
-            s[k][2] += terms[k] * v * v;
-    }
-    for (int k = 0; k < kSums; k++)
+        const Float4 e = a - b, x = w * gx, y = w * gy, wa = w * a;
+        Float4 terms[kSums] = {x * gx, x * gy, y * gy, x * a, y * a, x, y, x * e, y * e, wa * a, wa, w, wa * e, w * e};
         for (int m = 0; m < 3; m++)
-            out[k][m] = static_cast<double>(total(s[k][m]));
+            for (int k = 0; k < kSums; k++)
+                if (m < powers_of(k)) {
+                    out[k][m] += terms[k];
+                    terms[k] *= window.at[j - 1];
+                }
+    }
 }
 
 Normal normal_of(const Patch &p, Level lp, const Patch &q, Level lq, int r)
 {
     const Weights &window = weights_of(r);
-    // m[sum][i][j]: weighted by column^i row^j, i + j <= 2
-    double m[kSums][3][3] = {};
-    for (int j = 1; j <= 2 * r + 1; j++) {
-        double row[kSums][3];
-        sum_row(p, lp, q, lq, j, window, row);
-        const double w = static_cast<double>(window.w[j - 1]), y = j - 1 - r;
+    Float4 sums[kSums][3][3] = {}; // weighted by column^i row^j, i + j <= 2
+    for (int i = 0; i < 2 * r + 1; i += 4) {
+        Float4 s[kSums][3] = {};
+        sum_columns(p, lp, q, lq, i, window, s);
+        const Float4 v = load(window.at + i);
         for (int k = 0; k < kSums; k++)
-            for (int i = 0; i < 3; i++) {
-                m[k][i][0] += w * row[k][i];
-                m[k][i][1] += w * y * row[k][i];
-                m[k][i][2] += w * y * y * row[k][i];
-            }
+            for (int n = 0; n < powers_of(k); n++)
+                for (int j = 0; j + n < powers_of(k); j++) {
+                    sums[k][n][j] += s[k][j];
+                    s[k][j] *= v;
+                }
     }
+    double m[kSums][3][3];
+    for (int k = 0; k < kSums; k++)
+        for (int n = 0; n < powers_of(k); n++)
+            for (int j = 0; j + n < powers_of(k); j++)
+                m[k][n][j] = static_cast<double>(total(sums[k][n][j]));
     // Columns: gradient gx or gy times 1, column, row.
     const int component[6] = {0, 1, 0, 0, 1, 1}, i_of[6] = {0, 0, 1, 0, 1, 0}, j_of[6] = {0, 0, 0, 1, 0, 1};
     const Sum pair[2][2] = {{kXX, kXY}, {kXY, kYY}};
@@ -123,7 +130,7 @@ bool refine(const ScaleStack &first, const ScaleStack &second, int x, int y, int
     const double shift_ridge = 1e-3 * (n.h(0, 0) + n.h(1, 1)), map_ridge = 1e-3 * n.h.diagonal().segment<4>(2).sum();
     n.h.diagonal().head<2>().array() += shift_ridge;
     n.h.diagonal().segment<4>(2).array() += max_change > 0 ? map_ridge : 1e6 * map_ridge;
-    const Eigen::Matrix<float, 8, 1> d = n.h.ldlt().solve(n.g).cast<float>();
+    const Eigen::Matrix<float, 8, 1> d = n.h.llt().solve(n.g).cast<float>();
     Eigen::Matrix2f c;
     c << d(2), d(3), d(4), d(5);
     const Eigen::Vector2f t = d.head<2>();

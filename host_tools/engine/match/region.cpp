@@ -7,6 +7,7 @@
 
 #include <Eigen/LU>
 #include <opencv2/core.hpp>
+#include <opencv2/core/hal/hal.hpp>
 
 #include <algorithm>
 #include <cmath>
@@ -38,18 +39,22 @@ const auto kAdaptWindow = gaussian<2 * kAdaptHalf + 1>(4.5);
 const auto kTurnWindow = gaussian<kSide>(8);
 const auto kDescribeWindow = gaussian<kSide>(kHalf);
 
-using Normalised = std::array<std::array<float, kSide + 2>, kSide + 2>; // with a rim of one sample
+// With a rim of one sample; rows in whole Float4s.
+using Normalised = std::array<std::array<float, (kSide + 2 + 3) / 4 * 4>, kSide + 2>;
 
 // at + shape * v for v in [-1, 1]^2 (and a rim), from the level whose blur suits the spacing.
 void normalise(const ScaleStack &stack, const Region &region, int half, Normalised &out)
 {
     const Eigen::Matrix2d a = region.shape / half;
     const Image &image = stack.for_step(std::sqrt(std::abs(a.determinant())));
-    for (int j = -half - 1; j <= half + 1; j++)
-        for (int i = -half - 1; i <= half + 1; i++) {
-            const Eigen::Vector2f p = (region.at + a * Eigen::Vector2d(i, j)).cast<float>();
-            out[static_cast<size_t>(j + half + 1)][static_cast<size_t>(i + half + 1)] = bilinear(image, p.x(), p.y());
+    for (int j = -half - 1; j <= half + 1; j++) {
+        const Eigen::Vector2f start = (region.at + a.col(1) * j).cast<float>(), along = a.col(0).cast<float>();
+        float *row = out[static_cast<size_t>(j + half + 1)].data();
+        for (int i = 0; i < 2 * half + 3; i += 4) {
+            const Float4 t = counted(i - half - 1);
+            store(row + i, bilinear(image, start.x() + along.x() * t, start.y() + along.y() * t));
         }
+    }
 }
 
 bool within(const ScaleStack &stack, const Region &region)
@@ -81,8 +86,7 @@ bool adapt_shape(const ScaleStack &stack, Region &region)
             }
         if (!(m.determinant() > 1e-6 * m.trace() * m.trace()))
             return false;
-        const double both = std::sqrt(std::max(0.0, m.trace() * m.trace() - 4 * m.determinant()));
-        if (m.trace() - both > 0.95 * (m.trace() + both)) // ratio of eigenvalues
+        if (0.95 * aspect(m) < 1)
             return true;
         Eigen::Matrix2d u = region.shape * root(m).inverse();
         u *= std::sqrt(det / std::abs(u.determinant()));
@@ -93,18 +97,33 @@ bool adapt_shape(const ScaleStack &stack, Region &region)
     return false;
 }
 
+// Of a normalised patch without its rim, row by row: length and direction (degrees) of the gradient.
+struct Gradients {
+    std::array<float, kSide * kSide> size, turn;
+
+    explicit Gradients(const Normalised &p)
+    {
+        std::array<float, kSide * kSide> x, y;
+        for (size_t j = 1, k = 0; j <= kSide; j++)
+            for (size_t i = 1; i <= kSide; i++, k++) {
+                x[k] = p[j][i + 1] - p[j][i - 1];
+                y[k] = p[j + 1][i] - p[j - 1][i];
+            }
+        cv::hal::magnitude32f(x.data(), y.data(), size.data(), kSide * kSide);
+        cv::hal::fastAtan32f(y.data(), x.data(), turn.data(), kSide * kSide, true);
+    }
+};
+
 // At most two directions of the gradient in the normalised patch.
 std::vector<double> orientations(const Normalised &p)
 {
     constexpr int bins = 36;
     std::array<double, bins> raw = {}, h = {};
-    for (int j = 1; j <= kSide; j++)
-        for (int i = 1; i <= kSide; i++) {
-            const auto u = static_cast<size_t>(i), v = static_cast<size_t>(j);
-            const float gx = p[v][u + 1] - p[v][u - 1], gy = p[v + 1][u] - p[v - 1][u];
-            const auto at = static_cast<size_t>(cv::fastAtan2(gy, gx) * (bins / 360.0F));
-            raw[at % bins] +=
-                kTurnWindow[u - 1] * kTurnWindow[v - 1] * static_cast<double>(std::sqrt(gx * gx + gy * gy));
+    const Gradients g(p);
+    for (size_t j = 0, k = 0; j < kSide; j++)
+        for (size_t i = 0; i < kSide; i++, k++) {
+            const auto at = static_cast<size_t>(g.turn[k] * (bins / 360.0F));
+            raw[at % bins] += kTurnWindow[i] * kTurnWindow[j] * static_cast<double>(g.size[k]);
         }
     for (size_t k = 0; k < bins; k++)
         h[k] = 6 * raw[k] + 4 * (raw[(k + 1) % bins] + raw[(k + bins - 1) % bins]) + raw[(k + 2) % bins] +
@@ -125,32 +144,46 @@ std::vector<double> orientations(const Normalised &p)
     return out;
 }
 
+// Where a column or row of the patch lies among the 4 histograms: between the `first` and the next, counted from one
+// before them, the next one's share being `part`.
+struct Place {
+    size_t first;
+    float part;
+};
+constexpr auto kPlaces = [] {
+    std::array<Place, kSide> out = {};
+    for (size_t i = 0; i < kSide; i++) {
+        const float at = (static_cast<float>(i) - kHalf) * (4.0F / kSide) + 2.5F;
+        out[i] = {static_cast<size_t>(at), at - static_cast<float>(static_cast<size_t>(at))};
+    }
+    return out;
+}();
+
 // Lowe's histograms: 4 x 4 places, 8 directions, each sample shared between neighbours; root of the L1-normalised.
 Eigen::Matrix<float, kDescriptor, 1> descriptor(const Normalised &p)
 {
-    Eigen::Matrix<float, kDescriptor, 1> out = Eigen::Matrix<float, kDescriptor, 1>::Zero();
-    const float cell = kSide / 4.0F;
-    for (int j = 1; j <= kSide; j++)
-        for (int i = 1; i <= kSide; i++) {
-            const auto u = static_cast<size_t>(i), v = static_cast<size_t>(j);
-            const float gx = p[v][u + 1] - p[v][u - 1], gy = p[v + 1][u] - p[v - 1][u];
-            const auto x = static_cast<float>(i - kHalf - 1), y = static_cast<float>(j - kHalf - 1);
-            const float w =
-                std::sqrt(gx * gx + gy * gy) * static_cast<float>(kDescribeWindow[u - 1] * kDescribeWindow[v - 1]);
-            const float bx = x / cell + 1.5F, by = y / cell + 1.5F;
-            const float turn = cv::fastAtan2(gy, gx) * (8 / 360.0F);
-            const int ix = static_cast<int>(std::floor(bx)), iy = static_cast<int>(std::floor(by));
-            const int it = static_cast<int>(turn);
-            const float fx = bx - static_cast<float>(ix), fy = by - static_cast<float>(iy),
-                        ft = turn - static_cast<float>(it);
-            for (int c = 0; c < 8; c++) {
-                const int cx = ix + (c & 1), cy = iy + (c >> 1 & 1), ct = (it + (c >> 2)) % 8;
-                if (cx < 0 || cy < 0 || cx > 3 || cy > 3)
-                    continue;
-                out((cy * 4 + cx) * 8 + ct) +=
-                    w * (c & 1 ? fx : 1 - fx) * (c & 2 ? fy : 1 - fy) * (c & 4 ? ft : 1 - ft);
+    float sums[6][6][9] = {}; // with a place beside the first and the last, and the first direction again
+    const Gradients g(p);
+    for (size_t j = 0, k = 0; j < kSide; j++)
+        for (size_t i = 0; i < kSide; i++, k++) {
+            const float turn = g.turn[k] * (8 / 360.0F);
+            const auto t = static_cast<size_t>(turn);
+            const float ft = turn - static_cast<float>(t);
+            const float w = g.size[k] * static_cast<float>(kDescribeWindow[i] * kDescribeWindow[j]);
+            const Place x = kPlaces[i], y = kPlaces[j];
+            const float low = w * (1 - y.part), high = w * y.part;
+            const float share[4] = {low * (1 - x.part), low * x.part, high * (1 - x.part), high * x.part};
+            for (size_t c = 0; c < 4; c++) {
+                float *bin = &sums[y.first + c / 2][x.first + c % 2][t % 8];
+                bin[0] += share[c] * (1 - ft);
+                bin[1] += share[c] * ft;
             }
         }
+    Eigen::Matrix<float, kDescriptor, 1> out;
+    for (int k = 0; k < kDescriptor; k++) {
+        const float *bin = sums[k / 32 + 1][k / 8 % 4 + 1];
+        out(k) = bin[k % 8] + (k % 8 ? 0 : bin[8]);
+    }
     for (int pass = 0; pass < 2; pass++) {
         out /= std::max(out.norm(), 1e-12F);
         out = pass ? out : Eigen::Matrix<float, kDescriptor, 1>(out.cwiseMin(0.2F));
