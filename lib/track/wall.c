@@ -32,6 +32,7 @@
 #define ALIKE    4          /* strides in which the same tracks err alike: each adds such a part of what it says */
 #define WELL     (ONE / 32) /* of the radius: so well its place is known, once it is */
 #define AFAR     (ONE / 12) /* of the radius: a stride */
+#define RIM      (ONE / 4) /* a cotangent, of 76 degrees: beyond it the light moves most, and a track counts a quarter */
 #define TURNED   (ONE / 16) /* rad: with so much of a turn it ends too: its third power, 0.01 px, is left out */
 #define OFTEN    3          /* times the median: where the tube is none, all walk off */
 #define AGED     ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
@@ -206,10 +207,11 @@ static void gather(const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN], in
     for (uint32_t i = 0; i < n; i++) {
         int64_t r[2];
         int32_t j[2][UNKNOWN];
+        const int64_t part = pair[i].cot < RIM ? 1 : 4;
         residual(&pair[i], v, r, j);
         for (int32_t q = 0; q < 2; q++) {
             const int64_t far = r[q] > ONE ? ONE : r[q] < -ONE ? -ONE : r[q];
-            const int64_t weight = 4 * variance_q48 / ((4 * variance_q48 + far * far) >> 14);
+            const int64_t weight = part * variance_q48 / ((4 * variance_q48 + far * far) >> 14);
             for (int32_t k = 0; k < UNKNOWN; k++) {
                 const int64_t wj = (weight * j[q][k]) >> 14;
                 g[k] += (wj * far) >> 14;

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x3F82FA96u
+#define GOLDEN 0xD58CC961u
 
 void setUp(void) {}
 void tearDown(void) {}
