@@ -1,10 +1,11 @@
 /* Tracks that walk off the wall. Where relief shines along with the paint, a patch looks shifted, a little farther with
- * every frame: by the patch alone it cannot be told from a wall that is a little nearer. Its neighbours tell. From
- * frame to frame the bearings of all tracks determine how the camera moved in its tube; what a track moves beyond that
- * is summed up along its life.
+ * every frame: by the patch alone it cannot be told from a wall that is a little nearer. Its neighbours tell. Over
+ * a stride the bearings of all tracks determine how the camera moved in its tube; what a track moves beyond that is
+ * summed up along its life. A stride is a twelfth of the radius, or a frame where that is more: from frame to frame a
+ * slow camera moves too little to tell from the noise, and what was not known of its motion adds up with every frame.
  *
  * The tube is round, its radius the unit. In the camera's frame its axis runs through (o0, o1) + z (o2, o3): where the
- * camera stands off the axis, and its tilt. A frame's motion is a turn w and a way t, in the frame before. These ten
+ * camera stands off the axis, and its tilt. A stride's motion is a turn w and a way t, in its first frame. These ten
  * are fitted by Gauss and Newton with Cauchy weights; what is known of the axis is kept as a matrix of information that
  * fades as the camera drives on. Q24 unless said. */
 #include <string.h>
@@ -28,8 +29,11 @@
 #define PRIOR    ((int64_t)1 << 40)      /* no prior is stronger */
 #define FAINTLY  ((int64_t)1 << 10)      /* a pivot, Q30 */
 #define FADE     3                       /* tenths of a radius: on the way what is known of the axis fades to a third */
-#define ALIKE    8          /* frames in which the same tracks err alike: each adds such a part of what it says */
-#define WELL     (ONE / 64) /* of the radius: so well its place is known, once it is */
+#define ALIKE    4          /* strides in which the same tracks err alike: each adds such a part of what it says */
+#define WELL     (ONE / 32) /* of the radius: so well its place is known, once it is */
+#define AFAR     (ONE / 12) /* of the radius: a stride */
+#define RIM      (ONE / 4) /* a cotangent, of 76 degrees: beyond it the light moves most, and a track counts a quarter */
+#define TURNED   (ONE / 16) /* rad: with so much of a turn it ends too: its third power, 0.01 px, is left out */
 #define OFTEN    3          /* times the median: where the tube is none, all walk off */
 #define AGED     ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
 #define LIGHT    (ONE * 18 / 10000)  /* of a fall: the median of 0.27 % */
@@ -203,10 +207,11 @@ static void gather(const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN], in
     for (uint32_t i = 0; i < n; i++) {
         int64_t r[2];
         int32_t j[2][UNKNOWN];
+        const int64_t part = pair[i].cot < RIM ? 1 : 4;
         residual(&pair[i], v, r, j);
         for (int32_t q = 0; q < 2; q++) {
             const int64_t far = r[q] > ONE ? ONE : r[q] < -ONE ? -ONE : r[q];
-            const int64_t weight = 4 * variance_q48 / ((4 * variance_q48 + far * far) >> 14);
+            const int64_t weight = part * variance_q48 / ((4 * variance_q48 + far * far) >> 14);
             for (int32_t k = 0; k < UNKNOWN; k++) {
                 const int64_t wj = (weight * j[q][k]) >> 14;
                 g[k] += (wj * far) >> 14;
@@ -217,17 +222,18 @@ static void gather(const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN], in
     }
 }
 
-/* Fits the frame's motion. v begins at the last frame's. */
+/* Fits the stride's motion so far; v begins at what is expected. */
 static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v[UNKNOWN])
 {
-    int64_t axis[4][4], prior[4][4], before[UNKNOWN], variance = 0;
-    memcpy(before, v, sizeof before);
+    const pf_wall_axis *before = &wall->before;
+    const int64_t expected = v[5];
+    int64_t axis[4][4], prior[4][4], variance = 0;
     for (int32_t step = 0; step < STEPS; step++) {
         int64_t a[UNKNOWN][UNKNOWN] = {{0}}, g[UNKNOWN] = {0}, x[UNKNOWN];
-        const int64_t scale = scale_of(wall, pair, n, v), way = before[5] < 0 ? -before[5] : before[5];
+        const int64_t scale = scale_of(wall, pair, n, v), way = expected < 0 ? -expected : expected;
         variance = scale * scale;
         gather(pair, n, v, variance, a, g);
-        const int64_t ratio = wall->variance > 0 ? variance / ((wall->variance >> 16) + 1) : 0;
+        const int64_t ratio = before->variance > 0 ? variance / ((before->variance >> 16) + 1) : 0;
         const int64_t ratio_q16 = ratio < 1 << 22 ? ratio : 1 << 22;
         for (int32_t k = 0; k < AXIS; k++) {
             const int64_t aim = k < 3 ? 0 : k < 5 ? mul(v[AXIS + 2 + k - 3], v[5]) : 0;
@@ -238,12 +244,12 @@ static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v
         for (int32_t i = 0; i < 4; i++)
             for (int32_t k = 0; k < 4; k++) {
                 const int64_t least = i == k ? prior_of(variance / 2, i < 2 ? OFFSET : TILT) : 0;
-                const int64_t told = (wall->known[i][k] * ratio_q16) >> 16;
+                const int64_t told = (before->known[i][k] * ratio_q16) >> 16;
                 const int64_t p = i == k && told < least ? least : told;
                 prior[i][k] = p;
                 if (k >= i)
                     a[AXIS + i][AXIS + k] += p;
-                g[AXIS + i] -= (p * (v[AXIS + k] - before[AXIS + k])) >> 28;
+                g[AXIS + i] -= (p * (v[AXIS + k] - before->at[k])) >> 28;
             }
         for (int32_t i = 0; i < UNKNOWN; i++)
             for (int32_t k = 0; k < i; k++)
@@ -257,8 +263,9 @@ static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v
     const int64_t keep = fades < ONE / 2 ? ONE - fades : ONE / 2;
     for (int32_t i = 0; i < 4; i++)
         for (int32_t k = 0; k < 4; k++)
-            wall->known[i][k] = ((prior[i][k] + (axis[i][k] - prior[i][k]) / ALIKE) * (keep >> 8)) >> 16;
-    wall->variance = variance;
+            wall->axis.known[i][k] = ((prior[i][k] + (axis[i][k] - prior[i][k]) / ALIKE) * (keep >> 8)) >> 16;
+    memcpy(wall->axis.at, v + AXIS, sizeof wall->axis.at);
+    wall->axis.variance = variance;
 }
 
 pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size_t size)
@@ -267,32 +274,58 @@ pf_status pf_wall_init(pf_wall *wall, uint32_t max_tracks, void *workspace, size
         return PF_ERR_ARGUMENT;
     if (size < PF_WALL_BYTES(max_tracks))
         return PF_ERR_SPACE;
-    *wall = (pf_wall){.max_tracks = max_tracks, .id = workspace};
+    *wall = (pf_wall){.max_tracks = max_tracks, .ends = true, .now.id = workspace};
     wall->motion[5] = ONE / 64; /* somewhere to begin */
-    wall->scratch = (int64_t *)(wall->id + max_tracks);
-    wall->off = (int32_t *)(wall->scratch + MOST * sizeof(pf_pair) / sizeof(int64_t));
-    wall->ray = (pf_ray_q30 *)(wall->off + 3u * max_tracks);
-    wall->value = (uint32_t *)(wall->ray + max_tracks);
+    wall->from.id = wall->now.id + max_tracks;
+    wall->scratch = (int64_t *)(wall->from.id + max_tracks);
+    wall->now.off = (int32_t *)(wall->scratch + MOST * sizeof(pf_pair) / sizeof(int64_t));
+    wall->from.off = wall->now.off + 3u * max_tracks;
+    wall->now.ray = (pf_ray_q30 *)(wall->from.off + 3u * max_tracks);
+    wall->from.ray = wall->now.ray + max_tracks;
+    wall->value = (uint32_t *)(wall->from.ray + max_tracks);
     wall->pair = (uint16_t *)(wall->value + max_tracks);
     return PF_OK;
 }
 
-/* Row by row, where each track was in the list of the last frame: wall->pair, UINT16_MAX = nowhere. Both have ascending
- * ids. */
+/* Begins a stride with the last frame; its motion is taken to go on as it was. */
+static void begin_stride(pf_wall *wall)
+{
+    const pf_wall_list from = wall->from;
+    wall->from = wall->now;
+    wall->now = from;
+    wall->before = wall->axis;
+    for (int32_t k = 0; k < AXIS && wall->frames > 1; k++)
+        wall->motion[k] /= wall->frames;
+    wall->frames = 0;
+}
+
+/* Whether the stride ends here. */
+static bool has_strode(const pf_wall *wall)
+{
+    const int64_t *v = wall->motion;
+    for (int32_t k = 0; k < 3; k++)
+        if (v[k] > TURNED || v[k] < -TURNED)
+            return true;
+    return v[5] > AFAR || v[5] < -AFAR;
+}
+
+/* Row by row, where each track was in the list with which the stride began: wall->pair, UINT16_MAX = nowhere. Both have
+ * ascending ids. */
 static uint32_t match(pf_wall *wall, const pf_track *tracks, uint32_t n)
 {
+    const pf_wall_list *from = &wall->from;
     uint32_t i = 0, count = 0;
     for (uint32_t j = 0; j < n; j++) {
-        while (i < wall->n && wall->id[i] < tracks[j].id)
+        while (i < from->n && from->id[i] < tracks[j].id)
             i++;
-        const bool is_known = tracks[j].status == PF_TRACK_TRACKED && i < wall->n && wall->id[i] == tracks[j].id;
+        const bool is_known = tracks[j].status == PF_TRACK_TRACKED && i < from->n && from->id[i] == tracks[j].id;
         wall->pair[j] = is_known ? (uint16_t)i : UINT16_MAX;
         count += is_known;
     }
     return count;
 }
 
-/* Fits the motion to at most MOST of the tracks seen in both frames. False with too few. */
+/* Fits the motion to at most MOST of the tracks seen here and where the stride began. False with too few. */
 static bool learn_motion(pf_wall *wall, const pf_ray_q30 *rays, uint32_t n, uint32_t known)
 {
     pf_pair *pair = (pf_pair *)wall->scratch;
@@ -300,25 +333,27 @@ static bool learn_motion(pf_wall *wall, const pf_ray_q30 *rays, uint32_t n, uint
     uint32_t count = 0, seen = 0;
     for (uint32_t j = 0; j < n; j++)
         if (wall->pair[j] != UINT16_MAX && seen++ % every == 0 &&
-            make_pair(&wall->ray[wall->pair[j]], &rays[j], &pair[count]))
+            make_pair(&wall->from.ray[wall->pair[j]], &rays[j], &pair[count]))
             count++;
     if (count < LEAST)
         return false;
+    for (int32_t k = 0; k < AXIS && wall->frames > 0; k++)
+        wall->motion[k] += wall->motion[k] / wall->frames;
     fit_motion(wall, pair, count, wall->motion);
     return true;
 }
 
-/* Takes row j into the list as its k-th (k is at most where it was), with what it has walked off since. */
+/* Takes a track into the list as its k-th, with what it has walked off: before the stride and in it. */
 static void move_on(pf_wall *wall, uint32_t k, uint64_t id, const pf_ray_q30 *ray, uint32_t before, bool has_motion)
 {
-    int32_t *off = wall->off + 3u * k;
+    int32_t *off = wall->now.off + 3u * k;
     pf_pair pair;
     if (before == UINT16_MAX) {
         off[0] = off[1] = off[2] = 0;
     } else {
-        const int32_t *was = wall->off + 3u * before;
+        const int32_t *was = wall->from.off + 3u * before;
         int64_t now[3] = {was[0], was[1], was[2]}, r[2];
-        if (has_motion && make_pair(&wall->ray[before], ray, &pair)) {
+        if (has_motion && make_pair(&wall->from.ray[before], ray, &pair)) {
             const int64_t sine = -pair.out[2];
             residual(&pair, wall->motion, r, NULL);
             now[0] += r[0] * ONE / sine * ONE / sine;
@@ -328,19 +363,19 @@ static void move_on(pf_wall *wall, uint32_t k, uint64_t id, const pf_ray_q30 *ra
         for (uint32_t i = 0; i < 3u; i++)
             off[i] = pf_clamp_i64(now[i], 1 << 30);
     }
-    wall->id[k] = id;
-    wall->ray[k] = *ray;
+    wall->now.id[k] = id;
+    wall->now.ray[k] = *ray;
 }
 
 /* The BESIDE tracks of some age nearest to the k-th. Returns how many there are. */
 static uint32_t find_neighbours(const pf_wall *wall, uint32_t k, uint32_t at[BESIDE])
 {
     uint32_t near[BESIDE], n = 0;
-    for (uint32_t i = 0; i < wall->n; i++) {
-        const int32_t *off = wall->off + 3u * i;
+    for (uint32_t i = 0; i < wall->now.n; i++) {
+        const int32_t *off = wall->now.off + 3u * i;
         if (i == k || (off[2] < AGED && off[2] > -AGED))
             continue;
-        const uint32_t chord = pf_ray_chord2(&wall->ray[k], &wall->ray[i]);
+        const uint32_t chord = pf_ray_chord2(&wall->now.ray[k], &wall->now.ray[i]);
         uint32_t m = n < BESIDE ? n++ : BESIDE;
         if (m == BESIDE && chord >= near[BESIDE - 1u])
             continue;
@@ -371,7 +406,7 @@ static int64_t median_of(int64_t v[BESIDE])
  * fewer neighbours, all of it. */
 static void walked_alone(const pf_wall *wall, uint32_t k, int64_t walked[2])
 {
-    const int32_t *own = wall->off + 3u * k;
+    const int32_t *own = wall->now.off + 3u * k;
     uint32_t at[BESIDE];
     const bool has_neighbours = find_neighbours(wall, k, at) == BESIDE;
     for (uint32_t i = 0; i < 2u; i++) {
@@ -380,7 +415,7 @@ static void walked_alone(const pf_wall *wall, uint32_t k, int64_t walked[2])
         if (!has_neighbours)
             continue;
         for (uint32_t m = 0; m < BESIDE; m++)
-            part[m] = wall->off[3u * at[m] + i] * ONE / wall->off[3u * at[m] + 2u];
+            part[m] = wall->now.off[3u * at[m] + i] * ONE / wall->now.off[3u * at[m] + 2u];
         walked[i] -= mul(own[2], pf_clamp_i64(median_of(part), (int32_t)ONE));
     }
 }
@@ -390,7 +425,7 @@ static void walked_alone(const pf_wall *wall, uint32_t k, int64_t walked[2])
 static pf_point_q16 way_of(const pf_wall *wall, uint32_t k, const int64_t walked[2], pf_ray_project project,
                            const void *camera)
 {
-    const pf_ray_q30 *v = &wall->ray[k];
+    const pf_ray_q30 *v = &wall->now.ray[k];
     const int64_t sine = sine_of(v);
     pf_point_q16 a, b;
     if (sine < STEEP || !project(camera, v, &a))
@@ -415,8 +450,8 @@ static uint32_t length_of(pf_point_q16 way)
 /* Whether it is known where the camera stands: what tracks walk off before that is not held against them. */
 static bool knows_axis(const pf_wall *wall)
 {
-    const int64_t enough = prior_of(wall->variance / 2, WELL);
-    return wall->known[0][0] >= enough && wall->known[1][1] >= enough;
+    const int64_t enough = prior_of(wall->axis.variance / 2, WELL);
+    return wall->axis.known[0][0] >= enough && wall->axis.known[1][1] >= enough;
 }
 
 /* The part, Q16, of what a track walks off alone that is the light's doing. On brick, clay and plastic that is 0.27 %
@@ -425,8 +460,8 @@ static bool knows_axis(const pf_wall *wall)
 static uint32_t part_of_light(pf_wall *wall)
 {
     uint32_t n = 0;
-    for (uint32_t k = 0; k < wall->n; k++) {
-        const int64_t off = wall->off[3u * k], fall = wall->off[3u * k + 2u];
+    for (uint32_t k = 0; k < wall->now.n; k++) {
+        const int64_t off = wall->now.off[3u * k], fall = wall->now.off[3u * k + 2u];
         if (fall >= AGED || fall <= -AGED)
             wall->value[n++] =
                 (uint32_t)pf_clamp_i64((off < 0 ? -off : off) * ONE / (fall < 0 ? -fall : fall), (int32_t)ONE / 4);
@@ -443,7 +478,7 @@ static uint32_t part_of_light(pf_wall *wall)
  * best taken back is 0.5 inside 60 degrees, 0.65 to 75, 0.75 to 82 and 0.8 beyond, on brick, clay and plastic alike. */
 static int64_t part_of(const pf_wall *wall, uint32_t k)
 {
-    const pf_ray_q30 *v = &wall->ray[k];
+    const pf_ray_q30 *v = &wall->now.ray[k];
     const int64_t sine = sine_of(v), z = v->z < 0 ? -(int64_t)v->z : v->z, p = wall->light_q16;
     const int64_t cot = z < sine / 2 ? z * 65536 / sine : 32768;
     const int64_t odds = 65536 + GLANCE * (65536 - 2 * cot);
@@ -462,19 +497,25 @@ static uint32_t stray_of(const pf_wall *wall, uint32_t k, const int64_t walked[2
 uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                        pf_ray_project project, const void *camera, uint32_t most_q16, uint16_t *astray)
 {
-    const uint32_t rows = n < 2u * wall->max_tracks ? n : 2u * wall->max_tracks, known = match(wall, tracks, rows);
-    const bool has_motion = known >= LEAST && learn_motion(wall, rays, rows, known) && knows_axis(wall);
+    const uint32_t rows = n < 2u * wall->max_tracks ? n : 2u * wall->max_tracks;
+    if (wall->ends)
+        begin_stride(wall);
+    const uint32_t known = match(wall, tracks, rows);
+    const bool is_fitted = known >= LEAST && learn_motion(wall, rays, rows, known);
+    const bool has_motion = is_fitted && knows_axis(wall);
     uint32_t kept = 0, found = 0;
+    wall->frames++;
+    wall->ends = !is_fitted || has_strode(wall);
     for (uint32_t j = 0; j < rows && kept < wall->max_tracks; j++)
         if (tracks[j].status != PF_TRACK_LOST) {
             const uint32_t before = wall->pair[j];
             wall->pair[kept] = (uint16_t)j;
             move_on(wall, kept++, tracks[j].id, &rays[j], before, has_motion);
         }
-    wall->n = kept;
+    wall->now.n = kept;
     wall->light_q16 = part_of_light(wall);
     for (uint32_t k = 0; k < kept; k++) {
-        const int64_t walked[2] = {wall->off[3u * k], wall->off[3u * k + 1u]};
+        const int64_t walked[2] = {wall->now.off[3u * k], wall->now.off[3u * k + 1u]};
         wall->value[k] = stray_of(wall, k, walked, project, camera);
     }
     const uint64_t median = kept ? pf_value_of_rank(wall->value, kept, kept / 2u) : 0;
@@ -494,9 +535,9 @@ void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_pr
 {
     for (uint32_t j = 0, k = 0; j < n; j++) {
         int64_t walked[2];
-        while (k < wall->n && wall->id[k] < tracks[j].id)
+        while (k < wall->now.n && wall->now.id[k] < tracks[j].id)
             k++;
-        if (k == wall->n || wall->id[k] != tracks[j].id || tracks[j].status != PF_TRACK_TRACKED)
+        if (k == wall->now.n || wall->now.id[k] != tracks[j].id || tracks[j].status != PF_TRACK_TRACKED)
             continue;
         walked_alone(wall, k, walked);
         const pf_point_q16 way = way_of(wall, k, walked, project, camera);

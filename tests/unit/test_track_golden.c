@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0x6C567C3Au
+#define GOLDEN 0xD58CC961u
 
 void setUp(void) {}
 void tearDown(void) {}

@@ -235,16 +235,30 @@ void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, c
 /* --- The wall -----------------------------------------------------------------------------------------------------
  * Tracks that walk off it. In a light that goes with the camera, relief that shines along with the paint moves like a
  * wall a little nearer; one track alone cannot tell. All of them tell how the camera moved in its round tube. */
-typedef struct pf_wall { /* private */
-    uint32_t max_tracks, n;
-    int64_t motion[10];  /* of the last frame; the last four are the tube's axis */
-    int64_t known[4][4]; /* of the axis, as information, in units of ... */
+typedef struct pf_wall_axis { /* private: of the tube, as seen where a stride began */
+    int64_t at[4];
+    int64_t known[4][4]; /* of it, as information, in units of ... */
     int64_t variance;    /* ... this; 0: nothing is known */
-    uint32_t light_q16;  /* the part of what tracks walk off alone that is the light's doing */
-    uint64_t *id;        /* tracks of the last frame, ids ascending */
+} pf_wall_axis;
+
+typedef struct pf_wall_list { /* private: tracks of a frame */
+    uint32_t n;
+    uint64_t *id; /* ascending */
     pf_ray_q30 *ray;
     int32_t *off; /* how far each has walked since its first sight, three numbers: its cotangent, its azimuth; and what
                    * its cotangent fell, Q24 */
+} pf_wall_list;
+
+typedef struct pf_wall { /* private */
+    uint32_t max_tracks;
+    uint32_t frames;     /* of the stride so far */
+    bool ends;           /* it ends with the last of them */
+    int64_t motion[10];  /* in it; the last four are the tube's axis */
+    pf_wall_axis before; /* as was known when it began, */
+    pf_wall_axis axis;   /* and now */
+    pf_wall_list from;   /* the frame with which it began, */
+    pf_wall_list now;    /* and the last */
+    uint32_t light_q16;  /* the part of what tracks walk off alone that is the light's doing */
     int64_t *scratch;
     uint32_t *value;
     uint16_t *pair;
@@ -254,7 +268,7 @@ typedef struct pf_wall { /* private */
 #define PF_WALL_MOST_Q16 65536u
 
 /* Bytes of workspace for a tracker of so many tracks. */
-#define PF_WALL_BYTES(max_tracks) (40u * (size_t)(max_tracks) + 9216u)
+#define PF_WALL_BYTES(max_tracks) (72u * (size_t)(max_tracks) + 9216u)
 
 /* The workspace is aligned to 8 and stays the caller's. PF_ERR_ARGUMENT: max_tracks is not 1..2048; PF_ERR_SPACE. Call
  * it again after pf_tracker_reset. */
