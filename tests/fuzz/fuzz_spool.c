@@ -1,26 +1,32 @@
 /* The spool's recovery from whatever a power cut or a worn medium has left of its file and its log, and its salvage of
  * what a file that it sets aside still has. The files live in memory (a file system of SQLite's own kind, and what the
- * spool asks of the system's by name), so an input costs no disk. The input's first byte chooses what lies
- * there: a spool as kill -9 leaves it, with its log, or one that was closed; a valid header before bytes of the input's
- * own; whether the log's checksums are repaired, so that damage behind them is reached. The rest are changes and cuts.
- * Invariants: opening ends, well or with an error in words; an object that is handed out has the bytes of its name, and
- * rows ascend; what is stored in undamaged files without an error is there after opening again, and they lose
- * nothing. */
+ * spool asks of the system's by name), so an input costs no disk. The input's first byte chooses what lies there: a
+ * spool as kill -9 leaves it, with its log, or one that was closed; a valid header before bytes of the input's own;
+ * whether the log's checksums are repaired, so that damage behind them is reached; whether it cannot be written at
+ * first; and after how many reads the first program that opens it is told of an error that passes. The rest are changes
+ * and cuts. Invariants: opening ends, well or with an error in words; an object that is handed out has the bytes of its
+ * name, and rows ascend; what is stored in undamaged files without an error is there after opening again, and they lose
+ * nothing, also by errors that pass; what cannot be written is read; after any damage the next object
+ * is stored.
+ */
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/drivers/spool.h"
 
+#include <errno.h>
+#include <limits.h>
 #include <sanitizer/asan_interface.h>
 #include <sqlite3.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 enum { FILES = 10, CAPACITY = 1 << 19, OBJECTS = 6, OBJECT_MAX = 6000, WALK_MAX = 64, NAME_MAX_BYTES = 48 };
 enum { DATABASE = 0, LOG = 1 };
-enum { CLOSED = 1, REPAIRED = 2, RAW = 4 };
+enum { CLOSED = 1, REPAIRED = 2, RAW = 4, READ_ONLY = 8, READS_SHIFT = 4 };
 
 typedef struct image {
     uint8_t bytes[CAPACITY];
@@ -32,6 +38,8 @@ typedef struct image {
 #define PATH "/spool.db"
 
 static image disk[FILES], crashed[2], closed;
+static bool is_read_only;
+static int reads_left = INT_MAX;
 static uint32_t aside; /* files of a name other than the spool's and its log's */
 static uint8_t names[OBJECTS][32];
 
@@ -127,6 +135,8 @@ static int close_file(sqlite3_file *f)
 static int read_file(sqlite3_file *f, void *to, int n, sqlite3_int64 at)
 {
     const image *i = ((file *)f)->image;
+    if (reads_left != INT_MAX && reads_left-- <= 0)
+        return SQLITE_IOERR_NOMEM;
     size_t have = (size_t)at < i->n ? i->n - (size_t)at : 0, take = have < (size_t)n ? have : (size_t)n;
     memset(to, 0, (size_t)n);
     memcpy(to, i->bytes + (take ? at : 0), take);
@@ -136,6 +146,8 @@ static int read_file(sqlite3_file *f, void *to, int n, sqlite3_int64 at)
 static int write_file(sqlite3_file *f, const void *from, int n, sqlite3_int64 at)
 {
     image *i = ((file *)f)->image;
+    if (is_read_only)
+        return SQLITE_IOERR_WRITE;
     if (at + n > CAPACITY)
         return SQLITE_FULL;
     if ((size_t)at > i->n)
@@ -149,6 +161,8 @@ static int write_file(sqlite3_file *f, const void *from, int n, sqlite3_int64 at
 static int cut_file(sqlite3_file *f, sqlite3_int64 n)
 {
     image *i = ((file *)f)->image;
+    if (is_read_only)
+        return SQLITE_IOERR_TRUNCATE;
     if ((size_t)n < i->n)
         i->n = (size_t)n;
     return SQLITE_OK;
@@ -263,7 +277,7 @@ static int open_file(sqlite3_vfs *vfs, const char *path, sqlite3_file *f, int fl
 {
     image *i = path != NULL ? find_image(path) : NULL;
     (void)vfs;
-    if (i == NULL && flags & SQLITE_OPEN_CREATE)
+    if (i == NULL && flags & SQLITE_OPEN_CREATE && (path == NULL || !is_read_only))
         i = make_image(path != NULL && strstr(path, "-journal") == NULL ? path : "");
     f->pMethods = NULL;
     if (i == NULL)
@@ -280,6 +294,8 @@ static int delete_file(sqlite3_vfs *vfs, const char *path, int sync)
     image *i = find_image(path);
     (void)vfs;
     (void)sync;
+    if (is_read_only)
+        return SQLITE_IOERR_DELETE;
     if (i != NULL)
         forget(i);
     return SQLITE_OK;
@@ -330,7 +346,8 @@ static sqlite3_vfs memory = {.iVersion = 1,
                              .xFullPathname = full_path,
                              .xRandomness = random_bytes,
                              .xSleep = sleep_a_while,
-                             .xCurrentTime = tell_time};
+                             .xCurrentTime = tell_time},
+                   unlocked; /* takes the place of the system's */
 
 /* ---- the same files by name, for the spool itself: the linker gives its calls to these (--wrap) */
 
@@ -340,13 +357,16 @@ int __real_rename(const char *from, const char *to);
 int __wrap_rename(const char *from, const char *to);
 FILE *__real_fopen(const char *path, const char *how);
 FILE *__wrap_fopen(const char *path, const char *how);
+int __real_stat(const char *path, struct stat *told);
+int __wrap_stat(const char *path, struct stat *told);
 bool __wrap_pf_file_sync_folder(const char *path);
 
 int __wrap_access(const char *path, int how)
 {
-    if (!is_ours(path))
-        return strcmp(path, "/") == 0 ? 0 : __real_access(path, how);
-    return find_image(path) != NULL ? 0 : -1;
+    if (!is_ours(path) && strcmp(path, "/") != 0)
+        return __real_access(path, how);
+    errno = how == W_OK && is_read_only ? EROFS : ENOENT;
+    return errno != EROFS && (!is_ours(path) || find_image(path) != NULL) ? 0 : -1;
 }
 
 int __wrap_rename(const char *from, const char *to)
@@ -354,6 +374,10 @@ int __wrap_rename(const char *from, const char *to)
     if (!is_ours(from))
         return __real_rename(from, to);
     image *i = find_image(from), *old = find_image(to);
+    if (is_read_only) {
+        errno = EROFS;
+        return -1;
+    }
     require(strlen(to) < NAME_MAX_BYTES);
     if (i == NULL)
         return -1;
@@ -369,6 +393,15 @@ FILE *__wrap_fopen(const char *path, const char *how)
         return __real_fopen(path, how);
     image *i = find_image(path);
     return i != NULL && i->n > 0 ? fmemopen(i->bytes, i->n, how) : NULL;
+}
+
+int __wrap_stat(const char *path, struct stat *told)
+{
+    if (!is_ours(path))
+        return __real_stat(path, told);
+    const image *i = find_image(path);
+    *told = (struct stat){.st_size = i != NULL ? (off_t)i->n : 0};
+    return i != NULL ? 0 : -1;
 }
 
 bool __wrap_pf_file_sync_folder(const char *path)
@@ -398,13 +431,19 @@ static size_t make_object(uint32_t id, uint8_t *bytes, uint8_t name[32])
     return n;
 }
 
-static pf_status put(const pf_spool *spool, uint32_t id, uint8_t name[32])
+static pf_status put_over(const pf_spool *spool, uint32_t id, const pf_spool_victim *victims, uint32_t count,
+                          uint8_t name[32])
 {
     static uint8_t bytes[OBJECT_MAX];
     const pf_spool_rank rank = {id % 3, id};
     size_t n = make_object(id, bytes, name);
-    return spool->ops->exchange(spool->self, NULL, 0, 2, name, bytes, n, id % 2 ? &rank : NULL, "survey", &id,
+    return spool->ops->exchange(spool->self, victims, count, 2, name, bytes, n, id % 2 ? &rank : NULL, "survey", &id,
                                 sizeof id);
+}
+
+static pf_status put(const pf_spool *spool, uint32_t id, uint8_t name[32])
+{
+    return put_over(spool, id, NULL, 0, name);
 }
 
 /* How many objects come out, each checked; whether `name` is among them. */
@@ -444,6 +483,10 @@ static void begin(void)
     require(sqlite3_config(SQLITE_CONFIG_LOOKASIDE, 0, 0) == SQLITE_OK);
     require(sqlite3_config(SQLITE_CONFIG_MALLOC, &memory_methods) == SQLITE_OK);
     require(sqlite3_vfs_register(&memory, 1) == SQLITE_OK);
+    unlocked = memory;
+    unlocked.zName = "unix-none";
+    require(sqlite3_vfs_unregister(sqlite3_vfs_find("unix-none")) == SQLITE_OK);
+    require(sqlite3_vfs_register(&unlocked, 0) == SQLITE_OK);
     require(open_spool(&spool));
     for (uint32_t id = 0; id < OBJECTS; id++)
         require(put(&spool, id, names[id]) == PF_OK);
@@ -534,6 +577,40 @@ static void lay(const image *from, const char *name)
     i->n = from->n;
 }
 
+/* A program that can write nothing: it hands out what is there, and takes nothing. */
+static void read_only(bool is_whole)
+{
+    pf_spool spool;
+    uint8_t name[32] = {0};
+    bool is_there;
+    is_read_only = true;
+    if (open_spool(&spool)) {
+        uint32_t intact = walk(&spool, name, &is_there);
+        require(!is_whole || intact == OBJECTS - 1);
+        require(put(&spool, 100, name) != PF_OK && spool.ops->remove(spool.self, 2) != PF_OK);
+        require(spool.ops->keep_all(spool.self) != PF_OK && spool.ops->error(spool.self)[0] != '\0');
+        spool.ops->close(spool.self);
+    } else {
+        require(!is_whole);
+    }
+    is_read_only = false;
+}
+
+/* A program whose reads fail after so many, for a moment. */
+static void fail_for_a_moment(int reads)
+{
+    pf_spool spool;
+    uint8_t name[32] = {0};
+    bool is_there;
+    reads_left = reads;
+    if (open_spool(&spool)) {
+        (void)walk(&spool, name, &is_there);
+        (void)put(&spool, 200, name);
+        spool.ops->close(spool.self);
+    }
+    reads_left = INT_MAX;
+}
+
 static void try_files(const uint8_t *data, size_t size)
 {
     pf_spool spool;
@@ -557,14 +634,22 @@ static void try_files(const uint8_t *data, size_t size)
     }
     if (how & REPAIRED && disk[LOG].is_there)
         repair_log(&disk[LOG]);
+    if (how & READ_ONLY)
+        read_only(is_whole);
+    if (how >> READS_SHIFT)
+        fail_for_a_moment(4 * (how >> READS_SHIFT));
     if (!open_spool(&spool)) {
         require(!is_whole);
         return;
     }
     uint32_t intact = walk(&spool, name, &is_there);
-    require(!is_whole || intact == OBJECTS - 1);
+    require(!is_whole || intact >= OBJECTS - 1);
     (void)spool.ops->get(spool.self, "survey", value, sizeof value, &n);
-    (void)spool.ops->victims(spool.self, 0, 9, 1000, victims, &count);
+    (void)spool.ops->set(spool.self, "other", data, size < 40 ? size : 40);
+    if (spool.ops->victims(spool.self, 0, 9, 1000, victims, &count) == PF_OK && how & CLOSED)
+        (void)put_over(&spool, 99, victims, count, name);
+    else
+        (void)spool.ops->keep_all(spool.self);
     (void)spool.ops->remove(spool.self, 2);
     pf_status status = put(&spool, 100 + how % 7u, name);
     require(!is_whole || status == PF_OK);
