@@ -364,6 +364,8 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
                 if event["height"] - SURELY * event["height_sigma"] < LEAST_HEIGHT * d:
                     continue
+                # The highest of n points of a heap is so much lower than its top.
+                event["height_sigma"] = math.hypot(event["height_sigma"], 3 * event["height"] / event["points"])
                 ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
                 if not (sign > 0 and ringed and event["length"] < 0.3 * d):
                     out.append(event)
