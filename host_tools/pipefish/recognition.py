@@ -103,12 +103,13 @@ class Recognition:
     """One object in one scene.
 
     object, scene  name and index
-    score          0 to 1: share of the model that is found, weighted by coverage and correlation, by its best view
+    score          0 to 1: share of the model that is found, weighted by coverage, correlation and, below 6 nats,
+                   evidence, by its best view
     sum_score      the sum over the views
     present        whether score is at least the threshold
     view           label of the best view
-    segments       of the best view, and of others whose score is at least the threshold, as far as they are where the
-                   best view's best segment has the object; best first
+    segments       of the best view, and of others whose segments' scores together are at least the threshold, as far as
+                   they are where the best view's best segment has the object; best first
     extent         outline of the whole model, (N,2) each, carried into the scene by the affine map that fits the
                    matches of the view that has most of them: where all of the object would be, hidden parts too
     outline        (N,2) each: what is seen of a present object, its bare parts too: the extent, settled by the
@@ -252,7 +253,7 @@ def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], thresh
     x, y, radius = found[best]["place"]
     parts = [
         [s for s in f["segments"] if math.hypot(s["centre"][0] - x, s["centre"][1] - y) <= radius]
-        if k == best or scores[k] >= threshold
+        if k == best or sum(s["score"] for s in f["segments"]) >= threshold
         else []
         for k, f in enumerate(found)
     ]

@@ -257,6 +257,7 @@ Groups group_matches(const std::vector<Match> &matches, const Options &o)
                 {{mesh.vertices[static_cast<size_t>(t[0])], mesh.vertices[static_cast<size_t>(t[1])],
                   mesh.vertices[static_cast<size_t>(t[2])]},
                  out.count});
+        out.vertices.push_back(static_cast<int>(own.size()));
         out.count++;
     }
     label_all(matches, o, out);

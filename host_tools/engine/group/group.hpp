@@ -27,6 +27,7 @@ struct Triangle {
 struct Groups {
     int count = 0;                   // largest first, by triangles
     std::vector<int> label;          // of each match: its group or -1
+    std::vector<int> vertices;       // of each group, how many
     std::vector<Triangle> triangles; // of groups only; their corners are the matches that stand for their cells
 };
 

@@ -233,37 +233,50 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
     out.matches = static_cast<int>(matches.size());
     const Groups groups = group_matches(matches, options.grouping);
     const std::vector<double> evident = evidence(matches, groups);
-    std::vector<Candidate> found;
-    for (int g = 0; g < groups.count; g++)
-        if (evident[static_cast<size_t>(g)] >= options.evidence) {
-            found.push_back(measure(matches, groups, g, model, scene, options.reach));
-            found.back().segment.evidence = evident[static_cast<size_t>(g)];
+    std::vector<Candidate> found, small;
+    double most = -1; // evidence
+    for (int g = 0; g < groups.count; g++) {
+        const double e = evident[static_cast<size_t>(g)];
+        const bool large = groups.vertices[static_cast<size_t>(g)] >= options.vertices;
+        if (!large && e <= most)
+            continue;
+        Candidate c = measure(matches, groups, g, model, scene, options.reach);
+        c.segment.evidence = e;
+        if (large && c.segment.matches >= options.matches * options.vertices && c.segment.score >= options.least) {
+            found.push_back(std::move(c));
+        } else if (e > most) {
+            most = e;
+            small.assign(1, std::move(c));
         }
+    }
+    const auto counting = [&](const Segment &s) {
+        return s.score * std::exp(std::min(0.0, s.evidence - options.evidence));
+    };
+    const bool none =
+        std::ranges::none_of(found, [&](const Candidate &c) { return c.segment.evidence >= options.evidence; });
+    if (none && !small.empty() && most >= options.evidence)
+        found = std::move(small);
+    else if (found.empty() && !small.empty())
+        out.score = counting(small.front().segment);
     std::stable_sort(found.begin(), found.end(),
                      [](const Candidate &a, const Candidate &b) { return a.segment.score > b.segment.score; });
     Mask taken(scene.mask().size(), 0);
     Fit fit;
     for (Candidate &c : found) {
         const int area = cv::countNonZero(c.scene);
-        if (c.segment.score < options.least || 2 * cv::countNonZero(c.scene & taken) > area)
+        if (2 * cv::countNonZero(c.scene & taken) > area)
             continue;
         if (out.segments.empty())
             out.place = place_of(c.fit.map(), model, scene);
         else if (!out.place.has(c.segment.centre))
             continue;
         taken |= c.scene;
-        out.score = std::min(1.0, out.score + c.segment.score);
+        out.score = std::min(1.0, out.score + counting(c.segment));
         fit.add(c.fit);
         out.segments.push_back(std::move(c.segment));
     }
-    if (!out.segments.empty()) {
+    if (!out.segments.empty())
         out.extent = extent(fit.map(), model, scene);
-    } else if (groups.count > 0) {
-        const auto most = std::max_element(evident.begin(), evident.end());
-        const Candidate c =
-            measure(matches, groups, static_cast<int>(most - evident.begin()), model, scene, options.reach);
-        out.score = c.segment.score * std::exp(std::min(0.0, *most - options.evidence));
-    }
     return out;
 }
 

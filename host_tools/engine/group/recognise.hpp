@@ -55,9 +55,9 @@ struct Place {
 };
 
 struct Recognition {
-    int seeds = 0, matches = 0;    // before grouping
-    double score = 0;              // sum over `segments`, at most 1; without any: see RecogniseOptions::evidence
-    std::vector<Segment> segments; // best first; none overlaps a better one by half, all are in `place`
+    int seeds = 0, matches = 0; // before grouping
+    double score = 0; // sum over `segments` of what counts of them, at most 1; without any: of the most evident group
+    std::vector<Segment> segments; // largest score first; none overlaps a better one by half, all are in `place`
     Place place;                   // by the best segment's map
     // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
     // of the object would be.
@@ -69,9 +69,14 @@ struct RecogniseOptions {
     Options grouping;
     int seeds = 300;
     double least = 0.002; // score of a segment
-    // Nats from which a group is a segment: some 20 groups form by chance in a pair, the best of all had 4. Where none
-    // has them the score is that of the group with most, made smaller by the factor exp(what it lacks).
+    // Nats from which a group counts in full: some 20 form by chance in a pair, the best of all had 4. Its score counts
+    // by the factor exp(what it lacks).
     double evidence = 6;
+    // Vertices of a segment, and pixels matched for each. Of what is smaller there is one at most, where it is evident
+    // and nothing larger is: beside a larger one it is as likely on another side of the object, or where its
+    // print repeats, and turns the map of the whole.
+    int vertices = 30;
+    double matches = 12.5;
     double reach = 3; // pixels of the coarser image by which supports go beyond their triangles
 };
 
