@@ -190,6 +190,14 @@ def test_no_motion_is_made_up_where_one_of_five_agrees() -> None:
     assert dominant_geometry(cells_of_a_motion(0.2, 0)[0], "motion", 1.0) is None
 
 
+def test_what_is_off_the_motion_goes_by_itself_only_where_a_scene_is_likely_rigid() -> None:
+    """Where nine of ten cells agree; where six do, the rest may be right and move otherwise."""
+    rigid, moving = (cells_of_a_motion(share, 0)[0] for share in (0.9, 0.6))
+    by_itself, asked = (pf.filter_matches(rigid, least=0, geometry=name) for name in ("rigid", "motion"))
+    assert np.array_equal(by_itself.xy1, asked.xy1) and len(asked) < 0.92 * len(rigid)
+    assert len(pf.filter_matches(moving, least=0, geometry="rigid")) == len(moving)
+
+
 # ---- what is said of matches
 
 
@@ -262,6 +270,6 @@ def test_the_command_refuses_a_plane_or_motion_of_a_fisheye(tmp_path: Path, caps
     np.savetxt(tmp_path / "pose.txt", POSE)
     arguments = ["match", str(tmp_path / "a.png"), str(tmp_path / "a.png"), "-o", str(tmp_path / "out")]
     arguments += ["--profile", str(tmp_path / "camera.json"), "--pose", str(tmp_path / "pose.txt")]
-    for name in ("plane", "motion"):
+    for name in ("plane", "motion", "rigid"):
         assert main([*arguments, "--filter", name]) == 1
-        assert "--filter: plane and motion are of pinhole pictures" in capsys.readouterr().err
+        assert "--filter: plane, motion and rigid are of pinhole pictures" in capsys.readouterr().err
