@@ -1,5 +1,5 @@
 """Growth takes the best first by classes of correlation, the last found first within one. Beside an order that has a
-class for nearly each value, which is a heap's, that costs nothing."""
+class for each value, which is a heap's, that costs nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipefish import _engine
 
 Floats = NDArray[np.float64]
 WIDTH, HEIGHT = 260, 200
-STRICT = 1 << 22  # classes: four neighbouring floats near 1 share one
+STRICT = 1 << 24  # classes: each float from 0.5 to 1 has one to itself
 
 
 def scene() -> tuple[list[NDArray[np.float32]], Floats]:
@@ -58,10 +58,8 @@ def test_classes_of_correlation_are_as_good_an_order_as_a_strict_one(mode: str) 
         place.append(to)
         grown.append(len(x))
         right.append((np.median(off[off < 1]), np.mean(off < 1)))
-        if classes == STRICT:  # few share a class: a heap's order
-            assert len(np.unique((got["zncc"] * STRICT).astype(int))) > 0.97 * len(x)
     both = np.isfinite(place[0][..., 0]) & np.isfinite(place[1][..., 0])
-    assert both.sum() >= 0.98 * max(grown)
+    assert both.sum() >= 0.99 * max(grown)
     assert np.mean(np.linalg.norm(place[0][both] - place[1][both], axis=1) < 0.5) >= 0.98
     (median, share), (strict_median, strict_share) = right
-    assert share > 0.9 and share >= strict_share - 0.005 and median <= 1.02 * strict_median
+    assert share > 0.9 and share >= strict_share - 0.002 and median <= 1.01 * strict_median
