@@ -64,7 +64,9 @@ def select(m: Matches, keep: Mask) -> Matches:
 
 
 def _check(m: Matches) -> None:
-    """Raises ArgumentError for matches that are not within their images."""
+    """Raises ArgumentError for matches that are not within their images, or that no growth leaves so."""
+    if not ((m.parent >= -1) & (m.parent < np.arange(len(m)))).all():
+        raise ArgumentError("m: parent: not all -1 or a match found before")
     for name, shape in (("xy1", m.shape1), ("xy2", m.shape2)):
         xy = getattr(m, name)
         if not ((xy >= -0.5) & (xy < np.array(shape[::-1]) - 0.5)).all():

@@ -175,7 +175,7 @@ def cells_of_a_motion(share: float, seed: int) -> tuple[pf.Matches, NDArray[np.b
     n, none = len(xy1), np.empty((0, 2))
     number = np.arange(n)
     maps, good = np.tile(np.eye(2), (n, 1, 1)), np.ones(n)
-    m = pf.Matches(xy1, xy2, maps, good, number, number, pf.Seeds(none, none), "ok", (192, 256), (192, 256))
+    m = pf.Matches(xy1, xy2, maps, good, np.full(n, -1), number, pf.Seeds(none, none), "ok", (192, 256), (192, 256))
     return m, np.repeat(right, 64)
 
 
@@ -238,7 +238,8 @@ def test_finding_seeds_names_the_argument(options: dict, what: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("xy1", np.nan), ("xy1", -50.0), ("xy2", 1e30), ("xy2", np.nan), ("affine", np.nan)]
+    ("name", "value"),
+    [("xy1", np.nan), ("xy1", -50.0), ("xy2", 1e30), ("xy2", np.nan), ("affine", np.nan), ("parent", 3)],
 )
 def test_filters_name_what_is_wrong_with_matches(turned: tuple, name: str, value: float) -> None:
     one, two, _, m = turned
