@@ -8,7 +8,7 @@ from typing import Any
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError
 
-FILTERS = ("consistent", "both-ways", "plane", "motion", "unique", "none")
+FILTERS = ("consistent", "rigid", "both-ways", "plane", "motion", "unique", "none")
 MODES = ("adaptive", "constant", "translation")  # matching.MODES, whose import costs time here
 
 
@@ -25,11 +25,13 @@ def run_match(args: argparse.Namespace) -> Result:
     cameras = tuple(Camera.load(path) for path in args.profile) if args.profile else None
     if cameras and len(cameras) > 2:
         raise ArgumentError(f"--profile: {len(cameras)} profiles for two pictures")
-    filters = set(args.filter or ["consistent"])
-    if {"plane", "motion"} <= filters:
-        raise ArgumentError("--filter: plane or motion, not both")
-    if filters & {"plane", "motion"} and any(camera.radial != "perspective" for camera in cameras or ()):
-        raise ArgumentError("--filter: plane and motion are of pinhole pictures, the --profile is of none")
+    pinhole = all(camera.radial == "perspective" for camera in cameras or ())
+    filters = set(args.filter or (["consistent", "rigid"] if pinhole else ["consistent"]))
+    geometries = [name for name in ("plane", "motion", "rigid") if name in filters]
+    if len(geometries) > 1:
+        raise ArgumentError(f"--filter: {' or '.join(geometries)}, not both")
+    if geometries and not pinhole:
+        raise ArgumentError("--filter: plane, motion and rigid are of pinhole pictures, the --profile is of none")
     if "none" in filters and len(filters) > 1:
         raise ArgumentError("--filter: none, or others, not both")
     options = {"mode": args.mode, "zncc_min": args.zncc, "threads": args.threads}
@@ -42,9 +44,11 @@ def run_match(args: argparse.Namespace) -> Result:
             m,
             least=None if "consistent" in filters else 0,
             back=match_back(one, two, m, *geometry, **options) if "both-ways" in filters else None,
-            geometry=next(iter(filters & {"plane", "motion"}), None),
             rivals=match_rivals(one, two, m, *geometry, threads=args.threads) if "unique" in filters else None,
         )
+    consistent = len(m)
+    if geometries:
+        m = filter_matches(m, least=0, geometry=geometries[0])
     files = write_matches(args.output, one, two, m)
     document = statistics(m) | {"files": files}
     doubts = {
@@ -54,6 +58,11 @@ def run_match(args: argparse.Namespace) -> Result:
     rows: list[tuple[str, object]] = [
         ("matches", f"{len(m)}, {100 * document['share_of_image1']:.1f} % of {args.first}"),
         *([("filtered", f"{grown - len(m)} of {grown} taken away")] if len(m) < grown else []),
+        *(
+            [("motion", f"one fits most: of these {consistent - len(m)} are off it (--filter consistent keeps them)")]
+            if geometries == ["rigid"] and len(m) < consistent
+            else []
+        ),
         ("status", m.status),
         *([("doubt", doubts[m.status])] if m.status in doubts else []),
         ("seeds", f"{len(m.seeds)}, {document['seeds_that_grew']} of them grew"),
@@ -103,7 +112,8 @@ def add_match(commands: Any) -> None:
         choices=FILTERS,
         help="keep only matches that fit their neighbours and are no small islands (consistent), that the reverse "
         "direction confirms (both-ways), that fit the one plane or rigid motion that most agree with (pinhole "
-        "pictures), or that are the only place on their epipolar line which looks like it (unique: by --pose, else by "
-        "the rigid motion that most agree with); may be repeated; none: all that grew [consistent]",
+        "pictures; rigid: the motion, if 78 % of the picture agree), or that are the only place on their epipolar line "
+        "which looks like it (unique: by --pose, else by the rigid motion that most agree with); may be repeated; "
+        "none: all that grew [consistent and rigid; with a fisheye's --profile consistent]",
     )
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

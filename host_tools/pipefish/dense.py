@@ -20,7 +20,7 @@ from pipefish.dense_regions import ellipses, find_regions
 from pipefish.dense_steps import find_steps
 from pipefish.dense_unroll import THETA_LEAST, Unroller, View, box_sum, keyframe_picture
 from pipefish.errors import ArgumentError
-from pipefish.matching import Seeds, match_quasi_dense
+from pipefish.matching import Seeds, match_quasi_dense, whole
 from pipefish.wallmodel import Floats, WallModel, predicted_seeds, seen_on_wall
 
 Rays = tuple[Floats, Floats]  # origins and directions of unit length, (K,3) each
@@ -231,6 +231,13 @@ def _triangulated(unroller: Unroller, rays: tuple[Rays, Rays]) -> tuple[Floats, 
     return s, clock, deviation, MATCH_PX * footprint * gain
 
 
+def _medians(key: NDArray[np.int64], value: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    """Of each key, of values in order of key and value: where its values start, how many they are, their median."""
+    start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    count = np.diff(np.r_[start, len(key)])
+    return start, count, 0.5 * (value[start + (count - 1) // 2] + value[start + count // 2])
+
+
 def _per_cell(
     key: NDArray[np.int64], value: Floats, sigma: Floats, share: float
 ) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
@@ -238,9 +245,7 @@ def _per_cell(
     one match, which is that of what they share. share: of a window, a match's own."""
     order = np.lexsort((value, key))
     key, value, sigma = key[order], value[order], sigma[order]
-    start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-    count = np.diff(np.r_[start, len(key)])
-    middle = 0.5 * (value[start + (count - 1) // 2] + value[start + count // 2])
+    start, count, middle = _medians(key, value)
     mean_sigma = np.add.reduceat(sigma, start) / count
     keep = count >= 3
     effective = np.maximum(count * share, 1)
@@ -257,10 +262,8 @@ def _fused(
     key, value, sigma, common = key[order], value[order], sigma[order], shared * one[order]
     if not len(key):
         return np.full(cells, np.nan), np.full(cells, np.nan), np.zeros(cells, int), 1.0
-    start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-    count = np.diff(np.r_[start, len(key)])
+    start, count, median = _medians(key, value)
     group = np.repeat(np.arange(len(start)), count)
-    median = 0.5 * (value[start + (count - 1) // 2] + value[start + count // 2])
     telling = count >= SPREAD_LEAST
     normal = np.abs(value - median[group]) / (sigma * np.sqrt(1 - 1 / count[group]).clip(0.5))
     scatter = float(np.median(normal[telling[group]]) / 0.6745) if telling.any() else 1.0
@@ -336,6 +339,7 @@ def dense_wall(
         raise ArgumentError(f"poses: shape {pose_list.shape} is not (n,3,4), or not finite")
     if not (math.isfinite(scale) and 0.5 <= scale <= 8):
         raise ArgumentError(f"scale: {scale} is not within 0.5 to 8")
+    threads = whole("threads", threads, 1)
     diameter = 2 * wall.mean_radius
     unroller = Unroller(camera, wall, scale)
     if not 0 <= calibration_px <= 10:

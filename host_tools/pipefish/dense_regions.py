@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipefish.dense_harmonics import fitted_harmonics, harmonics
 from pipefish.wallmodel import Floats
 
 if TYPE_CHECKING:
@@ -61,27 +62,13 @@ def find_regions(found: DenseWall) -> list[dict[str, float]]:
 def ellipses(found: DenseWall) -> Floats:
     """(rows, columns): mean, shift and ellipse through the cells a quarter diameter to either side, robustly, but not
     beyond a step of the pipe."""
-    angle = np.outer([1, 1, 2, 2], found.clock) - np.array([[0], [np.pi / 2], [0], [np.pi / 2]])
-    terms = np.vstack([np.ones(len(found.clock)), np.cos(angle)])  # (5, columns)
-    value = np.nan_to_num(found.deviation)
-    weight = np.isfinite(found.deviation).astype(float)
     spacing = found.s[1] - found.s[0] if len(found.s) > 1 else 1.0
     half = max(1, round(0.5 * found.wall.mean_radius / spacing))
-    row = np.arange(len(value))
-    cuts = np.concatenate([[0], np.searchsorted(found.s, sorted(r["s"] for r in found.steps)), [len(value)]])
+    row = np.arange(len(found.s))
+    cuts = np.concatenate([[0], np.searchsorted(found.s, sorted(r["s"] for r in found.steps)), [len(row)]])
     section = np.searchsorted(cuts, row, "right")
     low, high = np.maximum(row - half, cuts[section - 1]), np.minimum(row + half + 1, cuts[section])
-    fitted = np.zeros_like(value)
-    bound = 3 * max(float(np.median(found.sigma[weight > 0])), 1e-9) if weight.any() else 1.0
-    for _ in range(4):
-        h = np.einsum("ac,rc,bc->rab", terms, weight, terms)
-        g = np.einsum("ac,rc->ra", terms, weight * value)
-        h, g = (np.array([a[i:j].sum(axis=0) for i, j in zip(low, high, strict=True)]) for a in (h, g))
-        h += 1e-3 * np.eye(5)
-        fitted = np.linalg.solve(h, g[..., None])[..., 0] @ terms
-        off = (value - fitted) / bound
-        weight = np.isfinite(found.deviation) / (1 + off**2) ** 2  # a deposit does not bend the ellipse
-    return fitted
+    return fitted_harmonics(found, low, high) @ harmonics(found.clock)
 
 
 def wrapped_box(values: Floats) -> Floats:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipefish.dense_harmonics import fitted_harmonics
 from pipefish.wallmodel import Floats
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def find_steps(found: DenseWall) -> list[dict[str, float]]:
     step."""
     spacing = float(found.s[1] - found.s[0]) if len(found.s) > 1 else 1.0
     reach = max(LEAST_ROWS, round(REACH * found.wall.mean_radius / spacing))
-    rows, good = _rows(found)
+    row = np.arange(len(found.s))
+    rows, good = fitted_harmonics(found, row, row + 1)[:, :3], np.isfinite(found.deviation).mean(axis=1) >= 0.5
     places = np.arange(reach + GAP, len(rows) - reach - GAP + 1)
     jump = np.full((len(places), 3), np.nan)
     for k, place in enumerate(places):
@@ -54,24 +56,6 @@ def find_steps(found: DenseWall) -> list[dict[str, float]]:
                 {"s": s, "step": float(np.hypot(up, right)), "clock": clock, "widening": widening, "sigma": sigma}
             )
     return sorted(out, key=lambda r: r["s"])
-
-
-def _rows(found: DenseWall) -> tuple[Floats, NDArray[np.bool_]]:
-    """(rows, 3): mean, and the first harmonic towards twelve and three o'clock, of each row, by weights that fall with
-    the residual; (rows,) where half of a row's cells are measured."""
-    angle = np.outer([1, 1, 2, 2], found.clock) - np.array([[0], [np.pi / 2], [0], [np.pi / 2]])
-    terms = np.vstack([np.ones(len(found.clock)), np.cos(angle)])
-    measured = np.isfinite(found.deviation)
-    value = np.where(measured, found.deviation, 0)
-    bound = 3 * float(np.median(found.sigma[measured])) if measured.any() else 1.0
-    weight = measured.astype(float)
-    fitted = np.zeros((len(value), 5))
-    for _ in range(5):
-        h = np.einsum("ac,rc,bc->rab", terms, weight, terms) + 1e-3 * np.eye(5)
-        g = np.einsum("ac,rc->ra", terms, weight * value)
-        fitted = np.linalg.solve(h, g[..., None])[..., 0]
-        weight = measured / (1 + ((value - fitted @ terms) / max(bound, 1e-9)) ** 2) ** 2
-    return fitted[:, :3], measured.mean(axis=1) >= 0.5
 
 
 def _place(rows: Floats, jump: Floats, place: int) -> int:

@@ -404,6 +404,7 @@ def test_places_and_points_of_a_bent_oval_wall_are_inverse() -> None:
         ({"poses": POSES[:1]}, "poses: no two keyframes"),
         ({"cell": 1.0}, "cell: 1.0"),
         ({"scale": 99.0}, "scale: 99"),
+        ({"threads": 0}, "threads: 0 is not at least 1"),
         ({"images": lambda k: np.zeros((64, 64), np.uint8)}, "keyframe 0: 64x64 is not the camera's 512x512"),
     ],
 )

@@ -175,7 +175,7 @@ def cells_of_a_motion(share: float, seed: int) -> tuple[pf.Matches, NDArray[np.b
     n, none = len(xy1), np.empty((0, 2))
     number = np.arange(n)
     maps, good = np.tile(np.eye(2), (n, 1, 1)), np.ones(n)
-    m = pf.Matches(xy1, xy2, maps, good, number, number, pf.Seeds(none, none), "ok", (192, 256), (192, 256))
+    m = pf.Matches(xy1, xy2, maps, good, np.full(n, -1), number, pf.Seeds(none, none), "ok", (192, 256), (192, 256))
     return m, np.repeat(right, 64)
 
 
@@ -188,6 +188,14 @@ def test_a_motion_is_found_that_two_of_five_agree_with(seed: int) -> None:
 
 def test_no_motion_is_made_up_where_one_of_five_agrees() -> None:
     assert dominant_geometry(cells_of_a_motion(0.2, 0)[0], "motion", 1.0) is None
+
+
+def test_what_is_off_the_motion_goes_by_itself_only_where_a_scene_is_likely_rigid() -> None:
+    """Where nine of ten cells agree; where six do, the rest may be right and move otherwise."""
+    rigid, moving = (cells_of_a_motion(share, 0)[0] for share in (0.9, 0.6))
+    by_itself, asked = (pf.filter_matches(rigid, least=0, geometry=name) for name in ("rigid", "motion"))
+    assert np.array_equal(by_itself.xy1, asked.xy1) and len(asked) < 0.92 * len(rigid)
+    assert len(pf.filter_matches(moving, least=0, geometry="rigid")) == len(moving)
 
 
 # ---- what is said of matches
@@ -230,7 +238,8 @@ def test_finding_seeds_names_the_argument(options: dict, what: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("xy1", np.nan), ("xy1", -50.0), ("xy2", 1e30), ("xy2", np.nan), ("affine", np.nan)]
+    ("name", "value"),
+    [("xy1", np.nan), ("xy1", -50.0), ("xy2", 1e30), ("xy2", np.nan), ("affine", np.nan), ("parent", 3)],
 )
 def test_filters_name_what_is_wrong_with_matches(turned: tuple, name: str, value: float) -> None:
     one, two, _, m = turned
@@ -262,6 +271,6 @@ def test_the_command_refuses_a_plane_or_motion_of_a_fisheye(tmp_path: Path, caps
     np.savetxt(tmp_path / "pose.txt", POSE)
     arguments = ["match", str(tmp_path / "a.png"), str(tmp_path / "a.png"), "-o", str(tmp_path / "out")]
     arguments += ["--profile", str(tmp_path / "camera.json"), "--pose", str(tmp_path / "pose.txt")]
-    for name in ("plane", "motion"):
+    for name in ("plane", "motion", "rigid"):
         assert main([*arguments, "--filter", name]) == 1
-        assert "--filter: plane and motion are of pinhole pictures" in capsys.readouterr().err
+        assert "--filter: plane, motion and rigid are of pinhole pictures" in capsys.readouterr().err

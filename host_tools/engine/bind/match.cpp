@@ -171,6 +171,7 @@ void bind_match(nb::module_ &m)
         .def_rw("texture", &Options::texture)
         .def_rw("epipolar_px", &Options::epipolar_px)
         .def_rw("refine_seeds", &Options::refine_seeds)
+        .def_rw("classes", &Options::classes)
         .def_rw("threads", &Options::threads);
     m.def(
         "find_seeds",

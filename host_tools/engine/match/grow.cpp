@@ -26,32 +26,33 @@ constexpr size_t kStride = kBlockMost + 3;                           // of the b
 class Queue
 {
 public:
-    Queue() { std::fill(std::begin(head_), std::end(head_), -1); }
+    explicit Queue(int classes) : head_(static_cast<size_t>(classes), -1) {}
 
     void push(float zncc, int id)
     {
-        const int k = std::clamp(static_cast<int>(zncc * kClasses), 0, kClasses - 1);
-        next_.push_back(head_[k]); // ids come in order: this is next_[id]
-        head_[k] = id;
+        const auto classes = static_cast<int>(head_.size());
+        const int k = std::clamp(static_cast<int>(zncc * static_cast<float>(classes)), 0, classes - 1);
+        int &head = head_[static_cast<size_t>(k)];
+        next_.push_back(head); // ids come in order: this is next_[id]
+        head = id;
         top_ = std::max(top_, k);
     }
 
     // -1 when empty.
     int pop()
     {
-        while (top_ >= 0 && head_[top_] < 0)
+        while (top_ >= 0 && head_[static_cast<size_t>(top_)] < 0)
             top_--;
         if (top_ < 0)
             return -1;
-        const int id = head_[top_];
-        head_[top_] = next_[static_cast<size_t>(id)];
+        int &head = head_[static_cast<size_t>(top_)];
+        const int id = head;
+        head = next_[static_cast<size_t>(id)];
         return id;
     }
 
 private:
-    static constexpr int kClasses = 1024;
-    int head_[kClasses];
-    std::vector<int> next_;
+    std::vector<int> head_, next_;
     int top_ = -1;
 };
 
@@ -98,7 +99,7 @@ class Grower
 {
 public:
     Grower(const ScaleStack &first, const ScaleStack &second, const Options &options, const Epipolar *epipolar)
-        : first_(first), second_(second), options_(options), epipolar_(epipolar)
+        : first_(first), second_(second), options_(options), epipolar_(epipolar), queue_(options.classes)
     {
         free_.first = textured(first.image(), options.texture);
         free_.second = textured(second.image(), options.texture);

@@ -42,7 +42,8 @@ struct Options {
     double sigma_min = 0.01;  // least deviation within a window
     double epipolar_px = 1.0; // largest Sampson distance, where there is an Epipolar
     bool refine_seeds = true;
-    int threads = 1; // for what is independent; results do not depend on it
+    int classes = 1024; // of correlation, best first; within one, the last found first, which keeps to the cache
+    int threads = 1;    // for what is independent; results do not depend on it
 };
 
 struct Match {
