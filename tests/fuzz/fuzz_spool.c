@@ -7,7 +7,7 @@
  * and cuts. Invariants: opening ends, well or with an error in words; an object that is handed out has the bytes of its
  * name, and rows ascend; what is stored in undamaged files without an error is there after opening again, and they lose
  * nothing, also by errors that pass; what cannot be written is read; after any damage the next object
- * is stored.
+ * is stored; damage to pages that hold no objects, only an index of them, costs none.
  */
 #include "pipefish/drivers/sha256.h"
 #include "pipefish/drivers/spool.h"
@@ -42,6 +42,7 @@ static bool is_read_only;
 static int reads_left = INT_MAX;
 static uint32_t aside; /* files of a name other than the spool's and its log's */
 static uint8_t names[OBJECTS][32];
+static uint64_t index_pages; /* of the closed spool: bits, page 1 is bit 0 */
 
 static void require(bool holds)
 {
@@ -215,7 +216,50 @@ static int characteristics(sqlite3_file *f)
     return 0;
 }
 
-static const sqlite3_io_methods methods = {.iVersion = 1,
+/* The index of a log, which a connection that does not lock its file for good has outside itself: salvage's, one at a
+ * time. */
+
+enum { INDEX_PARTS = 4, INDEX_PART = 1 << 15 };
+
+static _Alignas(16) uint8_t log_index[INDEX_PARTS][INDEX_PART];
+static int index_parts;
+
+static int map_index(sqlite3_file *f, int part, int size, int extend, void volatile **at)
+{
+    (void)f;
+    *at = NULL;
+    if (size != INDEX_PART || part >= INDEX_PARTS)
+        return SQLITE_IOERR_SHMMAP;
+    for (; part >= index_parts && extend; index_parts++)
+        memset(log_index[index_parts], 0, INDEX_PART);
+    if (part < index_parts)
+        *at = log_index[part];
+    return SQLITE_OK;
+}
+
+static int lock_index(sqlite3_file *f, int at, int n, int how)
+{
+    (void)f;
+    (void)at;
+    (void)n;
+    (void)how;
+    return SQLITE_OK;
+}
+
+static void order_index(sqlite3_file *f)
+{
+    (void)f;
+}
+
+static int unmap_index(sqlite3_file *f, int is_last)
+{
+    (void)f;
+    (void)is_last;
+    index_parts = 0;
+    return SQLITE_OK;
+}
+
+static const sqlite3_io_methods methods = {.iVersion = 2,
                                            .xClose = close_file,
                                            .xRead = read_file,
                                            .xWrite = write_file,
@@ -227,7 +271,11 @@ static const sqlite3_io_methods methods = {.iVersion = 1,
                                            .xCheckReservedLock = is_locked,
                                            .xFileControl = control_file,
                                            .xSectorSize = sector_size,
-                                           .xDeviceCharacteristics = characteristics};
+                                           .xDeviceCharacteristics = characteristics,
+                                           .xShmMap = map_index,
+                                           .xShmLock = lock_index,
+                                           .xShmBarrier = order_index,
+                                           .xShmUnmap = unmap_index};
 
 static bool is_ours(const char *path)
 {
@@ -468,6 +516,19 @@ static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
     return intact;
 }
 
+static void find_indices(void)
+{
+    sqlite3 *db = NULL;
+    sqlite3_stmt *q = NULL;
+    require(sqlite3_open_v2(PATH, &db, SQLITE_OPEN_READWRITE, NULL) == SQLITE_OK);
+    require(sqlite3_prepare_v2(db, "SELECT rootpage FROM sqlite_schema WHERE type = 'index'", -1, &q, NULL) ==
+            SQLITE_OK);
+    while (sqlite3_step(q) == SQLITE_ROW)
+        index_pages |= UINT64_C(1) << (sqlite3_column_int(q, 0) - 1);
+    sqlite3_finalize(q);
+    require(sqlite3_close(db) == SQLITE_OK && index_pages != 0);
+}
+
 static void begin(void)
 {
     static const sqlite3_mem_methods memory_methods = {.xMalloc = take_piece,
@@ -496,6 +557,7 @@ static void begin(void)
     crashed[LOG] = disk[LOG];
     spool.ops->close(spool.self);
     closed = disk[DATABASE];
+    find_indices();
     heap_kept = heap_used;
     pieces_kept = pieces;
 }
@@ -547,10 +609,12 @@ static void repair_log(image *log)
     }
 }
 
-/* Changes of six bytes: which file and what, where (24 bits), value, how many. Returns whether anything was changed. */
-static bool damage(const uint8_t *data, size_t size)
+/* Changes of six bytes: which file and what, where (24 bits), value, how many. Returns whether anything was changed;
+ * *pages: in which pages, 0 if not in any in particular. */
+static bool damage(const uint8_t *data, size_t size, uint64_t *pages)
 {
-    bool has_changed = false;
+    bool has_changed = false, is_anywhere = false;
+    *pages = 0;
     for (; size >= 6; data += 6, size -= 6) {
         image *i = &disk[data[0] & 1];
         size_t at = (size_t)data[1] | (size_t)data[2] << 8 | (size_t)data[3] << 16;
@@ -559,6 +623,10 @@ static bool damage(const uint8_t *data, size_t size)
         at %= i->n;
         if (data[0] & 2) /* the cell pointers and headers of pages are where it hurts */
             at = at / 4096 * 4096 + at % 64;
+        if ((data[0] & 0xF0) == 0xF0 || at / 4096 != (at + 7) / 4096 || at / 4096 >= 64)
+            is_anywhere = true;
+        else
+            *pages |= UINT64_C(1) << at / 4096;
         if ((data[0] & 0xF0) == 0xF0)
             i->n = at; /* cut short */
         else
@@ -566,6 +634,7 @@ static bool damage(const uint8_t *data, size_t size)
                 i->bytes[at + k] = (uint8_t)(data[0] & 4 ? i->bytes[at + k] ^ data[4] : data[4]);
         has_changed = true;
     }
+    *pages = is_anywhere ? 0 : *pages;
     return has_changed;
 }
 
@@ -618,7 +687,8 @@ static void try_files(const uint8_t *data, size_t size)
     uint8_t name[32] = {0}, value[64];
     uint32_t count;
     size_t n;
-    bool is_there, is_whole = true;
+    bool is_there, is_spared, is_whole = true;
+    uint64_t pages = 0;
     for (uint32_t i = 0; i < FILES; i++)
         forget(&disk[i]);
     const uint8_t how = data[0];
@@ -630,10 +700,11 @@ static void try_files(const uint8_t *data, size_t size)
         memcpy(disk[DATABASE].bytes + 100, data + 1, length);
         is_whole = length == 0;
     } else {
-        is_whole = !damage(data + 1, size - 1);
+        is_whole = !damage(data + 1, size - 1, &pages);
     }
     if (how & REPAIRED && disk[LOG].is_there)
         repair_log(&disk[LOG]);
+    is_spared = is_whole || (how & CLOSED && pages != 0 && (pages & ~index_pages) == 0);
     if (how & READ_ONLY)
         read_only(is_whole);
     if (how >> READS_SHIFT)
@@ -646,8 +717,9 @@ static void try_files(const uint8_t *data, size_t size)
     require(!is_whole || intact >= OBJECTS - 1);
     (void)spool.ops->get(spool.self, "survey", value, sizeof value, &n);
     (void)spool.ops->set(spool.self, "other", data, size < 40 ? size : 40);
+    uint32_t left = OBJECTS - 2; /* at least: row 1 was removed, and row 2 will be */
     if (spool.ops->victims(spool.self, 0, 9, 1000, victims, &count) == PF_OK && how & CLOSED)
-        (void)put_over(&spool, 99, victims, count, name);
+        left += (put_over(&spool, 99, victims, count, name) == PF_OK) - count;
     else
         (void)spool.ops->keep_all(spool.self);
     (void)spool.ops->remove(spool.self, 2);
@@ -657,10 +729,13 @@ static void try_files(const uint8_t *data, size_t size)
         status = put(&spool, 100 + how % 7u, name);
     require(status == PF_OK || status == PF_ERR_SPACE);
     spool.ops->close(spool.self);
+    left += status == PF_OK;
     if (open_spool(&spool)) {
-        (void)walk(&spool, name, &is_there);
-        require(is_there || !is_whole);
+        intact = walk(&spool, name, &is_there);
+        require(!is_spared || (is_there && intact >= left));
         spool.ops->close(spool.self);
+    } else {
+        require(!is_spared);
     }
 }
 
