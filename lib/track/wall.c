@@ -26,7 +26,7 @@
 #define TILT     (ONE / 25)              /* rad */
 #define STRIDE   ((int32_t)ONE / 16)     /* of the axis, a step: as far as it is linear */
 #define FARTHEST ((int32_t)ONE * 6 / 10) /* no camera stands nearer to the wall */
-#define PRIOR    ((int64_t)1 << 40)      /* no prior is stronger */
+#define PRIOR    ((int64_t)1 << 37)      /* no prior is stronger: times what v may be off, 62 bits */
 #define FAINTLY  ((int64_t)1 << 10)      /* a pivot, Q30 */
 #define FADE     3                       /* tenths of a radius: on the way what is known of the axis fades to a third */
 #define ALIKE    4          /* strides in which the same tracks err alike: each adds such a part of what it says */
@@ -222,6 +222,19 @@ static void gather(const pf_pair *pair, uint32_t n, const int64_t v[UNKNOWN], in
     }
 }
 
+/* What is known of the axis for residuals of this variance: by what factor, Q16. No prior becomes stronger than PRIOR.
+ */
+static int64_t ratio_to(const pf_wall_axis *before, int64_t variance_q48)
+{
+    const int64_t ratio = before->variance > 0 ? variance_q48 / ((before->variance >> 16) + 1) : 0;
+    int64_t most = 1, bound;
+    for (int32_t i = 0; i < 4; i++)
+        most = before->known[i][i] > most ? before->known[i][i] : most;
+    bound = PRIOR * 65536 / most;
+    bound = bound < 1 << 22 ? bound : 1 << 22;
+    return ratio < bound ? ratio : bound;
+}
+
 /* Fits the stride's motion so far; v begins at what is expected. */
 static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v[UNKNOWN])
 {
@@ -233,8 +246,7 @@ static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v
         const int64_t scale = scale_of(wall, pair, n, v), way = expected < 0 ? -expected : expected;
         variance = scale * scale;
         gather(pair, n, v, variance, a, g);
-        const int64_t ratio = before->variance > 0 ? variance / ((before->variance >> 16) + 1) : 0;
-        const int64_t ratio_q16 = ratio < 1 << 22 ? ratio : 1 << 22;
+        const int64_t ratio_q16 = ratio_to(before, variance);
         for (int32_t k = 0; k < AXIS; k++) {
             const int64_t aim = k < 3 ? 0 : k < 5 ? mul(v[AXIS + 2 + k - 3], v[5]) : 0;
             const int64_t p = prior_of(variance / 2, k < 3 ? TURN : k < 5 ? way / ASIDE + 200 : ONE);
