@@ -79,7 +79,7 @@ class Segment:
     area            of the segment in the model's picture, as a share of the model
     coverage        share of its textured pixels that are matched, counted in the coarser picture
     correlation     mean of (zncc - 0.5) / 0.5
-    evidence        that its neighbours agree by more than chance, nats
+    evidence        that its neighbours agree by more than chance: calibrated, from 6 on it counts in full
     matches         pixels
     centre          x, y of its middle in the scene
     view            label of the model's picture
@@ -103,11 +103,11 @@ class Recognition:
     """One object in one scene.
 
     object, scene  name and index
-    score          0 to 1: share of the model that is found, weighted by coverage, correlation and, below 6 nats,
-                   evidence, by its best view
+    score          0 to 1: share of the model that is found, weighted by coverage, correlation and, where that is
+                   below 6, evidence, by its best view; without segments at most 0.002
     sum_score      the sum over the views
-    present        whether score is at least the threshold
-    view           label of the best view
+    present        whether there are segments and score is at least the threshold
+    view           label of the best view: of those with segments, if there are any
     segments       of the best view, and of others whose segments' scores together are at least the threshold, as far as
                    they are where the best view's best segment has the object; best first
     extent         outline of the whole model, (N,2) each, carried into the scene by the affine map that fits the
@@ -249,7 +249,7 @@ def _ahead(pool: ThreadPoolExecutor, scenes: Sequence[ArrayLike], max_pixels: in
 
 def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], threshold: float) -> Recognition:
     scores = np.array([f["score"] for f in found])
-    best = int(np.argmax(scores))
+    best = max(range(len(found)), key=lambda k: (bool(found[k]["segments"]), scores[k]))
     x, y, radius = found[best]["place"]
     parts = [
         [s for s in f["segments"] if math.hypot(s["centre"][0] - x, s["centre"][1] - y) <= radius]
@@ -265,7 +265,7 @@ def _combine(model: ObjectModel, scene: int, found: list[dict[str, Any]], thresh
         scene=scene,
         score=float(scores[best]),
         sum_score=float(scores.sum()),
-        present=bool(scores[best] >= threshold),
+        present=bool(found[best]["segments"] and scores[best] >= threshold),
         view=model.labels[best],
         segments=segments,
         extent=found[most]["extent"],

@@ -16,6 +16,7 @@ from PIL import Image
 
 import pipefish as pf
 from pipefish.cli import main
+from pipefish.recognition import _combine
 from test_match import grid, noisy, waves
 
 Floats = NDArray[np.float64]
@@ -153,6 +154,37 @@ def test_a_small_piece_counts_where_it_fits_and_not_where_chance_matches_as_many
     assert rose.score > 0.02
     assert thorn.matches > 50 and thorn.segments == []
     assert 0 < thorn.score < 0.001  # ranked all the same: what is absent does not tie with what is hardly seen
+
+
+@pytest.mark.parametrize("seed", [0, 12, 15])
+def test_nothing_is_present_that_was_not_matched_anywhere(seed: int) -> None:
+    """16 x 16 pixels, all of an object, matched by a group too small to be evident: its share alone would do."""
+    rng = np.random.default_rng(seed)
+    picture = noisy(waves(grid(160, 140), 60 + seed), 3)
+    x, y = rng.integers(40, 80, 2)[::-1]
+    own, there = (slice(y, y + 16), slice(x, x + 16)), (slice(60, 76), slice(100, 116))
+    mask, shown = np.zeros(picture.shape, bool), scene(None)[0].copy()
+    mask[own] = True
+    shown[there] = np.clip(picture[own] + rng.normal(0, 0.03, (16, 16)), 0, 1)
+    model = pf.ObjectModel("it", [(picture, mask)])
+    (r,) = pf.recognise([model], [shown])
+    assert r.matches > 0 and r.segments == [] and not r.present
+    assert 0 < r.score <= 0.002  # what a segment has to have
+    (r,) = pf.recognise([model], [shown], threshold=0)
+    assert not r.present
+
+
+def test_a_view_without_segments_does_not_hide_those_of_others() -> None:
+    """It has no place: everything else would lie outside of it."""
+    segment = {"score": 0.055, "area": 0.1, "coverage": 0.8, "correlation": 0.7, "evidence": 20.0, "matches": 500}
+    segment |= {"centre": (50.0, 60.0), "model_contours": [], "scene_contours": [np.zeros((3, 2))]}
+    nowhere = {"score": 0.06, "place": (0, 0, 0), "segments": [], "extent": [], "seeds": 1, "matches": 100}
+    seen = {"score": 0.055, "place": (50, 60, 40), "segments": [segment], "extent": [np.zeros((4, 2))]}
+    seen |= {"seeds": 5, "matches": 900}
+    model = pf.ObjectModel("it", [model_picture("rose")] * 2, ["a", "b"])
+    r = _combine(model, 0, [nowhere, seen], 0.05)
+    assert r.present and r.view == "b" and [s.view for s in r.segments] == ["b"]
+    assert len(r.extent) == 1 and r.box() is not None
 
 
 def test_evidence_is_that_of_the_smaller_picture() -> None:

@@ -281,8 +281,9 @@ std::vector<double> evidence(const std::vector<Match> &matches, const Groups &gr
             const Vector2d edge = to.one - from.one;
             off[g] += (from.back * (to.two - from.two) - edge).norm() / (3 * edge.norm());
         }
+        const double det = (std::abs(at[0].det) + std::abs(at[1].det) + std::abs(at[2].det)) / 3;
         triangles[g]++;
-        weight[g] += std::min(1.0, std::abs(at[0].det)); // cells of image 1 crowd in a smaller image 2
+        weight[g] += std::min(1.0, det); // cells of image 1 crowd in a smaller image 2
     }
     // Normal distributions in the plane, of deviations s and s0: ln(s0 / s)^2 - 1 + (s / s0)^2 for each independent
     // edge, of which a mesh has one a vertex, that is one for two triangles.

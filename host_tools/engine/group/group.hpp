@@ -34,8 +34,10 @@ struct Groups {
 // Depends on the matches and their order alone. O(n log n).
 Groups group_matches(const std::vector<match::Match> &matches, const Options &options);
 
-// How much better the agreement of each group's neighbours is explained by one surface than by chance: log likelihood
-// ratio, nats, at least 0. What matches by chance passes the test of agreement just so.
+// How much better the agreement of each group's neighbours is explained by one surface than by chance: in nats, at
+// least 0. What matches by chance passes the test of agreement just so. No likelihood ratio, though of its form: the
+// surface's deviation is fitted on the group, and groups are chosen by agreement. From where on it counts is
+// calibrated.
 std::vector<double> evidence(const std::vector<match::Match> &matches, const Groups &groups);
 
 } // namespace pipefish::group

@@ -257,7 +257,7 @@ Recognition recognise(const Prepared &model, const Prepared &scene, const Recogn
     if (none && !small.empty() && most >= options.evidence)
         found = std::move(small);
     else if (found.empty() && !small.empty())
-        out.score = counting(small.front().segment);
+        out.score = std::min(options.least, counting(small.front().segment));
     std::stable_sort(found.begin(), found.end(),
                      [](const Candidate &a, const Candidate &b) { return a.segment.score > b.segment.score; });
     Mask taken(scene.mask().size(), 0);

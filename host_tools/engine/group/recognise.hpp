@@ -41,7 +41,7 @@ struct Segment {
     double area = 0;        // of the support, as a share of the model
     double coverage = 0;    // matched share of the textured pixels of the support, counted in the coarser image
     double correlation = 0; // mean of (zncc - 0.5) / 0.5
-    double evidence = 0;    // that it is no chance: nats
+    double evidence = 0;    // that it is no chance, see evidence()
     int matches = 0;
     cv::Point2d centre;                                 // of its support in the scene
     std::vector<std::vector<cv::Point2d>> model, scene; // outlines, pixels of the pictures that were given
@@ -56,7 +56,9 @@ struct Place {
 
 struct Recognition {
     int seeds = 0, matches = 0; // before grouping
-    double score = 0; // sum over `segments` of what counts of them, at most 1; without any: of the most evident group
+    // Sum over `segments` of what counts of them, at most 1; without any: of the most evident group, at most `least`,
+    // so that it ranks what is absent and nothing more.
+    double score = 0;
     std::vector<Segment> segments; // largest score first; none overlaps a better one by half, all are in `place`
     Place place;                   // by the best segment's map
     // The model's own outline carried into the scene by the affine map that fits the matches of all segments: where all
@@ -69,8 +71,8 @@ struct RecogniseOptions {
     Options grouping;
     int seeds = 300;
     double least = 0.002; // score of a segment
-    // Nats from which a group counts in full: some 20 form by chance in a pair, the best of all had 4. Its score counts
-    // by the factor exp(what it lacks).
+    // From which a group counts in full, set on judged pictures: some 20 form by chance in a pair, the best of all
+    // had 4. Its score counts by the factor exp(what it lacks).
     double evidence = 6;
     // Vertices of a segment, and pixels matched for each. Of what is smaller there is one at most, where it is evident
     // and nothing larger is: beside a larger one it is as likely on another side of the object, or where its
