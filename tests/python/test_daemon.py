@@ -448,16 +448,17 @@ def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawle
 def wake_ups_per_second(crawler: Crawler, seconds: float) -> float:
     """How often the daemon's threads have gone to sleep, a second."""
 
-    def count() -> int:
-        total = 0
+    def count() -> dict[Path, int]:
+        counts = {}
         for task in Path(f"/proc/{crawler.process.pid}/task").glob("*/status"):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
-                total += int(task.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
-        return total
+                counts[task] = int(task.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
+        return counts
 
     first, begin = count(), time.monotonic()
     time.sleep(seconds)
-    return (count() - first) / (time.monotonic() - begin)
+    last, end = count(), time.monotonic()
+    return sum(last[task] - first[task] for task in first.keys() & last.keys()) / (end - begin)
 
 
 def test_a_daemon_without_a_host_sleeps(crawler: Crawler):
