@@ -98,16 +98,16 @@ static void feed(pf_guard *g, uint64_t now)
 
 static void look(pf_guard *g, uint64_t now)
 {
-    const char *hung = pf_pulse_hung(now, g->hang_ns);
-    if (hung != g->hung) {
+    const char *hung = pf_pulse_hung(now, g->hang_ns), *before = atomic_load(&g->hung);
+    if (hung != before) {
         char text[64];
         if (hung != NULL)
             pf_log(PF_LOG_ERROR, "the %s thread hangs: the watchdogs are not fed", hung);
         else
-            pf_log(PF_LOG_WARNING, "the %s thread goes on", g->hung);
+            pf_log(PF_LOG_WARNING, "the %s thread goes on", before);
         (void)snprintf(text, sizeof text, "STATUS=%s%s", hung != NULL ? "hangs: " : "well", hung != NULL ? hung : "");
         tell_manager(g, text);
-        g->hung = hung;
+        atomic_store(&g->hung, hung);
     }
     if (hung == NULL)
         feed(g, now);
@@ -118,16 +118,15 @@ static void *watch(void *argument)
     pf_guard *g = argument;
     const struct timespec tick = {0, TICK_NS};
     (void)prctl(PR_SET_NAME, "watchdogs");
-    uint64_t up_ns = UINT64_MAX; /* from when on the start counts as one that came up */
+    bool was_ready = false;
     while (!atomic_load(&g->is_over)) {
-        const uint64_t now = pf_now();
-        if (up_ns == UINT64_MAX && atomic_load(&g->is_ready)) {
+        const bool is_ready = atomic_load(&g->is_ready);
+        if (is_ready && !was_ready)
             g->manager_due = 0;
-            up_ns = now + PF_RECALL_UP_NS;
-        }
-        look(g, now);
-        if (now > up_ns)
-            pf_recall_up(g->recall, g->hung == NULL);
+        was_ready = is_ready;
+        look(g, pf_now());
+        if (atomic_load(&g->hung) != NULL)
+            pf_recall_up(g->recall, false); /* waits for the disk: nothing is fed now */
         (void)nanosleep(&tick, NULL);
     }
     return NULL;

@@ -21,13 +21,13 @@ typedef struct pf_guard {
     int device; /* -1 = none */
     uint64_t device_ns, device_due;
     uint64_t hang_ns;
-    const char *hung; /* the thread that was last seen hanging */
+    const char *_Atomic hung; /* the thread that hangs; NULL = none */
 } pf_guard;
 
 /* Starts a thread that feeds them, from before the daemon's devices are opened: what hangs there is the main thread.
  * Until pf_guard_ready the service manager is told to go on waiting. `device`: "/dev/watchdog", or "" for none, barks
- * after `hang_s`; a thread hangs after half of it. `recall` is told from PF_RECALL_UP_NS after pf_guard_ready on, and
- * lives until pf_guard_close. False: error[n] says why. */
+ * after `hang_s`; a thread hangs after half of it. `recall` is told as long as one does, and lives until
+ * pf_guard_close; while all is well the thread touches no disk. False: error[n] says why. */
 bool pf_guard_open(pf_guard *guard, pf_recall *recall, const char *device, uint32_t hang_s, char *error, size_t n);
 
 /* The daemon is up. */

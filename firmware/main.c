@@ -385,9 +385,10 @@ static bool has_host(pf_daemon *d)
 }
 
 /* Returns when it is time to exit. */
-static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
+static void supervise(pf_daemon *d, pf_pipeline *pipeline, const pf_guard *guard, int signals)
 {
     uint64_t status_due = 0, drain_ns = (uint64_t)d->config.daemon.drain_s * 1000000000u, drain_end = 0;
+    const uint64_t up_ns = pf_now() + PF_RECALL_UP_NS;
     uint64_t host_ns = pf_now(); /* when a host was there last */
     bool is_terminated = false, must_exit = false;
     pf_gpio_state gpio = {0};
@@ -397,6 +398,8 @@ static void supervise(pf_daemon *d, pf_pipeline *pipeline, int signals)
         if (poll(&fd, 1, TICK_MS) > 0)
             take_signal(d, signals, &is_terminated);
         pf_pulse_work();
+        if (pf_now() > up_ns && atomic_load(&guard->hung) == NULL)
+            pf_recall_up(d->recall, true);
         if (pf_now() - d->started_ns > PF_RECALL_GOOD_NS)
             pf_recall_good(d->recall, &d->config);
         note_status(d, &status_due, false);
@@ -459,7 +462,7 @@ static int run_survey(pf_daemon *d, const pf_survey *survey, const pf_survey *be
     }
     if (is_good) {
         pf_guard_ready(guard);
-        supervise(d, pipeline, signals);
+        supervise(d, pipeline, guard, signals);
     } else {
         pf_log(PF_LOG_ERROR, "%s", error);
     }

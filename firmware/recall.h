@@ -33,7 +33,8 @@ void pf_recall_begin(pf_recall *recall, const char *folder, const char *file);
 /* Whether this start is to take good.ini; path[n] becomes its name. */
 bool pf_recall_is_due(const pf_recall *recall, char *path, size_t n);
 
-/* The daemon is up, and no thread hangs; or one does. By the guard: main may be the one. */
+/* The daemon is up, and no thread hangs: by main. Or one does: by the guard, for main may be the one, again and again
+ * until it goes on; main then takes it back. Either waits for the disk when that is news. */
 void pf_recall_up(pf_recall *recall, bool is_well);
 
 /* The run with these settings was good. By main. */

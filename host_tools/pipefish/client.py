@@ -174,11 +174,11 @@ class Client:
 
     def _turn(self, most_s: float) -> None:
         # What has come while the caller was busy, or stood still, is heard before the link looks at the clock: it is a
-        # sign of life.
-        self._hear(0.0)
+        # sign of life. The caller may have waited for just that: it is asked before anything else is waited for.
+        heard = self._hear(0.0)
         now = time.monotonic_ns()
         blocked = self._flush(now)
-        wait_s = min(most_s, max(0.0, (self.link.deadline(now) - now) / 1e9))
+        wait_s = 0.0 if heard else min(most_s, max(0.0, (self.link.deadline(now) - now) / 1e9))
         if self._pending:
             wait_s = min(wait_s, 0.01)
         if blocked:
@@ -187,13 +187,14 @@ class Client:
         self._answer_pending()
         self._flush(time.monotonic_ns())
 
-    def _hear(self, wait_s: float) -> None:
-        """Serves what the device says within that time."""
+    def _hear(self, wait_s: float) -> bool:
+        """Serves what the device says within that time; True: it said something."""
         readable, _, _ = select.select([self.transport], [], [], wait_s)
         now = time.monotonic_ns()
         data = self.transport.read() if readable else b""
         for event in self.link.input(data, now):
             self._serve(event)
+        return bool(readable)
 
     def _flush(self, now: int) -> bool:
         """Gives the line what the link wants to send. True while the line takes no more."""

@@ -190,12 +190,18 @@ class Crawl:
         board.run("systemctl enable pipefishd && systemctl start pipefishd")
 
     def wait_for(self, text: str, timeout: float = 300) -> float:
-        """Until the daemon's log of this start has `text`; the seconds that took."""
+        """Until the daemon's log of this start has `text`; the seconds that took. Fails, after one last look, when the
+        process of start_daemon() has ended."""
         start, timeout = time.monotonic(), timeout * self.patience
+        looked, has_ended = start, False
         log = self.board.share / f"daemon{self.starts - 1}.log"
         while text not in log.read_text(errors="replace"):
-            if time.monotonic() - start > timeout:
-                raise AssertionError(f"the daemon did not say '{text}':\n{self.board.logs()}\n{self.board.console()}")
+            if has_ended or time.monotonic() - start > timeout:
+                ended = " (it has ended)" if has_ended else ""
+                said = f"{self.board.logs()}\n{self.board.console()}"
+                raise AssertionError(f"the daemon did not say '{text}'{ended}:\n{said}")
+            if self.daemon and time.monotonic() - looked > 2:  # a command costs the emulated board time
+                has_ended, looked = not self.board.is_running(self.daemon), time.monotonic()
             time.sleep(0.05)
         return time.monotonic() - start
 

@@ -33,14 +33,21 @@ def real_data() -> Callable[[str], Path]:
     return find
 
 
+@pytest.fixture(autouse=True)
+def no_daemon_outlives_its_test() -> Iterator[None]:
+    """Nor one that failed: two cores have no room for what goes on for ever."""
+    yield
+    while Crawler.made:
+        crawler = Crawler.made.pop()
+        if crawler.process is not None:
+            crawler.kill()
+
+
 @pytest.fixture
-def crawler(tmp_path: Path) -> Iterator[Crawler]:
+def crawler(tmp_path: Path) -> Crawler:
     """A daemon with a recording of 40 frames."""
     write_recording(tmp_path / "survey.y4m", 40)
-    crawler = Crawler(tmp_path)
-    yield crawler
-    if crawler.process is not None:
-        crawler.kill()
+    return Crawler(tmp_path)
 
 
 @pytest.fixture
@@ -51,7 +58,7 @@ def own_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def device(tmp_path: Path, own_keys: None, request: pytest.FixtureRequest) -> Iterator[Crawler]:
+def device(tmp_path: Path, own_keys: None, request: pytest.FixtureRequest) -> Crawler:
     """A daemon on a network that serves until it is told to stop, with a small survey in its spool.
 
     Its parameter is link.keepalive_ms: after four of them in silence a host counts as gone."""
@@ -67,9 +74,7 @@ def device(tmp_path: Path, own_keys: None, request: pytest.FixtureRequest) -> It
     )
     crawler.start()
     wait_for_log(crawler, "127.0.0.1:")
-    yield crawler
-    if crawler.process.poll() is None:
-        crawler.kill()
+    return crawler
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,7 @@
 """pipefishd as a child process, its recordings, and a host that keeps what it gets: for the tests of the daemon."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import json
@@ -12,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from pipefish.client import ACCEPT, STORED, Client, ObjectHandlers
 from pipefish.transport import TcpTransport, TransportClosed
 
 ROOT = Path(__file__).resolve().parents[2]
+T = TypeVar("T")
 START, KEYFRAME, END = 1, 2, 3
 SEED = int(os.environ.get("PIPEFISH_TEST_SEED", "0"))  # of the moments of killing; the long tests try others
 PATIENCE_S = 60  # for what a busy machine may delay at will: only what will never come is waited for so long
@@ -84,7 +88,12 @@ def reserve_port() -> socket.socket:
 
 
 class Crawler:
-    """A daemon's settings and its process, which may be started again and again on the same spool."""
+    """A daemon's settings and its process, which may be started again and again on the same spool.
+
+    made   all of the test in progress: a fixture kills what is left of them
+    """
+
+    made: ClassVar[list[Crawler]] = []
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self._reserved = reserve_port()
@@ -110,6 +119,7 @@ class Crawler:
             sections.setdefault(section, []).append(f"{name} = {value}")
         self.config.write_text("".join(f"[{s}]\n" + "\n".join(lines) + "\n" for s, lines in sections.items()))
         self.process: subprocess.Popen[bytes] | None = None
+        self.made.append(self)
 
     def start(self, *arguments: str) -> None:
         with self.log.open("ab") as log:
@@ -159,17 +169,17 @@ class Store(ObjectHandlers):
         self.previews.append(preview)
 
     @contextlib.contextmanager
-    def client(self) -> Iterator[Client]:
+    def client(self, crawler: Crawler) -> Iterator[Client]:
         """A fresh client, as after the host's own restart; waits for the daemon's port."""
         client = Client(self.transport("127.0.0.1", self.port), self)
-        end = time.monotonic() + PATIENCE_S
-        while True:
-            try:
+
+        def is_open() -> bool:
+            with contextlib.suppress(TransportClosed):
                 client.open()
-                break
-            except TransportClosed:
-                assert time.monotonic() < end, "the daemon does not listen"
-                time.sleep(0.01)
+                return True
+            return False
+
+        wait_until(crawler, is_open)
         try:
             yield client
         finally:
@@ -202,24 +212,35 @@ def serve(crawler: Crawler, client: Client, until: Callable[[], object]) -> None
             return
 
 
+def wait_until(crawler: Crawler, look: Callable[[], T]) -> T:
+    """What `look()` gives, once that is true. What is not so when the daemon has ended is never going to be: it fails
+    then, after one last look."""
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        has_ended = crawler.process.poll() is not None
+        if seen := look():
+            return seen
+        assert not has_ended, f"the daemon has ended with {crawler.process.returncode}:\n{crawler.text()}"
+        assert time.monotonic() < end, f"{crawler.status()}\n{crawler.text()}"
+        time.sleep(0.01)
+
+
 def wait_for_log(crawler: Crawler, text: str, times: int = 1) -> None:
     """Until the daemon has logged `text` so often."""
-    end = time.monotonic() + PATIENCE_S
-    while crawler.text().count(text) < times:
-        assert time.monotonic() < end, crawler.text()
-        time.sleep(0.02)
+    wait_until(crawler, lambda: crawler.text().count(text) >= times)
 
 
 def wait_for_status(crawler: Crawler, is_so: Callable[[dict], object]) -> dict:
     """The status file, once it is there and `is_so`; a key that it does not have means that it is not."""
-    end = time.monotonic() + PATIENCE_S
-    while True:
+
+    def look() -> dict:
         status = crawler.status()
         with contextlib.suppress(KeyError):
             if status and is_so(status):
                 return status
-        assert time.monotonic() < end, f"{status}\n{crawler.text()}"
-        time.sleep(0.02)
+        return {}
+
+    return wait_until(crawler, look)
 
 
 def spooled(crawler: Crawler) -> Counter[int]:
@@ -230,7 +251,7 @@ def spooled(crawler: Crawler) -> Counter[int]:
 
 def receive_all(crawler: Crawler, store: Store) -> int:
     """Serves the daemon until it exits; returns its exit code."""
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: False)
     return crawler.wait()
 

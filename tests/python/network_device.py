@@ -91,7 +91,7 @@ def serving(*clients: Client) -> Iterator[None]:
 def receiving(device: Crawler) -> Iterator[Store]:
     """An operator who keeps the line; what he has received."""
     store = Store(device.port, TlsTransport)
-    with store.client() as client:
+    with store.client(device) as client:
         client.run(lambda: client.up, PATIENCE_S)
         with serving(client):
             yield store

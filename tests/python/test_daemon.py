@@ -116,7 +116,7 @@ def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_p
     assert done.returncode == 1
     assert str(crawler.port) in done.stderr
     crawler.start("--set", "camera.loops=0")
-    with Store(crawler.port).client(), reserve_port() as other:
+    with Store(crawler.port).client(crawler), reserve_port() as other:
         wait_for_log(crawler, "begins")
         done = run("--config", crawler.config, "--set", f"link.port={other.getsockname()[1]}")
     assert done.returncode == 1
@@ -258,7 +258,7 @@ def test_a_serial_device_that_is_not_there_is_waited_for_and_its_loss_is_logged_
 def test_sigterm_ends_the_survey_and_drains(tmp_path: Path, crawler: Crawler):
     store = Store(crawler.port)
     crawler.start("--set", "camera.loops=0", "--set", "camera.speed=recorded")
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: len(store.keyframes) >= 3)
         crawler.terminate()
         serve(crawler, client, lambda: False)
@@ -325,22 +325,51 @@ class LateStore(Store):
         return None if kind == END and not self.may_acknowledge else super().on_object(name, kind, data)
 
 
-def test_an_acknowledgement_at_the_last_moment_still_empties_the_spool(crawler: Crawler):
+def stop_while_it_lingers(crawler: Crawler, client: Client) -> bool:
+    """Stops a daemon as soon as it says that the link closes, 0.3 s before it does. False: a busy machine was late."""
+    end = time.monotonic() + PATIENCE_S
+    has_ended = crawler.process.poll() is not None
+    before = time.monotonic()
+    while "the link closes" not in crawler.text():
+        assert not has_ended and before < end, crawler.text()
+        client.step(0.005)
+        has_ended = crawler.process.poll() is not None
+        before = time.monotonic()
+    if crawler.process.poll() is not None:
+        return False
+    os.kill(crawler.process.pid, signal.SIGSTOP)  # unlike send_signal, does not reap one that has just ended
+    how = os.waitid(os.P_PID, crawler.process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+    return how.si_code == os.CLD_STOPPED and time.monotonic() - before < 0.15
+
+
+def acknowledge_at_the_last_moment(crawler: Crawler) -> bool:
+    """False: the daemon was not met in its last moment."""
     store = LateStore(crawler.port)
     crawler.start("--set", "daemon.drain_s=3", "--set", "daemon.log_level=debug")
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: store.has_end)
-        while "the link closes" not in crawler.text():
-            assert crawler.process.poll() is None, crawler.text()
-        crawler.process.send_signal(signal.SIGSTOP)  # this host has 0.3 s from here on, however busy its machine is
+        if not stop_while_it_lingers(crawler, client):
+            return False
         store.may_acknowledge = True
+        end = time.monotonic() + PATIENCE_S
         while not store.ends or client.link.deadline(time.monotonic_ns()) <= time.monotonic_ns():
+            assert time.monotonic() < end, crawler.text()
             client.step(0.02)
         crawler.process.send_signal(signal.SIGCONT)
         serve(crawler, client, lambda: False)
     assert crawler.wait() == 0
     assert len(store.ends) == 1
     assert spooled(crawler) == {}
+    return True
+
+
+def test_an_acknowledgement_at_the_last_moment_still_empties_the_spool(tmp_path: Path):
+    write_recording(tmp_path / "survey.y4m", 40)
+    for i in range(5):
+        (tmp_path / str(i)).mkdir()
+        if acknowledge_at_the_last_moment(Crawler(tmp_path / str(i), camera__path=tmp_path / "survey.y4m")):
+            return
+    pytest.fail("a busy machine was late each time")
 
 
 def test_a_shutdown_waits_for_a_host_that_takes_nothing_only_as_long_as_a_signal_does(crawler: Crawler):
@@ -381,7 +410,7 @@ def test_requests_are_answered(crawler: Crawler):
         serve(crawler, client, lambda: number in client.replies)
         return client.replies.pop(number)
 
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: client.up and store.starts)
         info = ask(client, get_info=pb.Nothing()).info
         assert info.software == "pipefishd 0.1.0"
@@ -407,7 +436,7 @@ def test_requests_are_answered(crawler: Crawler):
 def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawler):
     store = Store(crawler.port)
     crawler.start("--set", "daemon.exit_when_done=false")
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: bool(store.statuses) and store.statuses[-1].state == "idle")
         assert crawler.process.poll() is None
         assert len(store.keyframes) == 20
@@ -419,16 +448,17 @@ def test_without_exit_when_done_the_daemon_serves_until_shutdown(crawler: Crawle
 def wake_ups_per_second(crawler: Crawler, seconds: float) -> float:
     """How often the daemon's threads have gone to sleep, a second."""
 
-    def count() -> int:
-        total = 0
+    def count() -> dict[Path, int]:
+        counts = {}
         for task in Path(f"/proc/{crawler.process.pid}/task").glob("*/status"):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
-                total += int(task.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
-        return total
+                counts[task] = int(task.read_text().split("voluntary_ctxt_switches:")[1].split()[0])
+        return counts
 
     first, begin = count(), time.monotonic()
     time.sleep(seconds)
-    return (count() - first) / (time.monotonic() - begin)
+    last, end = count(), time.monotonic()
+    return sum(last[task] - first[task] for task in first.keys() & last.keys()) / (end - begin)
 
 
 def test_a_daemon_without_a_host_sleeps(crawler: Crawler):
@@ -442,7 +472,7 @@ def test_a_host_that_reads_nothing_counts_as_gone_and_costs_no_wake_ups(tmp_path
     store = Store(crawler.port)
     full_line = ("--set", "link.window=1048576", "--set", "link.send_slots=16")
     crawler.start("--set", "link.keepalive_ms=200", *full_line, *EVERY_FRAME)
-    with store.client() as client:
+    with store.client(crawler) as client:
         client.transport._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # it fills up at once
         serve(crawler, client, lambda: len(store.objects) > 3)
         wait_for_log(crawler, "host has gone")  # from here on it reads nothing

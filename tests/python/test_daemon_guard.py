@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from crawler import PATIENCE_S, WIDTH, Crawler, texture, write_recording
+from crawler import PATIENCE_S, WIDTH, Crawler, texture, wait_until, write_recording
 from pipefish import keys
 
 PERIOD_S = 0.3  # of the feeding: a third of WATCHDOG_USEC
@@ -39,11 +39,28 @@ class Manager:
                     break
         return said
 
-    def wait_for(self, text: str) -> list[str]:
-        """What is said until `text` is, which must come."""
-        said = self.listen(PATIENCE_S, text)
-        assert said and said[-1] == text, said
+    def wait_for(self, crawler: Crawler, text: str) -> list[str]:
+        """What the daemon says until `text`, which must come."""
+        said: list[str] = []
+
+        def has_come() -> bool:
+            said.extend(self.listen(0, text))
+            return said[-1:] == [text]
+
+        wait_until(crawler, has_come)
         return said
+
+    def wait_for_hang(self, crawler: Crawler, thread: str) -> None:
+        """Until the last that was said of the threads is that this one hangs, and nothing is fed for four periods: both
+        must come. A stall of a busy machine looks like a hang too, but one that passes."""
+        said: list[str] = []
+
+        def is_starved() -> bool:
+            now = self.listen(4 * PERIOD_S)
+            said.extend(text for text in now if text.startswith("STATUS="))
+            return said[-1:] == [f"STATUS=hangs: {thread}"] and "WATCHDOG=1" not in now
+
+        wait_until(crawler, is_starved)
 
 
 @pytest.fixture
@@ -63,14 +80,15 @@ def slow_folder(path: Path, frames: int) -> None:
 
 def task_of(crawler: Crawler, thread: str) -> Path:
     """The folder in /proc of the daemon's thread of that name, once it has come to run and named itself."""
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        for task in Path(f"/proc/{crawler.process.pid}/task").iterdir():
-            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
+
+    def look() -> Path | None:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
+            for task in Path(f"/proc/{crawler.process.pid}/task").iterdir():
                 if (task / "comm").read_text() == f"{thread}\n":
                     return task
-        time.sleep(0.01)
-    pytest.fail(f"the daemon has no thread {thread}")
+        return None
+
+    return wait_until(crawler, look)
 
 
 def rounds(crawler: Crawler) -> int:
@@ -85,7 +103,7 @@ def test_the_service_manager_hears_that_the_daemon_is_up_well_and_going(tmp_path
     crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0)
     begin = time.monotonic()
     crawler.start("--state", str(tmp_path / "state"))
-    manager.wait_for("READY=1")
+    manager.wait_for(crawler, "READY=1")
     first, gone, said = rounds(crawler), 0, []
     while gone < 60 and time.monotonic() < begin + PATIENCE_S:
         said += manager.listen(PERIOD_S)
@@ -95,12 +113,12 @@ def test_the_service_manager_hears_that_the_daemon_is_up_well_and_going(tmp_path
     # A period is six rounds of 50 ms, seven at most: no more pass between two feeds, and no feed comes early.
     assert gone / 7 - 1 <= fed <= (time.monotonic() - begin) / PERIOD_S + 1 and gone >= 60
     assert set(said) == {"WATCHDOG=1"}
-    end = time.monotonic() + PATIENCE_S  # up and well for five seconds: a power cut from now on is no failed start
-    while not (tmp_path / "state" / "starts").read_text().endswith(" up\n"):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_for_start(crawler, tmp_path / "state", True)  # up and well for five seconds: a power cut is no failed start
+    disk = task_of(crawler, "watchdogs") / "io"
+    if disk.exists() and "hangs" not in crawler.text():
+        assert "syscw: 0\n" in disk.read_text(), "while all is well the thread that feeds waits for no disk"
     crawler.terminate()
-    manager.wait_for("STOPPING=1")
+    manager.wait_for(crawler, "STOPPING=1")
     assert crawler.wait() == 0
 
 
@@ -116,26 +134,26 @@ def test_a_camera_that_hangs_starves_the_watchdog_until_it_goes_on(tmp_path: Pat
         daemon__drain_s=0,
     )
     crawler.start()
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     later = [tmp_path / "frames" / f"{i:03d}.png" for i in range(6, frames)]
     image = later[-1].read_bytes()
     for path in later:  # whichever comes next blocks the thread that opens it
         os.mkfifo(tmp_path / "fifo")
         (tmp_path / "fifo").rename(path)
-    manager.wait_for("STATUS=hangs: capture")
-    assert "WATCHDOG=1" not in manager.listen(4 * PERIOD_S)
+    manager.wait_for_hang(crawler, "capture")
     assert "the capture thread hangs" in crawler.text()
-    end = time.monotonic() + PATIENCE_S
-    while "the capture thread goes on" not in crawler.text():
-        assert time.monotonic() < end
+
+    def goes_on() -> bool:
         for path in later:
             with contextlib.suppress(OSError):  # nobody reads this one
                 fd = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
                 os.set_blocking(fd, True)
                 os.write(fd, image)
                 os.close(fd)
-        time.sleep(0.02)
-    manager.wait_for("STATUS=well")
+        return "the capture thread goes on" in crawler.text()
+
+    wait_until(crawler, goes_on)
+    manager.wait_for(crawler, "STATUS=well")
     crawler.kill()
 
 
@@ -143,7 +161,7 @@ def test_a_camera_that_hangs_while_it_is_opened_starves_the_watchdog(tmp_path: P
     os.mkfifo(tmp_path / "survey.y4m")
     crawler = Crawler(tmp_path, daemon__watchdog_s=2)
     crawler.start()
-    said = manager.wait_for("STATUS=hangs: main")
+    said = manager.wait_for(crawler, "STATUS=hangs: main")
     assert set(said[:-1]) == {"EXTEND_TIMEOUT_USEC=30000000"}, "before that it asks for time to start"
     assert manager.listen(2) == []
     assert "the main thread hangs" in crawler.text()
@@ -162,14 +180,13 @@ def test_a_link_that_hangs_starves_the_watchdog(tmp_path: Path, manager: Manager
         daemon__exit_when_done="false",
     )
     crawler.start()
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     os.mkfifo(tmp_path / "trust" / "peers")  # nobody writes: who looks up a key waits for ever
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     context.load_cert_chain(keys.host_key_file())
     with context.wrap_socket(socket.create_connection(("127.0.0.1", crawler.port), PATIENCE_S)):
-        manager.wait_for("STATUS=hangs: link")
-        assert "WATCHDOG=1" not in manager.listen(4 * PERIOD_S)
+        manager.wait_for_hang(crawler, "link")
     crawler.kill()
 
 
@@ -188,7 +205,7 @@ def test_a_thread_that_is_stopped_starves_the_watchdog(tmp_path: Path, manager: 
         daemon__exit_when_done="false",
     )
     crawler.start()
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     task = int(task_of(crawler, thread).name)
     libc = ctypes.CDLL(None, use_errno=True)
     seize, interrupt, detach, any_thread = 0x4206, 0x4207, 17, 0x40000000
@@ -197,11 +214,10 @@ def test_a_thread_that_is_stopped_starves_the_watchdog(tmp_path: Path, manager: 
     assert libc.ptrace(interrupt, task, None, None) == 0
     os.waitpid(task, any_thread)
     try:
-        manager.wait_for(f"STATUS=hangs: {thread}")
-        assert "WATCHDOG=1" not in manager.listen(4 * PERIOD_S)
+        manager.wait_for_hang(crawler, thread)
     finally:
         libc.ptrace(detach, task, None, None)
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     crawler.kill()
 
 
@@ -209,23 +225,24 @@ def test_a_process_that_stands_still_starves_the_watchdog(tmp_path: Path, manage
     write_recording(tmp_path / "survey.y4m", 5)
     crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0)
     crawler.start()
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     crawler.process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, crawler.process.pid, os.WSTOPPED)
     manager.listen(0)
     assert manager.listen(4 * PERIOD_S) == []
     crawler.process.send_signal(signal.SIGCONT)
-    manager.wait_for("WATCHDOG=1")
+    manager.wait_for(crawler, "WATCHDOG=1")
     crawler.kill()
 
 
-def wait_for_start(folder: Path, is_up: bool) -> str:
+def wait_for_start(crawler: Crawler, folder: Path, is_up: bool) -> str:
     """The file that `--state` keeps of the start in progress, once it says so."""
-    end = time.monotonic() + 60
-    while (text := (folder / "starts").read_text()).endswith(" up\n") != is_up:
-        assert time.monotonic() < end, text
-        time.sleep(0.05)
-    return text
+
+    def look() -> str:
+        text = (folder / "starts").read_text()
+        return text if text.endswith(" up\n") == is_up else ""
+
+    return wait_until(crawler, look)
 
 
 def test_a_main_thread_that_hangs_is_a_failed_start_and_a_power_cut_of_a_daemon_that_is_well_is_none(
@@ -236,15 +253,14 @@ def test_a_main_thread_that_hangs_is_a_failed_start_and_a_power_cut_of_a_daemon_
     state = tmp_path / "state"
     crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0, daemon__watchdog_s=4)
     crawler.start("--state", str(state))
-    assert "READY=1" in manager.listen(30, "READY=1")
-    well = wait_for_start(state, True)
+    manager.wait_for(crawler, "READY=1")
+    well = wait_for_start(crawler, state, True)
     draft = tmp_path / "status.json.new"  # nobody reads: who writes the status waits for ever
     while not draft.is_fifo():
         with contextlib.suppress(FileExistsError):  # it is just being written
             os.mkfifo(draft)
-    assert "STATUS=hangs: main" in manager.listen(30, "STATUS=hangs: main")
-    hung = wait_for_start(state, False)
-    assert "WATCHDOG=1" not in manager.listen(4 * PERIOD_S)
+    manager.wait_for_hang(crawler, "main")
+    hung = wait_for_start(crawler, state, False)
     assert "the main thread hangs" in crawler.text()
     crawler.kill()
     draft.unlink()
@@ -255,7 +271,7 @@ def test_a_main_thread_that_hangs_is_a_failed_start_and_a_power_cut_of_a_daemon_
         assert count == "1" and settings != boot and other != text
         (state / "starts").write_text(other)  # as found after the board has booted again
         crawler.start("--state", str(state))
-        assert "READY=1" in manager.listen(30, "READY=1")
+        manager.wait_for(crawler, "READY=1")
         counts.append((state / "starts").read_text().split()[0])
         crawler.kill()
     assert counts == ["1", "2"]

@@ -82,7 +82,7 @@ def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path
         subprocess.run(["mount", "-o", "remount,ro", medium], check=True)
         store = Store(crawler.port)
         crawler.start("--set", "survey.name=next", *on_medium)
-        with store.client() as client:
+        with store.client(crawler) as client:
             serve(crawler, client, lambda: store.ends and crawler.status().get("spool_trouble"))
             status = crawler.status()
             assert "Read-only file system" in status["spool_trouble"]
@@ -237,7 +237,7 @@ def test_kill_9_while_sending_and_a_host_that_dies_too_lose_nothing_and_double_n
     for i in range(kills):
         crawler.start("--set", "camera.loops=0")
         for _ in range(1 + i % 2):
-            with store.client() as client:
+            with store.client(crawler) as client:
                 few = len(store.objects) + 2 * (i % 2)  # it is indeed sending
                 serve(crawler, client, lambda few=few: len(store.objects) >= few)
                 end = time.monotonic() + rng.uniform(0.02, 0.2)

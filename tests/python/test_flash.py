@@ -110,7 +110,7 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
     assert not state.in_use.trial and not state.stored.trial
     assert state.in_use.crc32c == int.from_bytes(OLD.to_binary()[-4:], "little")
     store = Store(crawler.port)
-    with store.client() as client:
+    with store.client(crawler) as client:
         serve(crawler, client, lambda: any(s.profile for s in store.starts) and store.statuses)
         status = client.answer_to(PATIENCE_S, get_status=pb.Nothing()).status
     assert OLD.to_binary() in [s.profile for s in store.starts]

@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("own_keys")
 def test_an_operator_takes_the_whole_survey_and_the_device_says_who_he_is(device: Crawler):
     let_in(device, "operator")
     store = Store(device.port, TlsTransport)
-    with store.client() as client:
+    with store.client(device) as client:
         client.run(lambda: store.ends, PATIENCE_S)
         reply = client.answer_to(PATIENCE_S, get_status=pb.Nothing())
     assert [k.index for k in store.keyframes] == list(range(store.ends[0].keyframes)) and len(store.keyframes) > 5
@@ -47,7 +47,7 @@ def test_an_operator_takes_the_whole_survey_and_the_device_says_who_he_is(device
 def test_a_viewer_sees_the_status_and_can_make_the_device_forget_nothing(device: Crawler):
     let_in(device, "viewer")
     store = Watcher(device.port, TlsTransport)
-    with store.client() as client:
+    with store.client(device) as client:
         client.answer_to(PATIENCE_S, get_status=pb.Nothing())
         with pytest.raises(PipefishError, match="role operator"):
             client.answer_to(PATIENCE_S, stop_survey=pb.Nothing())
@@ -69,12 +69,12 @@ def test_objects_that_an_operator_left_halfway_are_not_offered_to_a_viewer(devic
             self.arrivals[name] += 1  # and it never says that it has it
 
     slow = Slow(device.port, TlsTransport)
-    with slow.client() as client:
+    with slow.client(device) as client:
         client.run(lambda: slow.arrivals, PATIENCE_S)
     viewer = another_user(tmp_path / "viewer", monkeypatch)
     let_in(device, "viewer", viewer, "visitor")
     store = Watcher(device.port, TlsTransport)
-    with store.client() as client:
+    with store.client(device) as client:
         client.answer_to(PATIENCE_S, get_status=pb.Nothing())
         end = time.monotonic() + 1
         client.run(lambda: time.monotonic() > end, PATIENCE_S)
@@ -122,17 +122,17 @@ def test_others_look_on_while_a_host_receives_and_can_change_nothing(device: Cra
             with pytest.raises(PipefishError, match="refuses the profile: another host is connected"):
                 flasher.send(b"whatever it is")
         watcher = Watcher(device.port, TlsTransport)
-        with watcher.client() as client:
+        with watcher.client(device) as client:
             client.run(lambda: len(watcher.statuses) > 1, PATIENCE_S)
         assert not watcher.objects
         taker = Taker(device.port, TlsTransport)
-        with taker.client() as client:
+        with taker.client(device) as client:
             client.run(lambda: taker.losses, PATIENCE_S)
             with pytest.raises(NoDevice, match="another host is connected"):
                 client.run(lambda: taker.objects, 0.1)
         wait_for_status(device, lambda s: s["spool"]["acknowledged"] > 5)
     # He has gone: the same host that was told so is served now.
-    with taker.client() as client:
+    with taker.client(device) as client:
         client.run(lambda: client.up and taker.statuses, PATIENCE_S)
     assert len(store.objects) > 5 and network(device)["refused_busy"] == 0
     assert "host is there: tester, operator" in device.text() and "looks on: second, calibrator" in device.text()
@@ -254,7 +254,7 @@ def test_a_host_that_lost_its_way_takes_its_own_place_over(device: Crawler):
     lost = open_client(device)
     lost.run(lambda: lost.up, PATIENCE_S)
     again = Store(device.port, TlsTransport)  # the device has not noticed yet that the first has gone
-    with again.client() as client:
+    with again.client(device) as client:
         client.run(lambda: again.objects, PATIENCE_S)
     lost.close()
 
@@ -267,7 +267,7 @@ def test_a_host_that_falls_silent_makes_room_for_another(device: Crawler, tmp_pa
     other = another_user(tmp_path / "other", monkeypatch)
     let_in(device, "operator", other, "second")
     taker = Taker(device.port, TlsTransport)
-    with taker.client() as client:
+    with taker.client(device) as client:
         client.run(lambda: taker.objects, PATIENCE_S)
     silent.close()
 

@@ -23,6 +23,7 @@ import pytest
 from crawler import PATIENCE_S
 from device import Device
 from pipefish import client
+from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
 from pipefish.receive import Interrupted, receive
 from pipefish.survey import Survey
@@ -138,7 +139,9 @@ def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):
             # A shell's background job ignores SIGINT, and so would what it starts.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
+        deadline = time.monotonic() + PATIENCE_S
         while device.spool:
+            assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -267,6 +270,33 @@ def test_a_host_that_stood_still_takes_what_waits_for_a_sign_of_life(monkeypatch
         monkeypatch.setattr(client, "time", Later)
         asker.step(0.0)
         assert asker.up and asker.handlers.losses == 0
+        asker.close()
+
+
+def test_a_reply_that_waits_is_returned_before_anything_else_is_waited_for(monkeypatch):
+    """A host that was busy while it came: the caller's `until` is asked at once."""
+
+    class Spy:
+        heard = False
+        longest_s = 0.0  # asked for after something was heard
+
+        @classmethod
+        def select(cls, *arguments):
+            cls.longest_s = max(cls.longest_s, arguments[3] if cls.heard else 0.0)
+            answer = select.select(*arguments)
+            cls.heard = cls.heard or bool(answer[0])
+            return answer
+
+    with Device([], SURVEY) as device:
+        asker = client.Client(open_transport(device.address), client.Handlers())
+        asker.open()
+        asker.run(lambda: asker.up, PATIENCE_S)
+        asker.ask(get_status=pb.Nothing())
+        asker._flush(time.monotonic_ns())
+        assert select.select([asker.transport], [], [], PATIENCE_S)[0], "the device's next words"
+        monkeypatch.setattr(client, "select", Spy)
+        asker.step(client.IDLE_S)
+        assert Spy.heard and Spy.longest_s == 0.0
         asker.close()
 
 

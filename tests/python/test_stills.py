@@ -66,7 +66,7 @@ def test_a_still_that_nobody_waits_for_is_dropped_and_the_next_host_gets_its_own
             stills.client.ask(get_still=pb.Nothing())
             stills.client.step(0.0)
     store = Store(daemon.port)
-    with store.client() as client:
+    with store.client(daemon) as client:
         serve(daemon, client, lambda: len(store.keyframes) > 3)
     assert all(kind != 5 for kind, _ in store.objects.values())
     with stills_of(daemon) as stills:
@@ -104,7 +104,7 @@ def test_record_writes_a_folder_that_plays_and_calibrates(crawler, tmp_path, cap
     player = Crawler(second, camera__path=folder)  # the device plays what it gave, hashes checked
     player.start()
     store = Store(player.port)
-    with store.client() as client:
+    with store.client(player) as client:
         serve(player, client, lambda: len(store.ends) > 0)
     player.kill()
     assert store.ends[0].frames == 3 and store.ends[0].reason == "end of recording"

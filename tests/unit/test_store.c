@@ -35,11 +35,11 @@ static pf_store *_Atomic watched; /* NULL = none is open */
 static _Atomic int asked_with_mutex;
 
 /* Called by each call of the spool: the store's mutex, which tracking and link take, must be free, or they wait for the
- * disk. Others hold it for moments only. */
+ * disk. Others hold it for moments only; once one did not, no more is waited for. */
 static void check_mutex(void)
 {
     pf_store *s = atomic_load(&watched);
-    for (int i = 0; s != NULL && i < 3000; i++) {
+    for (int i = 0; s != NULL && i < 3000 && atomic_load(&asked_with_mutex) == 0; i++) {
         if (pthread_mutex_trylock(&s->mutex) == 0) {
             (void)pthread_mutex_unlock(&s->mutex);
             return;
