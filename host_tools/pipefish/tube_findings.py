@@ -445,15 +445,41 @@ def _grown(
     inner = sign * near[left] > 2.5 * p["sigma"][left]
     out, rim = [], cluster
     while len(rim):
-        s, clock = p["s"][rim], p["clock"][rim]
-        joins = np.zeros(len(left), bool)
         reach = np.where(inner, REACH, 1.0) * link
-        for i in np.flatnonzero((p["s"][left] > s.min() - reach) & (p["s"][left] < s.max() + reach)).tolist():
-            around = (p["clock"][left[i]] - clock + np.pi) % (2 * np.pi) - np.pi
-            joins[i] = (np.hypot(p["s"][left[i]] - s, around * radius) < reach[i]).any()
+        joins = _beside(p, left, rim, reach, radius)
         out.append(left[joins])
         rim, left, inner = left[joins & inner], left[~joins], inner[~joins]
     return np.sort(np.concatenate(out))
+
+
+def _beside(
+    p: dict[str, np.ndarray], rows: np.ndarray, rim: np.ndarray, reach: np.ndarray, radius: float
+) -> np.ndarray:
+    """(n,) bool: which points `rows` lie within their `reach` (n,) of one of the points `rim` on the unrolled wall."""
+    found = np.zeros(len(rows), bool)
+    s, clock = p["s"], p["clock"]
+    near = np.flatnonzero((s[rows] > s[rim].min() - reach) & (s[rows] < s[rim].max() + reach))
+    if not len(near):
+        return found
+    # Cells as wide as the farthest reach: only those of the eight around a point's own, and that, can hold what it
+    # meets. Pairs all along the pipe, as of a dense cloud with a film on its wall, would be millions.
+    cell = float(reach.max())
+    around = max(1, int(2 * np.pi * radius / cell))
+    (i, j), (k, m) = (
+        (np.floor(s[x] / cell).astype(int), (clock[x] / (2 * np.pi) * around).astype(int) % around)
+        for x in (rows[near], rim)
+    )
+    order = np.argsort(k * around + m, kind="stable")
+    keys, rim = (k * around + m)[order], rim[order]
+    for x, y in ((x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)):
+        key = (i + x) * around + (j + y) % around
+        first, last = np.searchsorted(keys, key), np.searchsorted(keys, key, side="right")
+        one = np.repeat(np.arange(len(near)), last - first)
+        other = rim[np.arange(len(one)) - np.repeat(np.cumsum(last - first) - last, last - first)]
+        away = (clock[rows[near[one]]] - clock[other] + np.pi) % (2 * np.pi) - np.pi
+        close = np.hypot(s[rows[near[one]]] - s[other], away * radius) < reach[near[one]]
+        found[near[one[close]]] = True
+    return found
 
 
 def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any]:

@@ -152,3 +152,16 @@ def test_a_heap_whose_far_flank_shows_few_points_is_told_at_its_middle() -> None
     found = of_kind(pf.fit_tube(points, pipe.noise, pipe.cameras()), "deposit")
     assert abs(found["s"] - 1.4) < 0.015 and abs(found["length"] - 0.3) < 0.04
     assert abs(found["height"] - 0.012) < 0.002
+
+
+@pytest.mark.parametrize("link", [0.01, 0.08, 0.5, 3.0])
+def test_points_beside_a_rim_are_those_of_all_pairs(link: float) -> None:
+    """Over the seam at twelve o'clock, and where few or one of the cells go round the pipe."""
+    rng = np.random.default_rng(7)
+    p = {"s": rng.uniform(-1, 1, 900), "clock": rng.uniform(0, 2 * np.pi, 900)}
+    p["clock"][:3] = 0.0, 2 * np.pi, np.nextafter(2 * np.pi, 0)
+    rim, rows = np.arange(0, 900, 5), np.arange(1, 900, 2)
+    reach = np.where(rng.random(len(rows)) < 0.5, 1.5, 1.0) * link
+    away = (p["clock"][rows][:, None] - p["clock"][rim] + np.pi) % (2 * np.pi) - np.pi
+    near = np.hypot(p["s"][rows][:, None] - p["s"][rim], away * 0.15) < reach[:, None]
+    assert (tube_findings._beside(p, rows, rim, reach, 0.15) == near.any(axis=1)).all()
