@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 import pipefish as pf
+from pipefish.measure import TRACK_COMMON_PX, TRACK_FLOOR_PX
 from pipefish.sectionsigma import shared_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -221,7 +222,9 @@ def tube_figures(seed: int) -> dict[str, Any]:
     drive = tube_drive(seed, LENGTH)
     quality = pf.Encoder(scale_sigma=1e-5)
     rec = pf.reconstruct(drive.tracks, drive.camera, readings(drive, seed), encoder=quality)
-    tube = pf.fit_tube(rec.points, rec.own_covariance, rec.centres, nominal=DIAMETER, shared=shared_of(rec, 0))
+    # With the share that `measure` takes; here residuals are as the weights say, so that all of it counts.
+    shared = shared_of(rec, 0, ellipse=(TRACK_COMMON_PX / TRACK_FLOOR_PX) ** 2)
+    tube = pf.fit_tube(rec.points, rec.own_covariance, rec.centres, nominal=DIAMETER, shared=shared)
     stations = {name: np.array(values) for name, values in tube.stations.items()}
     a, b = DIAMETER / 2 * (1 - OVALITY / 2), DIAMETER / 2 * (1 + OVALITY / 2)
     h = ((a - b) / (a + b)) ** 2

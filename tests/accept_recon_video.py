@@ -146,6 +146,6 @@ def video_figures(name: str) -> list[Limits]:
         rows.append(("bend_degrees", truth["bend_degrees"], -math.inf, 0.5))
         radii = [e["radius"] for s in measured.measured for e in s.tube.events if e["kind"] == "bend"]
         true = [p["radius"] for p in scene.spec["pieces"] if p["angle"]]
-        worst = max(abs(f / t - 1) for f, t in zip(radii, true, strict=True))
+        worst = max(abs((f or math.inf) / t - 1) for f, t in zip(radii, true, strict=True))
         rows.append(("bend_radius_off", worst, -math.inf, 0.05))
     return rows + findings(measured, scene)

@@ -179,10 +179,11 @@ class Reconstruction:
 
     def names(self, track: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Under what name each of these tracks (n,) may have a point in `track`."""
-        out = track.copy()
-        for other, name in self.joined:
-            out[track == other] = name
-        return out
+        if not len(self.joined):
+            return track.copy()
+        # In the order of `joined`, which is np.unique's: by the first name, of which each has one row.
+        place = np.minimum(np.searchsorted(self.joined[:, 0], track), len(self.joined) - 1)
+        return np.where(self.joined[place, 0] == track, self.joined[place, 1], track)
 
     def functions_covariance(
         self, points: npt.ArrayLike, jacobian: npt.ArrayLike, *, systematic: bool = False

@@ -2,8 +2,8 @@
 
 An event is a dictionary: kind ("joint", "bend", "deposit", "hole", "lateral", "recess"), s (chainage, m), s_sigma, and
   joint    step (m, across), step_sigma, clock (of the step), diameter_step, angle (rad), gap (m or None), gap_sigma
-  bend     start, end, angle (rad), angle_sigma, radius (m) of its axis, radius_sigma (both None where it is shorter
-           than can be told from a kink), clock (towards which it turns)
+  bend     start, end, angle (rad; over pi where it turns back), angle_sigma, radius (m) of its axis, radius_sigma (both
+           None where it is shorter than can be told from a kink, or turns unevenly), clock (towards which it turns)
   others   clock, length (along), width (around, m), height (m; how far in or out), height_sigma, points, area (m^2)
 
 False alarms: each test is set so that a clean pipe, rough or with scattered gross points, gives less than one event in
@@ -12,8 +12,9 @@ a hundred fits (FALSE_ALARMS), whatever its length; tests/python/test_tube_findi
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -32,10 +33,14 @@ GROSS = 4.0  # standard deviations
 # Of the diameter. Neighbouring tracks see the same relief in the same changing light and go astray together, which no
 # point's own sigma knows: heaps of 0.7 to 1.2 mm were found in a smooth DN300.
 LEAST_HEIGHT = 0.005
-# Of the diameter. The smooth axis goes round a bend in kinks a knot or two apart: arcs 1.6 to 4.4 diameters long were
-# too short by 0.02 to 0.06, of 0.8 by 0.1; one of 0.3 came out as 0.55.
-BEND_ENDS = 0.1
-BEND_LEAST = 0.6  # shorter ones are kinks for all that can be told
+LEAST_BEND = math.radians(2)
+# Of the diameter, for a bend as long: the smooth axis goes round a bend in kinks a knot or two apart. What that does to
+# an arc's length beside its fit's own scatter falls as the bend grows: 60 fits, 15 to 90 degrees, noise 0.5 to 3 mm.
+BEND_ENDS = 0.05
+BEND_SHORTEST = 0.6  # shorter ones are kinks for all that can be told
+# Of the whole turn, rms: one arc between straights is left by the tangent by 0.004 to 0.06 of it, an S that is
+# taken for one by 0.2 and more.
+BEND_UNEVEN = 0.1
 # The flank of a heap that looks away from the camera shows few points: where most of a point's nearest FEW stand out, a
 # patch goes on over REACH times what the nearest k of its median take.
 FEW, REACH = 7, 1.5
@@ -251,65 +256,93 @@ def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
         f = tube.frames(s, [k] * len(s))
         curvature = f["curvature"]
         bent = curvature > 3 * f["curvature_sigma"]
+        turning = np.cross(f["tangent"], np.gradient(f["tangent"], axis=0))  # rad from station to station
+        bent[1:] &= np.einsum("ni,ni->n", turning[1:], turning[:-1]) > 0  # an S is two bends
         edges = np.flatnonzero(np.diff(np.r_[0, bent, 0]))
         runs: list[list[int]] = []
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             if runs and s[a] - s[runs[-1][1] - 1] < 0.5 * d:
-                runs[-1][1] = int(b)
-            else:
-                runs.append([int(a), int(b)])
-        for a, b in runs:
-            # The smooth axis enters a bend over about a knot: the angle is taken outside it.
-            out_a, out_b = np.searchsorted(s, s[a] - 0.5 * d), min(len(s) - 1, np.searchsorted(s, s[b - 1] + 0.5 * d))
-            t0, t1 = f["tangent"][out_a], f["tangent"][out_b]
-            angle = math.atan2(float(np.linalg.norm(np.cross(t0, t1))), float(t0 @ t1))
-            if angle < math.radians(2):
+                turns = [turning[slice(*run)].sum(axis=0) for run in (runs[-1], (a, b))]
+                # Beside a kink the smooth axis swings back a little: that is no bend of its own.
+                if turns[0] @ turns[1] > 0 or min(np.linalg.norm(turns, axis=1)) < LEAST_BEND:
+                    runs[-1][1] = int(b)
+                    continue
+            runs.append([int(a), int(b)])
+        between = [0, *((r[1] - 1 + n[0]) // 2 for r, n in pairwise(runs)), len(s) - 1]
+        for (a, b), least, most in zip(runs, between, between[1:], strict=False):
+            # The smooth axis enters a bend over about a knot: the angle is taken outside it, short of the next bend.
+            out_a = max(least, int(np.searchsorted(s, s[a] - 0.5 * d)))
+            out_b = min(most, int(np.searchsorted(s, s[b - 1] + 0.5 * d)))
+            arc = _arc(s[out_a : out_b + 1], f["tangent"][out_a : out_b + 1], float(s[a]), float(s[b - 1]))
+            if arc.angle < LEAST_BEND:
                 continue
             turn = f["tangent_covariance"].reshape(-1, 2, 2)
             own = max(0.0, float(np.trace(turn[out_a]) + np.trace(turn[out_b])) / 2)
             # The heading wanders with the poses from one end to the other: more than both ends by themselves.
             sigma = math.sqrt(own + common.turn(k, (float(s[out_a]), float(s[out_b])), own / 2))
-            low, high = _arc(s[out_a : out_b + 1], f["tangent"][out_a : out_b + 1], float(s[a]), float(s[b - 1]))
-            middle = int(np.searchsorted(s, 0.5 * (low + high)))
-            toward = (t1 - t0) - ((t1 - t0) @ f["tangent"][middle]) * f["tangent"][middle]
-            radius = (high - low) / angle if high - low > BEND_LEAST * d else None
-            relative = math.hypot(BEND_ENDS * d / (high - low), sigma / angle)
+            at = int(np.searchsorted(s, arc.middle))
+            toward = np.cross(arc.normal, f["tangent"][at])
+            ends = BEND_ENDS * d * d / arc.length
+            radius = None
+            if arc.length > BEND_SHORTEST * d and arc.uneven < BEND_UNEVEN:
+                radius = arc.length / arc.angle
+            relative = math.hypot(arc.length_sigma, ends) / arc.length
             found.append(
                 {
                     "kind": "bend",
-                    "s": 0.5 * (low + high),
-                    "s_sigma": BEND_ENDS * d,
-                    "start": low,
-                    "end": high,
-                    "angle": angle,
+                    "s": arc.middle,
+                    "s_sigma": math.hypot(arc.middle_sigma, ends / 2),
+                    "start": arc.middle - 0.5 * arc.length,
+                    "end": arc.middle + 0.5 * arc.length,
+                    "angle": arc.angle,
                     "angle_sigma": sigma,
                     "radius": radius,
-                    "radius_sigma": relative * radius if radius else None,
-                    "clock": float(math.atan2(toward @ f["right"][middle], toward @ f["up"][middle]) % (2 * math.pi)),
+                    "radius_sigma": radius and radius * math.hypot(relative, sigma / arc.angle),
+                    "clock": float(math.atan2(toward @ f["right"][at], toward @ f["up"][at]) % (2 * math.pi)),
                 }
             )
     return found
 
 
-def _arc(s: np.ndarray, tangent: np.ndarray, start: float, end: float) -> tuple[float, float]:
-    """Chainages between which a pipe with these tangents (n,3) at s (n,) turns evenly, straight before and behind:
-    least squares of its heading. start, end: about."""
-    normal = np.cross(tangent[0], tangent[-1])
-    across = np.cross(normal / np.linalg.norm(normal), tangent[0])
+class _Arc(NamedTuple):
+    """An even turn between two straights. normal (3,): of the bend's plane; uneven: rms residual, in the
+    plane and out of it, over the turn."""
+
+    middle: float
+    length: float
+    angle: float
+    normal: np.ndarray
+    middle_sigma: float
+    length_sigma: float
+    uneven: float
+
+
+def _arc(s: np.ndarray, tangent: np.ndarray, start: float, end: float) -> _Arc:
+    """Where a pipe with these tangents (n,3) at s (n,) turns evenly, straight before and behind: least squares of its
+    heading in the plane in which it turns on the whole. start, end: about. The angle is from first to last tangent."""
+    normal = np.cross(tangent[:-1], tangent[1:]).sum(axis=0)
+    normal /= np.linalg.norm(normal)
+    across = np.cross(normal, tangent[0])
     heading = np.unwrap(np.arctan2(tangent @ across, tangent @ tangent[0]))
     middle, length, least = 0.5 * (start + end), max(end - start, s[1] - s[0]), s[1] - s[0]
     for _ in range(30):
         along = np.clip((s - middle) / length + 0.5, 0, 1)
         ramp = np.column_stack([np.ones(len(s)), along])
         turn = np.linalg.lstsq(ramp, heading, rcond=None)[0]
+        residual = heading - ramp @ turn
         slope = np.where((along > 0) & (along < 1), -turn[1] / length, 0.0)
         columns = np.column_stack([ramp, slope, slope * (s - middle) / length])
-        move = np.linalg.lstsq(columns, heading - ramp @ turn, rcond=None)[0][2:]
+        move = np.linalg.lstsq(columns, residual, rcond=None)[0][2:]
         middle = float(np.clip(middle + np.clip(move[0], -length / 4, length / 4), s[0], s[-1]))
         length = float(np.clip(length + move[1], max(0.5 * length, least), min(1.5 * length, s[-1] - s[0])))
         if np.abs(move).max() < 1e-6 * (s[-1] - s[0]):
             break
-    return middle - 0.5 * length, middle + 0.5 * length
+    scatter = float(residual @ residual) / max(1, len(s) - columns.shape[1])
+    variance = scatter * np.diag(np.linalg.pinv(columns.T @ columns))
+    left = residual**2 + (tangent @ normal) ** 2
+    uneven = math.sqrt(float(np.mean(left))) / max(1e-9, abs(float(turn[1])))
+    angle = abs(float(heading[-1] - heading[0]))
+    return _Arc(middle, length, angle, normal, math.sqrt(variance[2]), math.sqrt(variance[3]), uneven)
 
 
 def _majority(share: float, k: int) -> float:
@@ -412,15 +445,41 @@ def _grown(
     inner = sign * near[left] > 2.5 * p["sigma"][left]
     out, rim = [], cluster
     while len(rim):
-        s, clock = p["s"][rim], p["clock"][rim]
-        joins = np.zeros(len(left), bool)
         reach = np.where(inner, REACH, 1.0) * link
-        for i in np.flatnonzero((p["s"][left] > s.min() - reach) & (p["s"][left] < s.max() + reach)).tolist():
-            around = (p["clock"][left[i]] - clock + np.pi) % (2 * np.pi) - np.pi
-            joins[i] = (np.hypot(p["s"][left[i]] - s, around * radius) < reach[i]).any()
+        joins = _beside(p, left, rim, reach, radius)
         out.append(left[joins])
         rim, left, inner = left[joins & inner], left[~joins], inner[~joins]
     return np.sort(np.concatenate(out))
+
+
+def _beside(
+    p: dict[str, np.ndarray], rows: np.ndarray, rim: np.ndarray, reach: np.ndarray, radius: float
+) -> np.ndarray:
+    """(n,) bool: which points `rows` lie within their `reach` (n,) of one of the points `rim` on the unrolled wall."""
+    found = np.zeros(len(rows), bool)
+    s, clock = p["s"], p["clock"]
+    near = np.flatnonzero((s[rows] > s[rim].min() - reach) & (s[rows] < s[rim].max() + reach))
+    if not len(near):
+        return found
+    # Cells as wide as the farthest reach: only those of the eight around a point's own, and that, can hold what it
+    # meets. Pairs all along the pipe, as of a dense cloud with a film on its wall, would be millions.
+    cell = float(reach.max())
+    around = max(1, int(2 * np.pi * radius / cell))
+    (i, j), (k, m) = (
+        (np.floor(s[x] / cell).astype(int), (clock[x] / (2 * np.pi) * around).astype(int) % around)
+        for x in (rows[near], rim)
+    )
+    order = np.argsort(k * around + m, kind="stable")
+    keys, rim = (k * around + m)[order], rim[order]
+    for x, y in ((x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)):
+        key = (i + x) * around + (j + y) % around
+        first, last = np.searchsorted(keys, key), np.searchsorted(keys, key, side="right")
+        one = np.repeat(np.arange(len(near)), last - first)
+        other = rim[np.arange(len(one)) - np.repeat(np.cumsum(last - first) - last, last - first)]
+        away = (clock[rows[near[one]]] - clock[other] + np.pi) % (2 * np.pi) - np.pi
+        close = np.hypot(s[rows[near[one]]] - s[other], away * radius) < reach[near[one]]
+        found[near[one[close]]] = True
+    return found
 
 
 def _describe(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any]:
