@@ -34,6 +34,8 @@ GROSS = 4.0  # standard deviations
 # point's own sigma knows: heaps of 0.7 to 1.2 mm were found in a smooth DN300.
 LEAST_HEIGHT = 0.005
 LEAST_BEND = math.radians(2)
+# Each half of an S: waves a diameter long, of 1 % of it (rms), swing the axis to and fro by 3 to 5 degrees.
+LEAST_S = math.radians(5)
 # Of the diameter, for a bend as long: the smooth axis goes round a bend in kinks a knot or two apart. What that does to
 # an arc's length beside its fit's own scatter falls as the bend grows: 60 fits, 15 to 90 degrees, noise 0.5 to 3 mm.
 BEND_ENDS = 0.05
@@ -263,8 +265,8 @@ def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             if runs and s[a] - s[runs[-1][1] - 1] < 0.5 * d:
                 turns = [turning[slice(*run)].sum(axis=0) for run in (runs[-1], (a, b))]
-                # Beside a kink the smooth axis swings back a little: that is no bend of its own.
-                if turns[0] @ turns[1] > 0 or min(np.linalg.norm(turns, axis=1)) < LEAST_BEND:
+                # Beside a kink the smooth axis swings back a little, and with waves of the wall to and fro.
+                if turns[0] @ turns[1] > 0 or min(np.linalg.norm(turns, axis=1)) < LEAST_S:
                     runs[-1][1] = int(b)
                     continue
             runs.append([int(a), int(b)])

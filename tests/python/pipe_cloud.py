@@ -25,6 +25,7 @@ class Pipe:
     deposit: tuple[float, float, float, float] | None = None  # chainage, clock, diameter, height
     noise: float = 0.0015
     roughness: float = 0.0
+    waves: tuple[float, float] = (1.0, 0.0)  # relief: about so long (m), rms height (m), in all directions
     outliers: float = 0.0
     cover: float = 2 * math.pi  # azimuth seen, centred at twelve o'clock
     seed: int = 0
@@ -57,6 +58,16 @@ class Pipe:
         t = clock - self.clock_max
         r = a * b / np.sqrt((b * np.cos(t)) ** 2 + (a * np.sin(t)) ** 2)
         r = r + self.egg * self.diameter / 2 * np.cos(3 * clock)
+        if self.waves[1]:
+            rng = np.random.default_rng(self.seed + 999)
+            for _ in range(60):
+                # A whole number of waves around, the rest of the wave number along.
+                wave = 2 * np.pi / (self.waves[0] * math.exp(rng.normal(0, 0.3)))
+                turns = rng.integers(0, int(wave * self.diameter / 2) + 1)
+                along = math.sqrt(max(0.0, wave**2 - (2 * turns / self.diameter) ** 2))
+                r = r + self.waves[1] * math.sqrt(2 / 60) * np.cos(
+                    along * s + turns * clock + rng.uniform(0, 2 * np.pi)
+                )
         if self.deposit:
             at, where, size, height = self.deposit
             away = np.hypot(s - at, ((clock - where + np.pi) % (2 * np.pi) - np.pi) * self.diameter / 2) / (size / 2)

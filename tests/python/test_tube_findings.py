@@ -28,6 +28,13 @@ def test_clean_rough_pipes_raise_no_alarms() -> None:
     assert not alarms  # one in a hundred fits is allowed: 8 % of such batches would show one
 
 
+def test_a_wall_in_waves_raises_no_alarms() -> None:
+    """Relief that neighbours share, as the white roughness of the pipes above is not."""
+    pipe = Pipe(length=4, waves=(0.2, 0.002), noise=0.0005, seed=1)
+    tube = pf.fit_tube(pipe.points(2500), 0.001, pipe.cameras())
+    assert tube.status == "ok" and tube.surface.correlation > 2 and not tube.events
+
+
 @pytest.mark.parametrize("degrees", [15.0, 45.0])
 def test_bends_have_their_angle_radius_and_side(degrees: float) -> None:
     pipe = Pipe(length=4, bend=(1.5, math.radians(degrees), 0.9), seed=3)
