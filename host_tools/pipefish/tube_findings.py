@@ -46,6 +46,7 @@ BEND_UNEVEN = 0.1
 # The flank of a heap that looks away from the camera shows few points: where most of a point's nearest FEW stand out, a
 # patch goes on over REACH times what the nearest k of its median take.
 FEW, REACH = 7, 1.5
+TENTH = 1.28  # sigmas that a tenth of what is normally distributed exceeds
 SURELY = 1.645  # of its own sigmas by which a patch has to stand out further than that: 95 %, one-sided
 
 
@@ -397,7 +398,7 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
             cluster = _grown(p, seed, near, sign, radius, spacing, height)
             if len(cluster) >= 4:
                 event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
-                if event["height"] - SURELY * event["height_sigma"] < LEAST_HEIGHT * d:
+                if _surely(p, cluster, event["height"], event["height_sigma"]) < LEAST_HEIGHT * d:
                     continue
                 # The highest of n points of a heap is so much lower than its top.
                 event["height_sigma"] = math.hypot(event["height_sigma"], 3 * event["height"] / event["points"])
@@ -405,6 +406,14 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 if not (sign > 0 and ringed and event["length"] < 0.3 * d):
                     out.append(event)
     return out
+
+
+def _surely(p: dict[str, np.ndarray], cluster: np.ndarray, height: float, sigma: float) -> float:
+    """What a patch surely stands out by. The points that make its height are its highest for their errors, too: those
+    of the tenth that is, are 1.28 sigmas at least."""
+    top = np.abs(p["distance"][cluster]) >= 0.8 * height
+    own = math.sqrt(float(np.mean(p["sigma"][cluster][top] ** 2)))
+    return height - TENTH * own - SURELY * max(sigma, own / math.sqrt(max(1.0, 0.2 * len(cluster))))
 
 
 def _clusters(p: dict[str, np.ndarray], rows: np.ndarray, radius: float, link: float) -> list[np.ndarray]:
