@@ -139,6 +139,19 @@ def test_a_heap_is_told_where_it_is_surely_more_than_tracks_have_in_common(heigh
     assert [e["kind"] for e in tube.events] == ["deposit"] * is_told
 
 
+@pytest.mark.parametrize(("sigma_of_the_highest", "is_sure"), [(0.0005, False), (0.0001, True)])
+def test_points_that_are_the_highest_for_their_errors_make_no_height(
+    sigma_of_the_highest: float, is_sure: bool
+) -> None:
+    """Seven points, 2.4 mm by the two that are known least: as tracks in a bend had them where nothing is."""
+    points = {
+        "distance": np.array([2.6, 2.2, 1.7, 1.3, 1.3, 0.9, 0.8]) / 1000,
+        "sigma": np.array([sigma_of_the_highest] * 2 + [0.0002] * 5),
+    }
+    surely = tube_findings._surely(points, np.arange(7), 0.0024, 0.0002)
+    assert (surely > tube_findings.LEAST_HEIGHT * 0.3) is is_sure
+
+
 @pytest.mark.parametrize(("clock", "height"), [(3.0, 0.015), (0.05, 0.009), (4.5, -0.012)])
 def test_deposits_and_holes_have_place_height_and_kind(clock: float, height: float) -> None:
     pipe = Pipe(deposit=(1.4, clock, 0.15, height), outliers=0.1, seed=5)
