@@ -224,23 +224,46 @@ static bool family_increases(const pf_camera *camera)
 /* --- The proof for the whole map ------------------------------------------------------------------------------- */
 
 /* Bounds over 0 <= theta <= t, all phi, of what the asymmetric terms add to each of the four entries of the Jacobian
- * [r_t r_p; t_t t_p], and of the derivatives of that by theta and by phi. A term c theta^p e^(i h phi) adds at most
- * |c| max(p, |h| + 1) theta^(p-1). */
+ * [r_t r_p; t_t t_p], or rather of the derivatives of that by theta and by phi: polynomials in t, here of degree i. A
+ * term c theta^p e^(i h phi) adds at most |c| max(p, |h| + 1) theta^(p-1) to an entry. */
+enum { POWER_MAX = 5 };
 typedef struct bounds {
-    double by_theta, by_phi;
-    double symmetric; /* |r''|, which also bounds twice the derivative of r / theta */
+    double by_theta[POWER_MAX], by_phi[POWER_MAX];
 } bounds;
 
-static void add_bound(bounds *b, double size, int power, int harmonic_number, double t)
+static void add_bound(bounds *b, double size, int power, int harmonic_number)
 {
     int h = harmonic_number < 0 ? -harmonic_number : harmonic_number;
     double entry = size * (power > h + 1 ? power : h + 1);
-    for (int i = 2; i < power; i++)
-        entry *= t;
-    b->by_theta += entry * (power - 1);
-    b->by_phi += entry * h * (power > 1 ? t : 1);
+    if (power > 1)
+        b->by_theta[power - 2] += entry * (power - 1);
+    b->by_phi[power - 1] += entry * h;
 }
 
+static bounds make_bounds(const pf_camera *camera)
+{
+    bounds b = {{0}, {0}};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 4; j++) {
+            double size = fabs(camera->asym_radial_theta[i] * camera->asym_radial_phi[j]) +
+                          fabs(camera->asym_tangential_theta[i] * camera->asym_tangential_phi[j]);
+            add_bound(&b, size, 2 * i + 1, j < 2 ? 1 : 2);
+        }
+    for (int i = 0; i < CPOLY_TERMS; i++)
+        add_bound(&b, fabs(camera->cpoly[2 * i]) + fabs(camera->cpoly[2 * i + 1]), pf_cpoly_power[i],
+                  pf_cpoly_harmonic[i]);
+    return b;
+}
+
+static double polynomial(const double a[POWER_MAX], double t)
+{
+    double sum = 0;
+    for (int i = POWER_MAX; i-- > 0;)
+        sum = sum * t + a[i];
+    return sum;
+}
+
+/* Of |r''| up to t, which also bounds twice the derivative of r / theta. */
 static double symmetric_bound(const pf_camera *camera, double t)
 {
     double s = t * t, sine, cosine, slope, m = camera->mirror;
@@ -260,43 +283,52 @@ static double symmetric_bound(const pf_camera *camera, double t)
     }
 }
 
-static bounds bounds_up_to(const pf_camera *camera, double t)
+/* A cell of the domain, and what is known of it: a half that has the same phi, or the same theta, shares that part. */
+typedef struct cell {
+    double theta, phi, half_theta, half_phi;        /* centre and half sizes */
+    double c, s;                                    /* of phi */
+    double over_theta, slope;                       /* r / theta and r' at theta */
+    double bound_theta, bound_phi, bound_symmetric; /* bounds up to the cell's end */
+} cell;
+
+typedef struct proof {
+    const pf_camera *camera;
+    camera_kind kind;
+    bounds bounds;
+} proof;
+
+/* phi in [-pi, pi], of which the functions know half. */
+static void set_phi(cell *at, double phi)
 {
-    bounds b = {0, 0, symmetric_bound(camera, t)};
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 4; j++) {
-            double size = fabs(camera->asym_radial_theta[i] * camera->asym_radial_phi[j]) +
-                          fabs(camera->asym_tangential_theta[i] * camera->asym_tangential_phi[j]);
-            add_bound(&b, size, 2 * i + 1, j < 2 ? 1 : 2, t);
-        }
-    for (int i = 0; i < CPOLY_TERMS; i++)
-        add_bound(&b, fabs(camera->cpoly[2 * i]) + fabs(camera->cpoly[2 * i + 1]), pf_cpoly_power[i],
-                  pf_cpoly_harmonic[i], t);
-    return b;
+    at->phi = phi;
+    sine_cosine(fabs(phi), &at->s, &at->c);
+    at->s = phi < 0 ? -at->s : at->s;
 }
 
-typedef struct cell {
-    double theta, phi, half_theta, half_phi; /* centre and half sizes */
-} cell;
+static void set_theta(const proof *p, cell *at, double theta, double half)
+{
+    const double end = theta + half;
+    at->theta = theta;
+    at->half_theta = half;
+    at->over_theta = pf_camera_radial(p->camera, theta, &at->slope);
+    at->bound_theta = polynomial(p->bounds.by_theta, end);
+    at->bound_phi = polynomial(p->bounds.by_phi, end);
+    at->bound_symmetric = symmetric_bound(p->camera, end);
+}
 
 typedef enum verdict { PROVED, DISPROVED, UNDECIDED } verdict;
 
 /* Whether the symmetric part of the Jacobian is positive definite in the whole cell: r_t > 0 and
  * 4 r_t t_p > (r_p + t_t)^2. Values at the centre, less what the derivatives' bounds allow. Sets *split_theta to the
  * better half for UNDECIDED. */
-static verdict judge(const pf_camera *camera, camera_kind kind, const cell *at, bool *split_theta)
+static verdict judge(const proof *p, const cell *at, bool *split_theta)
 {
-    /* cos and sin phi by the half-plane functions: phi in [-pi, pi]. */
-    double c, s;
-    sine_cosine(fabs(at->phi), &s, &c);
-    s = at->phi < 0 ? -s : s;
-    lens_point lens = pf_camera_lens(camera, kind, at->theta, c, s);
+    lens_point lens = pf_camera_lens_at(p->camera, p->kind, at->theta, at->c, at->s, at->over_theta, at->slope);
     double off = fabs(lens.r_p + lens.t_t), room = 4 * lens.r_t * lens.t_p - off * off;
     if (!(lens.r_t > 0 && lens.t_p > 0 && room > 0))
         return DISPROVED;
-    bounds b = bounds_up_to(camera, at->theta + at->half_theta);
-    double by_theta = at->half_theta * b.by_theta, by_phi = at->half_phi * b.by_phi;
-    double radial = at->half_theta * b.symmetric;
+    double by_theta = at->half_theta * at->bound_theta, by_phi = at->half_phi * at->bound_phi;
+    double radial = at->half_theta * at->bound_symmetric;
     double d_r = radial + by_theta + by_phi, d_t = 0.5 * radial + by_theta + by_phi, d_off = 2 * (by_theta + by_phi);
     double change = 4 * (lens.r_t * d_t + lens.t_p * d_r + d_r * d_t) + 2 * off * d_off + d_off * d_off;
     double rounding = 1e-12 * (1 + lens.r_t * lens.t_p + off * off);
@@ -306,36 +338,58 @@ static verdict judge(const pf_camera *camera, camera_kind kind, const cell *at, 
     return UNDECIDED;
 }
 
+/* A map that folds mostly does so at the rim, and in a wide part of it: a few points tell that before thousands of
+ * cells beside it are proved. */
+static bool folds_visibly(const proof *p)
+{
+    enum { RINGS = 4, SPOKES = 16 };
+    bool ignored;
+    for (int i = RINGS; i > 0; i--) {
+        cell at = {.half_phi = 0};
+        set_theta(p, &at, p->camera->theta_max * i / RINGS, 0);
+        for (int j = 0; j < SPOKES; j++) {
+            set_phi(&at, PI_ALL * (2 * j - SPOKES) / SPOKES);
+            if (judge(p, &at, &ignored) == DISPROVED)
+                return true;
+        }
+    }
+    return false;
+}
+
 /* Depth first over halved cells: the stack holds at most one pending right half a level. */
 static bool map_is_one_to_one(const pf_camera *camera, camera_kind kind)
 {
     enum { MAX_DEPTH = 60, MAX_CELLS = 100000 };
+    const proof p = {camera, kind, make_bounds(camera)};
     cell stack[MAX_DEPTH + 2];
     int top = 0;
     double half = 0.5 * camera->theta_max;
-    stack[0] = (cell){half, 0, half * (1 + 4 * DBL_EPSILON), PI_ALL * (1 + 4 * DBL_EPSILON)};
+    if (folds_visibly(&p))
+        return false;
+    stack[0].half_phi = PI_ALL * (1 + 4 * DBL_EPSILON);
+    set_phi(&stack[0], 0);
+    set_theta(&p, &stack[0], half, half * (1 + 4 * DBL_EPSILON));
     for (int cells = 0; top >= 0; cells++) {
-        cell at = stack[top];
         bool split_theta = true;
-        verdict v = judge(camera, kind, &at, &split_theta);
+        verdict v = judge(&p, &stack[top], &split_theta);
         if (v == DISPROVED || cells == MAX_CELLS || (v == UNDECIDED && top == MAX_DEPTH))
             return false;
         if (v == PROVED) {
             top--;
             continue;
         }
-        cell left = at, right = at;
+        cell *left = &stack[top], *right = &stack[++top];
+        *right = *left;
         if (split_theta) {
-            left.half_theta = right.half_theta = 0.5 * at.half_theta;
-            left.theta -= left.half_theta;
-            right.theta += right.half_theta;
+            double quarter = 0.5 * left->half_theta, middle = left->theta;
+            set_theta(&p, left, middle - quarter, quarter);
+            set_theta(&p, right, middle + quarter, quarter);
         } else {
-            left.half_phi = right.half_phi = 0.5 * at.half_phi;
-            left.phi -= left.half_phi;
-            right.phi += right.half_phi;
+            double middle = left->phi;
+            left->half_phi = right->half_phi = 0.5 * left->half_phi;
+            set_phi(left, middle - left->half_phi);
+            set_phi(right, middle + right->half_phi);
         }
-        stack[top++] = left;
-        stack[top] = right;
     }
     return true;
 }
