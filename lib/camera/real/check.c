@@ -2,6 +2,7 @@
 #include "real.h"
 
 #include <float.h>
+#include <stdlib.h>
 
 double *pf_camera_param_at(pf_camera *camera, uint32_t param)
 {
@@ -223,36 +224,57 @@ static bool family_increases(const pf_camera *camera)
 
 /* --- The proof for the whole map ------------------------------------------------------------------------------- */
 
-/* Bounds over 0 <= theta <= t, all phi, of what the asymmetric terms add to each of the four entries of the Jacobian
- * [r_t r_p; t_t t_p], or rather of the derivatives of that by theta and by phi: polynomials in t, here of degree i. A
- * term c theta^p e^(i h phi) adds at most |c| max(p, |h| + 1) theta^(p-1) to an entry. */
+/* Of what the asymmetric terms add to a quantity: bounds of its derivatives by theta and by phi over 0 <= theta <= t,
+ * all phi, as polynomials in t, here of degree i. */
 enum { POWER_MAX = 5 };
 typedef struct bounds {
     double by_theta[POWER_MAX], by_phi[POWER_MAX];
 } bounds;
 
+/* Of the quantities that decide: r_t, t_p and off = r_p + t_t. */
+typedef struct proof {
+    const pf_camera *camera;
+    camera_kind kind;
+    bounds r_t, t_p, off;
+} proof;
+
+/* Of size theta^(power-1) cos(harmonic phi + anything). */
 static void add_bound(bounds *b, double size, int power, int harmonic_number)
 {
-    int h = harmonic_number < 0 ? -harmonic_number : harmonic_number;
-    double entry = size * (power > h + 1 ? power : h + 1);
     if (power > 1)
-        b->by_theta[power - 2] += entry * (power - 1);
-    b->by_phi[power - 1] += entry * h;
+        b->by_theta[power - 2] += size * (power - 1);
+    b->by_phi[power - 1] += size * abs(harmonic_number);
 }
 
-static bounds make_bounds(const pf_camera *camera)
+static double length(double a, double b)
 {
-    bounds b = {{0}, {0}};
+    return sqrt(a * a + b * b);
+}
+
+/* R = a theta^p g(phi) has r_t = p a theta^(p-1) g, r_p = a theta^(p-1) g' and t_p = a theta^(p-1) g; T = m theta^p g
+ * has t_t = p m theta^(p-1) g, t_p = m theta^(p-1) g' and r_p = -m theta^(p-1) g. R + i T = c theta^p e^(i h phi) has
+ * r_t + i t_t = p, r_p = -(h + 1) times its T / theta and t_p = (h + 1) times its R / theta. */
+static proof make_proof(const pf_camera *camera, camera_kind kind)
+{
+    proof q = {.camera = camera, .kind = kind};
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 4; j++) {
-            double size = fabs(camera->asym_radial_theta[i] * camera->asym_radial_phi[j]) +
-                          fabs(camera->asym_tangential_theta[i] * camera->asym_tangential_phi[j]);
-            add_bound(&b, size, 2 * i + 1, j < 2 ? 1 : 2);
+        for (int h = 1; h <= 2; h++) {
+            const double *b = camera->asym_radial_phi + 2 * h - 2, *j = camera->asym_tangential_phi + 2 * h - 2;
+            double radial = fabs(camera->asym_radial_theta[i]) * length(b[0], b[1]);
+            double tangential = fabs(camera->asym_tangential_theta[i]) * length(j[0], j[1]);
+            int p = 2 * i + 1;
+            add_bound(&q.r_t, p * radial, p, h);
+            add_bound(&q.t_p, radial + h * tangential, p, h);
+            add_bound(&q.off, h * radial + (p - 1) * tangential, p, h);
         }
-    for (int i = 0; i < CPOLY_TERMS; i++)
-        add_bound(&b, fabs(camera->cpoly[2 * i]) + fabs(camera->cpoly[2 * i + 1]), pf_cpoly_power[i],
-                  pf_cpoly_harmonic[i]);
-    return b;
+    for (int i = 0; i < CPOLY_TERMS; i++) {
+        double size = length(camera->cpoly[2 * i], camera->cpoly[2 * i + 1]);
+        int p = pf_cpoly_power[i], h = pf_cpoly_harmonic[i];
+        add_bound(&q.r_t, p * size, p, h);
+        add_bound(&q.t_p, abs(h + 1) * size, p, h);
+        add_bound(&q.off, abs(p - h - 1) * size, p, h);
+    }
+    return q;
 }
 
 static double polynomial(const double a[POWER_MAX], double t)
@@ -283,37 +305,45 @@ static double symmetric_bound(const pf_camera *camera, double t)
     }
 }
 
-/* A cell of the domain, and what is known of it: a half that has the same phi, or the same theta, shares that part. */
+typedef struct slopes {
+    double by_theta, by_phi;
+} slopes;
+
 typedef struct cell {
-    double theta, phi, half_theta, half_phi;        /* centre and half sizes */
-    double c, s;                                    /* of phi */
-    double over_theta, slope;                       /* r / theta and r' at theta */
-    double bound_theta, bound_phi, bound_symmetric; /* bounds up to the cell's end */
+    double theta, phi, half_theta, half_phi; /* centre and half sizes */
 } cell;
 
-typedef struct proof {
-    const pf_camera *camera;
-    camera_kind kind;
-    bounds bounds;
-} proof;
+/* What is known of a cell. Neighbours share a half of it, which is kept from one to the next. */
+typedef struct view {
+    double theta, half_theta, phi; /* for which it holds */
+    double c, s;                   /* of phi */
+    double over_theta, slope;      /* r / theta and r' at theta */
+    double symmetric;              /* the bounds up to the cell's end */
+    slopes r_t, t_p, off;
+} view;
 
-/* phi in [-pi, pi], of which the functions know half. */
-static void set_phi(cell *at, double phi)
+static slopes slopes_up_to(const bounds *b, double t)
 {
-    at->phi = phi;
-    sine_cosine(fabs(phi), &at->s, &at->c);
-    at->s = phi < 0 ? -at->s : at->s;
+    return (slopes){polynomial(b->by_theta, t), polynomial(b->by_phi, t)};
 }
 
-static void set_theta(const proof *p, cell *at, double theta, double half)
+static void look(const proof *p, const cell *at, view *v)
 {
-    const double end = theta + half;
-    at->theta = theta;
-    at->half_theta = half;
-    at->over_theta = pf_camera_radial(p->camera, theta, &at->slope);
-    at->bound_theta = polynomial(p->bounds.by_theta, end);
-    at->bound_phi = polynomial(p->bounds.by_phi, end);
-    at->bound_symmetric = symmetric_bound(p->camera, end);
+    if (v->phi != at->phi) { /* in [-pi, pi], of which the functions know half */
+        v->phi = at->phi;
+        sine_cosine(fabs(at->phi), &v->s, &v->c);
+        v->s = at->phi < 0 ? -v->s : v->s;
+    }
+    if (v->theta != at->theta || v->half_theta != at->half_theta) {
+        const double end = at->theta + at->half_theta;
+        v->theta = at->theta;
+        v->half_theta = at->half_theta;
+        v->over_theta = pf_camera_radial(p->camera, at->theta, &v->slope);
+        v->symmetric = symmetric_bound(p->camera, end);
+        v->r_t = slopes_up_to(&p->r_t, end);
+        v->t_p = slopes_up_to(&p->t_p, end);
+        v->off = slopes_up_to(&p->off, end);
+    }
 }
 
 typedef enum verdict { PROVED, DISPROVED, UNDECIDED } verdict;
@@ -321,20 +351,25 @@ typedef enum verdict { PROVED, DISPROVED, UNDECIDED } verdict;
 /* Whether the symmetric part of the Jacobian is positive definite in the whole cell: r_t > 0 and
  * 4 r_t t_p > (r_p + t_t)^2. Values at the centre, less what the derivatives' bounds allow. Sets *split_theta to the
  * better half for UNDECIDED. */
-static verdict judge(const proof *p, const cell *at, bool *split_theta)
+static verdict judge(const proof *p, const cell *at, view *v, bool *split_theta)
 {
-    lens_point lens = pf_camera_lens_at(p->camera, p->kind, at->theta, at->c, at->s, at->over_theta, at->slope);
+    look(p, at, v);
+    lens_point lens = pf_camera_lens_at(p->camera, p->kind, v->theta, v->c, v->s, v->over_theta, v->slope);
     double off = fabs(lens.r_p + lens.t_t), room = 4 * lens.r_t * lens.t_p - off * off;
     if (!(lens.r_t > 0 && lens.t_p > 0 && room > 0))
         return DISPROVED;
-    double by_theta = at->half_theta * at->bound_theta, by_phi = at->half_phi * at->bound_phi;
-    double radial = at->half_theta * at->bound_symmetric;
-    double d_r = radial + by_theta + by_phi, d_t = 0.5 * radial + by_theta + by_phi, d_off = 2 * (by_theta + by_phi);
-    double change = 4 * (lens.r_t * d_t + lens.t_p * d_r + d_r * d_t) + 2 * off * d_off + d_off * d_off;
+    /* by how much the three change at most, on the way by theta and by phi */
+    double theta = at->half_theta, phi = at->half_phi;
+    double r_by_theta = theta * (v->symmetric + v->r_t.by_theta), r_by_phi = phi * v->r_t.by_phi;
+    double t_by_theta = theta * (0.5 * v->symmetric + v->t_p.by_theta), t_by_phi = phi * v->t_p.by_phi;
+    double off_by_theta = theta * v->off.by_theta, off_by_phi = phi * v->off.by_phi;
+    double d_r = r_by_theta + r_by_phi, d_t = t_by_theta + t_by_phi, d_off = off_by_theta + off_by_phi;
+    double change = 4 * (lens.r_t * d_t + lens.t_p * d_r - d_r * d_t) + 2 * off * d_off + d_off * d_off;
     double rounding = 1e-12 * (1 + lens.r_t * lens.t_p + off * off);
     if (lens.r_t - d_r > 0 && lens.t_p - d_t > 0 && room - change > rounding)
         return PROVED;
-    *split_theta = (radial + by_theta) * (lens.r_t + lens.t_p + off) >= by_phi * (lens.r_t + lens.t_p + off);
+    *split_theta = 4 * (lens.r_t * t_by_theta + lens.t_p * r_by_theta) + (2 * off + off_by_theta) * off_by_theta >=
+                   4 * (lens.r_t * t_by_phi + lens.t_p * r_by_phi) + (2 * off + off_by_phi) * off_by_phi;
     return UNDECIDED;
 }
 
@@ -343,16 +378,14 @@ static verdict judge(const proof *p, const cell *at, bool *split_theta)
 static bool folds_visibly(const proof *p)
 {
     enum { RINGS = 4, SPOKES = 16 };
+    view v = {.theta = NAN, .phi = NAN};
     bool ignored;
-    for (int i = RINGS; i > 0; i--) {
-        cell at = {.half_phi = 0};
-        set_theta(p, &at, p->camera->theta_max * i / RINGS, 0);
+    for (int i = RINGS; i > 0; i--)
         for (int j = 0; j < SPOKES; j++) {
-            set_phi(&at, PI_ALL * (2 * j - SPOKES) / SPOKES);
-            if (judge(p, &at, &ignored) == DISPROVED)
+            cell at = {p->camera->theta_max * i / RINGS, PI_ALL * (2 * j - SPOKES) / SPOKES, 0, 0};
+            if (judge(p, &at, &v, &ignored) == DISPROVED)
                 return true;
         }
-    }
     return false;
 }
 
@@ -360,36 +393,36 @@ static bool folds_visibly(const proof *p)
 static bool map_is_one_to_one(const pf_camera *camera, camera_kind kind)
 {
     enum { MAX_DEPTH = 60, MAX_CELLS = 100000 };
-    const proof p = {camera, kind, make_bounds(camera)};
+    const proof p = make_proof(camera, kind);
+    view known = {.theta = NAN, .phi = NAN};
     cell stack[MAX_DEPTH + 2];
     int top = 0;
     double half = 0.5 * camera->theta_max;
+    stack[0] = (cell){half, 0, half * (1 + 4 * DBL_EPSILON), PI_ALL * (1 + 4 * DBL_EPSILON)};
     if (folds_visibly(&p))
         return false;
-    stack[0].half_phi = PI_ALL * (1 + 4 * DBL_EPSILON);
-    set_phi(&stack[0], 0);
-    set_theta(&p, &stack[0], half, half * (1 + 4 * DBL_EPSILON));
     for (int cells = 0; top >= 0; cells++) {
+        cell at = stack[top];
         bool split_theta = true;
-        verdict v = judge(&p, &stack[top], &split_theta);
+        verdict v = judge(&p, &at, &known, &split_theta);
         if (v == DISPROVED || cells == MAX_CELLS || (v == UNDECIDED && top == MAX_DEPTH))
             return false;
         if (v == PROVED) {
             top--;
             continue;
         }
-        cell *left = &stack[top], *right = &stack[++top];
-        *right = *left;
+        cell left = at, right = at;
         if (split_theta) {
-            double quarter = 0.5 * left->half_theta, middle = left->theta;
-            set_theta(&p, left, middle - quarter, quarter);
-            set_theta(&p, right, middle + quarter, quarter);
+            left.half_theta = right.half_theta = 0.5 * at.half_theta;
+            left.theta -= left.half_theta;
+            right.theta += right.half_theta;
         } else {
-            double middle = left->phi;
-            left->half_phi = right->half_phi = 0.5 * left->half_phi;
-            set_phi(left, middle - left->half_phi);
-            set_phi(right, middle + right->half_phi);
+            left.half_phi = right.half_phi = 0.5 * at.half_phi;
+            left.phi -= left.half_phi;
+            right.phi += right.half_phi;
         }
+        stack[top++] = left;
+        stack[top] = right;
     }
     return true;
 }
