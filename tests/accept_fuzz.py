@@ -44,7 +44,7 @@ class Reach:
 REACH = {
     "csv": Reach(r"drivers/camera_replay/csv\.c", 36),
     "ini": Reach(r"firmware/(config|ini|utf8)\.c", 59),
-    "link": Reach(r"lib/link/(?!messages)\w+\.c", 65),
+    "link": Reach(r"lib/link/(?!messages)\w+\.c", 51),
     "messages": Reach(r"lib/link/messages\.c", 222),
     "peers": Reach(r"drivers/trust/peers\.c", 6),
     "picture": Reach(r"drivers/camera_replay/picture\.c", 11),
