@@ -74,7 +74,7 @@ int64_t pf_detect_late(const pf_tracker *t)
         return 0;
     const int64_t cot = ((int64_t)leaves.z * (1 << 24)) / sine + WAY_LEFT;
     const int64_t norm = pf_isqrt64((uint64_t)(cot * cot + ((int64_t)1 << 48)));
-    const pf_ray_q30 late = {(int32_t)(((int64_t)1 << 54) / norm), 0, (int32_t)((cot << 30) / norm)};
+    const pf_ray_q30 late = {(int32_t)(((int64_t)1 << 54) / norm), 0, (int32_t)(cot * ((int64_t)1 << 30) / norm)};
     if (!lens->project(lens->camera, &late, &at))
         return 0;
     return ((int64_t)at.x - t->config.circle.x) >> 8;
