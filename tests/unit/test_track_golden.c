@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xB6D4A2D2u
+#define GOLDEN 0xD58CC961u
 
 void setUp(void) {}
 void tearDown(void) {}
