@@ -273,6 +273,8 @@ def run_evaluate(args: argparse.Namespace) -> Result:
         ("survival", "kept of those visible"),
         ("median_px", "median error, px"),
         ("length_median", "median length, frames"),
+        ("length_possible", "if none were lost"),
+        ("whole", "share of whole lives"),
     ):
         values = [side[name] for side in (ours, peer) if side is not None]
         rows.append((what, ", ".join("-" if v is None else f"{v:.4g}" for v in values)))

@@ -88,8 +88,9 @@ typedef struct pf_tracker_config {
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
     pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
-                         * warp alone leaves 0.02 px a fifth of growth, the same way for all; and no track begins at
-                         * the edge of the glare [none] */
+                         * warp alone leaves 0.02 px a fifth of growth, the same way for all; no track begins at the
+                         * edge of the glare, nor, while the wall comes out towards the rim, where half a radius of way
+                         * is left of it: that is gone before the third keyframe [none] */
     bool has_wall; /* the caller gives up what walks off the wall, with pf_wall_check: what is left need look less alike
                     * (0.2 less than min_zncc, twice fb, twice the variance at which a track is lost) */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
