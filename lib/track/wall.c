@@ -549,7 +549,9 @@ void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_pr
         walked_alone(wall, k, walked);
         const pf_point_q16 way = way_of(wall, k, walked, project, camera);
         const int64_t part = part_of(wall, k);
-        tracks[j].pos.x = pf_clamp_i64(tracks[j].pos.x - way.x * part / 65536, INT32_MAX);
-        tracks[j].pos.y = pf_clamp_i64(tracks[j].pos.y - way.y * part / 65536, INT32_MAX);
+        tracks[j].settled_x_q8 = (int16_t)pf_clamp_i64(-way.x * part / (65536 * 256), INT16_MAX);
+        tracks[j].settled_y_q8 = (int16_t)pf_clamp_i64(-way.y * part / (65536 * 256), INT16_MAX);
+        tracks[j].pos.x = pf_clamp_i64((int64_t)tracks[j].pos.x + 256 * tracks[j].settled_x_q8, INT32_MAX);
+        tracks[j].pos.y = pf_clamp_i64((int64_t)tracks[j].pos.y + 256 * tracks[j].settled_y_q8, INT32_MAX);
     }
 }
