@@ -14,6 +14,7 @@ MAKEFLAGS += --no-print-directory
 VENV := build/venv
 PY := $(VENV)/bin/python
 STAMP := build/stamp
+FUZZ_SECONDS := 60
 UNITY_DIR = $(abspath $(wildcard $(VENV)/lib/python3*/site-packages/vyperling/c))
 ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type f)
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
@@ -66,14 +67,14 @@ lint: packages-test $(STAMP)/venv
 	@clang-format --dry-run --Werror $(C_FILES)
 	@$(VENV)/bin/ruff check --quiet . && $(VENV)/bin/ruff format --check --quiet .
 
-# Every parser and state machine for a fixed number of inputs, from those in tests/fuzz/corpus on, under clang with
+# Every parser and state machine for FUZZ_SECONDS, two at a time, from the inputs in tests/fuzz/corpus on, under clang with
 # sanitizers; `make accept` runs longer, and keeps what it finds.
 fuzz-build: packages-test
 	@test -f build/clang/build.ninja || cmake --preset clang
 	@cmake --build --preset clang
 
 fuzz-smoke: fuzz-build
-	@ls build/clang/tests/fuzz | grep '^fuzz_[a-z0-9_]*$$' | xargs -n 1 -P 2 tests/fuzz/smoke build/clang/tests/fuzz
+	@ls build/clang/tests/fuzz | grep '^fuzz_[a-z0-9_]*$$' | xargs -n 1 -P 2 tests/fuzz/smoke $(FUZZ_SECONDS) build/clang/tests/fuzz
 
 # The protocols, in every state that small bounds reach (tests/proof).
 proof: packages-test

@@ -106,10 +106,11 @@ def findings(measured: Measurement, scene: Scene) -> list[Limits]:
     rows.append(("other_findings", sum(e["kind"] not in wanted for e in events), -math.inf, 0))
     for kind, sizes, truth in (
         ("joint", "step", [math.hypot(j["step_down"], j["step_right"]) for j in scene.spec["joints"]]),
+        ("joint", "gap", [j["gap"] for j in scene.spec["joints"]]),
         ("deposit", "height", [d["height"] for d in scene.spec["deposits"]]),
         ("deposit", "length", [visible_length(scene, d) for d in scene.spec["deposits"]]),
     ):
-        found = [e[sizes] for e in events if e["kind"] == kind]
+        found = [e[sizes] or math.inf for e in events if e["kind"] == kind]
         if truth and len(found) == len(truth):
             worst = max(size_error(f, t) for f, t in zip(found, truth, strict=True))
             rows.append((f"{kind}_{sizes}_off", worst, -math.inf, 1.0))

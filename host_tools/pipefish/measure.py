@@ -255,6 +255,7 @@ def measure(
     tell       is called with a fraction done and a word
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
+    from pipefish.joint_gaps import tell_gaps
     from pipefish.measured_remarks import remark
 
     tell = tell or (lambda fraction, word: None)
@@ -357,6 +358,8 @@ def measure(
         ),
         lambda: tell(0.9, "profile"),
     )
+    if pictures:
+        tell_gaps(m)
     remark(m)
     return m
 

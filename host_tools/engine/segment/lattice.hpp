@@ -58,7 +58,7 @@ public:
     void add(const Lattice::Spot &at, const Matrix2d &q, const Vector2d &b);
     // Adds weight times the bending of the warp with its change.
     void bend(const Warp &warp, double weight);
-    // The change of least cost, to a thousandth of it. `similar` is brought up to date where it does not serve.
+    // The change of least cost, to a hundredth of it. `similar` is brought up to date where it does not serve.
     Eigen::VectorXd solve(std::shared_ptr<const Factor> &similar);
 
 private:

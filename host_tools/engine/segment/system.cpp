@@ -110,7 +110,7 @@ Eigen::VectorXd System::solve() const
 Eigen::VectorXd System::solve(std::shared_ptr<const Factor> &similar) const
 {
     constexpr int most = 12;       // steps that take less time than a factor
-    constexpr double share = 1e-6; // squared
+    constexpr double share = 1e-4; // squared
     if (similar) {
         Eigen::VectorXd out = Eigen::VectorXd::Zero(right_.size()), rest = right_;
         Eigen::VectorXd way = similar->solve(rest), step = way;
