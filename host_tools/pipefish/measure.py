@@ -291,6 +291,7 @@ def measure(
             sag_sigma=TRACK_SAG_PX2,
             hold_camera=camera.covariance is None,  # tracks are no better than what is assumed
             drift=drift_prior(weighed, camera, TRACK_SHARPER),
+            common_errors=True,  # the floor
             shutter=shutter,
         ),
         lambda: tell(0.05, "poses and points"),

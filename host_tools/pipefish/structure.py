@@ -94,8 +94,9 @@ class Reconstruction:
     points           (N,3), track (N,) int64 the track of each, point_segment (N,)
     covariance       (N,3,3) of the points and pose_covariance (K,6,6) of the poses (rotation on the left, then centre),
                      random part, in the gauge of `gauge`; first frame of each segment: 0
-    own_covariance   (N,3,3) random part of the points, the poses held: what neighbours do not have in common. What fits
-                     a shape to the points wants this one: the other grows with the distance from the first frame
+    own_covariance   (N,3,3) random part of the points, the poses held, by the residuals: what neighbours do not have in
+                     common. What fits a shape to the points wants this one: the other grows with the distance from the
+                     first frame
     systematic       (N,3,3), pose_systematic (K,6,6): what the camera's own uncertainty adds; None where the profile
                      has no covariance
     unit             "metre", or "arbitrary" where there is no source of scale
@@ -103,7 +104,10 @@ class Reconstruction:
     scale_sigma      relative sigma of the scale, wheel included; None without a source
     wheel            (true distance over reading) - 1 as estimated, and wheel_sigma
     sigma            robust spread of the residuals, in units of the stated noise; variance_factor likewise, after
-                     outliers were removed, of each segment
+                     outliers were removed, of each segment's pixels
+    noise            of each segment: of the pixels over the stated one, as the estimate and its covariances have it:
+                     what the variance factor says (not less than 1 with common_errors). The encoder's, the
+                     inclinometer's and the camera's uncertainty stay as stated
     observations     used; outside: beyond the camera's model; repeated: the same track twice in a frame
     standing         frames not used: nothing had moved since the one before
     gaps             list of Gap
@@ -139,6 +143,7 @@ class Reconstruction:
     wheel_sigma: float
     sigma: list[float]
     variance_factor: list[float]
+    noise: list[float]
     observations: int
     outside: int
     repeated: int
@@ -211,7 +216,7 @@ class Reconstruction:
         found = random.functions(inside, rows)
         if systematic:
             return found + (total.functions(inside, rows) - found) / self.camera_share
-        return found * self.variance_factor[number]
+        return found
 
     def camera_of(self, camera: Camera, segment: int) -> Camera:
         """The camera with which a segment's poses and points agree: as estimated with its prior."""
@@ -304,6 +309,7 @@ def reconstruct(
     sag_sigma: float = 0.0,
     hold_camera: bool = False,
     drift: tuple[Sequence[str], Floats, float] | None = None,
+    common_errors: bool = False,
     shutter: RollingShutter | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
@@ -323,6 +329,8 @@ def reconstruct(
     drift      names of the camera's parameters, their covariance, as wide as they may have changed since it was
                calibrated, and a factor on the noise of the tracks: the adjustment is then made once more with them
                free, for Reconstruction.drift alone
+    common_errors   the stated noise holds errors that tracks have in common, too, which leave no residual: it counts
+               as stated even where residuals are smaller, against the encoder and in the covariances
     shutter    of a camera whose rows are exposed one after the other; None: all at once
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
@@ -370,6 +378,7 @@ def reconstruct(
             [PARAMETERS.index(name) for name in drift[0]] if drift else [],
             np.ascontiguousarray(drift[1]) if drift else None,
             float(drift[2]) if drift else 1.0,
+            common_errors,
             float(sag_sigma),
             None if shutter is None else np.asarray(shutter.time)[:end],
             0.0 if shutter is None else shutter.line_time,
@@ -489,9 +498,8 @@ def _result(
         points.append(s["points"] @ r.T + t)
         spin = np.eye(6)
         spin[3:, 3:] = r
-        factor = s["variance_factor"]
-        covariances.append(factor * (r @ s["random"].point @ r.T))
-        pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
+        covariances.append(r @ s["random"].point @ r.T)
+        pose_covariances.append(spin @ s["random"].pose @ spin.T)
         pose_covariances[-1][0] = 0.0  # held; the engine has the unit matrix there
         if s["total"] is not None:
             systematic.append(r @ (s["total"].point - s["random"].point) @ r.T / share)
@@ -522,6 +530,7 @@ def _result(
         wheel_sigma=_wheel_sigma(first) or 0.0,
         sigma=[s["sigma"] for s in segments],
         variance_factor=[s["variance_factor"] for s in segments],
+        noise=[s["noise"] for s in segments],
         observations=sum(s["observations"] for s in segments),
         outside=found["outside"],
         repeated=found["repeated"],

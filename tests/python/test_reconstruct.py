@@ -131,6 +131,37 @@ def test_wheels_that_slip_do_not_stretch_the_pipe() -> None:
     assert rec.length == pytest.approx(drive.driven[-1], rel=0.003)
 
 
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 3.0])
+def test_the_pixels_noise_is_not_the_encoders(sigma: float) -> None:
+    """A wheel known to 1 %: no length is known better, however much better the pixels are than was stated, and the
+    encoder's own noise stays in it. Against the pixels it counts by what the residuals show."""
+    drive = tube_drive(7, 2.0)
+    chainage = readings(drive, 7)
+    rec = pf.reconstruct(drive.tracks, drive.camera, chainage, encoder=pf.Encoder(scale_sigma=0.01), sigma=sigma)
+    assert rec.variance_factor[0] == pytest.approx((0.3 / sigma) ** 2, rel=0.1)
+    axis = drive.poses[0, :, :3] @ np.array([0.0, 0.0, 1.0])
+    length = np.linalg.norm(rec.centres[-1] - rec.centres[0])
+    assert np.sqrt(axis @ rec.pose_covariance[-1, 3:, 3:] @ axis) / length == pytest.approx(0.0101, rel=0.02)
+    exact = pf.reconstruct(drive.tracks, drive.camera, chainage, encoder=pf.Encoder(scale_sigma=1e-5), sigma=sigma)
+    found = np.sqrt(axis @ exact.pose_covariance[-1, 3:, 3:] @ axis)
+    assert found == pytest.approx(0.0005 * np.sqrt(len(drive.driven) - 1), rel=0.1)
+    across = np.sqrt(np.trace(exact.own_covariance.mean(0)))
+    assert across == pytest.approx(np.sqrt(np.trace(rec.own_covariance.mean(0))), rel=0.05)
+
+
+def test_errors_in_common_keep_the_noise_as_stated() -> None:
+    """Nothing is taken off a noise that no residual shows; one that is too small grows to what residuals show."""
+    drive = tube_drive(18, 1.0)
+    small, large, plain = (
+        pf.reconstruct(drive.tracks, drive.camera, sigma=s, common_errors=c)
+        for s, c in ((0.2, True), (1.0, True), (0.3, False))
+    )
+    assert small.noise[0] == pytest.approx(1.5, rel=0.05) and large.noise == [1.0]
+    own = np.trace(plain.covariance.mean(0))
+    assert np.trace(small.covariance.mean(0)) == pytest.approx(own, rel=0.05)
+    assert np.trace(large.covariance.mean(0)) == pytest.approx(own / 0.09, rel=0.1)
+
+
 def test_inclinometer_says_where_down_is() -> None:
     drive = tube_drive(8, 2.0)
     world_down = drive.poses[:, :, :3] @ np.array([0.0, 1.0, 0.0])
