@@ -131,6 +131,17 @@ def test_wheels_that_slip_do_not_stretch_the_pipe() -> None:
     assert rec.length == pytest.approx(drive.driven[-1], rel=0.003)
 
 
+@pytest.mark.parametrize("jump", [1.5, 8.0, 1e4])
+def test_one_wild_reading_of_the_encoder_does_not_end_the_survey(jump: float) -> None:
+    """A glitch of thousands of sigmas: there both exponentials of the slip's mixture are 0 in double precision."""
+    drive = tube_drive(7, 2.0)
+    chainage = readings(drive, 7)
+    chainage[20:] += jump
+    rec = pf.reconstruct(drive.tracks, drive.camera, chainage)
+    assert rec.status == "ok" and rec.length == pytest.approx(drive.driven[-1], rel=0.01)
+    assert rec.variance_factor[0] == pytest.approx(1, abs=0.1), "of the pixels: they know nothing of the glitch"
+
+
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 3.0])
 def test_the_pixels_noise_is_not_the_encoders(sigma: float) -> None:
     """A wheel known to 1 %: no length is known better, however much better the pixels are than was stated, and the
