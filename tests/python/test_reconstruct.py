@@ -361,6 +361,24 @@ def test_photographs_of_a_fountain(real_data: Callable[[str], Path], tmp_path: P
             assert np.degrees(np.arcsin(sine)) < 0.05
 
 
+@pytest.mark.parametrize("broken", [False, True], ids=["one stretch", "two"])
+def test_an_inclinometer_that_stops_takes_nothing_with_it(broken: bool) -> None:
+    """Its last readings come before a break of all tracks: the stretch behind it has none, and is measured without."""
+    drive = tube_drive(7, 2.0)
+    t, frames = drive.tracks, len(drive.poses)
+    cut = frames // 2
+    tracks = pf.Tracks(t.frame, t.track + 10**6 * (broken & (t.frame >= cut)), t.pixels)
+    attitude = np.zeros((frames, 2))
+    attitude[cut - 2 :] = np.nan
+    # Corners behind the break are not those before it, or the two would be joined.
+    if broken:
+        here = (t.frame < cut) | (t.track % 2 == 0)
+        before = (t.frame >= cut) | (t.track % 2 == 1)
+        tracks = pf.Tracks(t.frame[here & before], tracks.track[here & before], t.pixels[here & before])
+    rec = pf.reconstruct(tracks, drive.camera, readings(drive, 7), attitude=attitude)
+    assert len(rec.frames) == frames and len(rec.sigma) == (2 if broken else 1) and rec.down is not None
+
+
 def test_wrong_arguments_are_named() -> None:
     drive = tube_drive(17, 0.5)
     with pytest.raises(pf.ArgumentError, match="method"):

@@ -222,6 +222,7 @@ public:
     const std::vector<int> &used() const { return place_; }
     int observations() const { return static_cast<int>(place_.size()); }
     int late_at() const { return late_at_; }
+    Vector3d down() const { return options_.gravity ? state_.down : Vector3d(Vector3d::Zero()); }
 
     // Of the pixels alone: what shares the border with them (wheel, gravity, priors) tells that border, and the scale.
     int redundancy() const
@@ -324,15 +325,12 @@ private:
         if (options_.odometry) {
             border_ = 1;
         }
+        if (options_.gravity && !start_gravity()) {
+            options_.gravity = nullptr;
+        }
         if (options_.gravity) {
             down_at_ = border_;
             border_ += 2;
-            Vector3d sum = Vector3d::Zero();
-            for (size_t f = 0; f < state_.rotation.size(); f++) {
-                const Vector3d &down = options_.gravity->down[f + static_cast<size_t>(first_)];
-                sum += state_.rotation[f].transpose() * down;
-            }
-            state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
         }
         if (options_.sag_sigma > 0.0) {
             sag_at_ = border_;
@@ -349,6 +347,20 @@ private:
             const Eigen::LLT<Eigen::MatrixXd> llt(options_.camera_prior->covariance);
             camera_root_ = llt.matrixL().solve(Eigen::MatrixXd::Identity(camera_columns_, camera_columns_));
         }
+    }
+
+    // False where the inclinometer says nothing of these frames: nothing would tell where down is.
+    bool start_gravity()
+    {
+        Vector3d sum = Vector3d::Zero();
+        bool known = false;
+        for (size_t f = 0; f < state_.rotation.size(); f++) {
+            const Vector3d &down = options_.gravity->down[f + static_cast<size_t>(first_)];
+            known = known || !down.isZero();
+            sum += state_.rotation[f].transpose() * down;
+        }
+        state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
+        return known;
     }
 
     bool has_step(int f) const { return std::isfinite(options_.odometry->step[static_cast<size_t>(f + first_)]); }
@@ -594,7 +606,7 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.variance_factor = 2.0 * pixels / report.redundancy;
     report.cost = pixels + rest;
     report.wheel = problem.state().wheel;
-    report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
+    report.down = problem.down();
     report.sag = problem.state().sag;
     report.late = problem.state().late;
     report.late_at = problem.late_at();
