@@ -255,9 +255,10 @@ def _down(attitude: npt.ArrayLike, frames: int) -> Floats:
     given = np.asarray(attitude, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 2 or len(given) < frames:
         raise ArgumentError(f"attitude: expected roll and pitch for each of {frames} frames, got shape {given.shape}")
-    roll, pitch = given[:frames].T
+    known = np.isfinite(given[:frames]).all(axis=1)
+    roll, pitch = np.where(known[:, None], given[:frames], 0.0).T
     down = np.column_stack([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])
-    return np.ascontiguousarray(np.nan_to_num(down))
+    return np.ascontiguousarray(np.where(known[:, None], down, 0.0))
 
 
 def _checked(shutter: RollingShutter, frames: int, camera: Camera) -> RollingShutter | None:

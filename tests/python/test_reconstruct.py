@@ -379,6 +379,17 @@ def test_an_inclinometer_that_stops_takes_nothing_with_it(broken: bool) -> None:
     assert len(rec.frames) == frames and len(rec.sigma) == (2 if broken else 1) and rec.down is not None
 
 
+def test_an_inclinometer_that_says_nothing_is_none() -> None:
+    """A roll that is not known is no roll of 0: gravity is taken from readings that are whole."""
+    drive = tube_drive(8, 1.0)
+    nothing = np.full((len(drive.poses), 2), np.nan)
+    rec = pf.reconstruct(drive.tracks, drive.camera, attitude=nothing)
+    assert rec.status == "ok" and rec.down is None
+    pitch_alone = np.column_stack([nothing[:, 0], np.full(len(drive.poses), -0.2)])
+    other = pf.reconstruct(drive.tracks, drive.camera, attitude=pitch_alone)
+    assert other.down is None and np.array_equal(other.poses, rec.poses)
+
+
 def test_wrong_arguments_are_named() -> None:
     drive = tube_drive(17, 0.5)
     with pytest.raises(pf.ArgumentError, match="method"):
