@@ -243,6 +243,9 @@ def _steps(chainage: npt.ArrayLike, frames: int, encoder: Encoder) -> tuple[Floa
     given = np.asarray(chainage, dtype=np.float64)
     if given.ndim != 1 or len(given) < frames:
         raise ArgumentError(f"chainage: expected one number for each of {frames} frames, got shape {given.shape}")
+    sigmas = (encoder.noise_m_per_sqrt_m, encoder.scale_sigma, encoder.quantum)
+    if not (np.isfinite(sigmas).all() and min(sigmas) >= 0.0 and encoder.scale_sigma > 0.0):
+        raise ArgumentError(f"encoder: scale_sigma is not above 0, or another value of {encoder} is below")
     step = np.append(np.diff(given[:frames]), np.nan)
     noise = encoder.noise_m_per_sqrt_m**2 * np.abs(np.nan_to_num(step)) + encoder.quantum**2 / 6.0
     if not (noise[np.isfinite(step) & (step != 0.0)] > 0.0).all():
@@ -348,6 +351,8 @@ def reconstruct(
     if chainage is not None:
         step, step_sigma = _steps(chainage, frames, encoder)
     if attitude is not None:
+        if not (np.isfinite(attitude_sigma) and attitude_sigma > 0.0):
+            raise ArgumentError(f"attitude_sigma: {attitude_sigma} is not above 0")
         down = _down(attitude, frames)
     if shutter is not None:
         shutter = _checked(shutter, frames, camera)
@@ -356,7 +361,7 @@ def reconstruct(
 
     def run(end: int) -> dict[str, Any]:  # of the frames before one
         kept = tracks.frame < end
-        return _engine.reconstruct(
+        return _engine_run(
             camera._profile,
             end,
             len(names),
@@ -417,6 +422,13 @@ def reconstruct(
         part["noise"] = drift[2]
     out.own_covariance = _own_covariance(out, tracks, camera, sigma)
     return out
+
+
+def _engine_run(*arguments: Any) -> dict[str, Any]:
+    try:
+        return _engine.reconstruct(*arguments)
+    except ValueError as error:  # numbers that leave the range of an adjustment
+        raise ArgumentError(f"these tracks, chainage and priors cannot be adjusted: {error}") from error
 
 
 def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: float) -> Floats:

@@ -396,6 +396,14 @@ def test_wrong_arguments_are_named() -> None:
         pf.reconstruct(drive.tracks, drive.camera, method="magic")
     with pytest.raises(pf.ArgumentError, match="chainage"):
         pf.reconstruct(drive.tracks, drive.camera, [0.0, 1.0])
+    flat = np.zeros((len(drive.poses), 2))
+    for sigma in (0.0, -1.0, np.nan):
+        with pytest.raises(pf.ArgumentError, match="attitude_sigma"):
+            pf.reconstruct(drive.tracks, drive.camera, attitude=flat, attitude_sigma=sigma)
+        with pytest.raises(pf.ArgumentError, match="encoder"):
+            pf.reconstruct(drive.tracks, drive.camera, drive.driven, encoder=pf.Encoder(scale_sigma=sigma))
+    with pytest.raises(pf.ArgumentError, match="encoder"):
+        pf.reconstruct(drive.tracks, drive.camera, drive.driven, encoder=pf.Encoder(noise_m_per_sqrt_m=np.nan))
     with pytest.raises(pf.ArgumentError, match="attitude"):
         pf.reconstruct(drive.tracks, drive.camera, attitude=[[0.0, 1.0]])
     with pytest.raises(pf.ArgumentError, match="pixels"):
