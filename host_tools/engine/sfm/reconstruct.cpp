@@ -1,6 +1,7 @@
 #include "sfm/reconstruct.hpp"
 
 #include "geometry/triangulate.hpp"
+#include "median.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -13,16 +14,6 @@ namespace
 
 constexpr double LEAST_FACTOR = 1e-6; // of the pixels' variance: sharper ones would leave the encoder no digits
 constexpr double LATE_SIGMA = 10.0;   // stated line times may have the other sign, or be of other units
-
-double median_of(std::vector<double> &values)
-{
-    if (values.empty()) {
-        return 0.0;
-    }
-    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    return *middle;
-}
 
 int common_tracks(const TrackTable &table, int first, int last)
 {
@@ -115,17 +106,21 @@ struct LeafPlan {
     int first, count;
 };
 
+LeafPlan leaf_from(const TrackTable &table, int first, const Limits &limits)
+{
+    int count = 3;
+    while (count < limits.longest_leaf && first + count < table.frames() &&
+           common_tracks(table, first, first + count) >= limits.wanted_common) {
+        count++;
+    }
+    return {first, count};
+}
+
 std::vector<LeafPlan> plan_leaves(const TrackTable &table, const Limits &limits)
 {
     std::vector<LeafPlan> plans;
-    for (int first = 0; first + 2 < table.frames();) {
-        int count = 3;
-        while (count < limits.longest_leaf && first + count < table.frames() &&
-               common_tracks(table, first, first + count) >= limits.wanted_common) {
-            count++;
-        }
-        plans.push_back({first, count});
-        first += count - 2;
+    for (int first = 0; first + 2 < table.frames(); first += plans.back().count - 2) {
+        plans.push_back(leaf_from(table, first, limits));
     }
     return plans;
 }
@@ -274,12 +269,7 @@ public:
     {
         Building out;
         for (int first = 0; first + 2 < table_.frames();) {
-            int count = 3;
-            while (count < options_.limits.longest_leaf && first + count < table_.frames() &&
-                   common_tracks(table_, first, first + count) >= options_.limits.wanted_common) {
-                count++;
-            }
-            Leaf leaf = try_leaf(table_, camera_, {first, count}, options_.limits);
+            Leaf leaf = try_leaf(table_, camera_, leaf_from(table_, first, options_.limits), options_.limits);
             if (leaf.trouble != Trouble::none) {
                 note(out, {first, first + 1, leaf.trouble, leaf.common});
                 first++;
