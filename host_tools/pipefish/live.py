@@ -49,6 +49,8 @@ class Course:
     places: dict[int, dict[str, Any]] = field(default_factory=dict)  # of the station's number along the pipe
     warned: dict[str, int] = field(default_factory=dict)  # kind of warning: last keyframe at which it held
     warnings: list[str] = field(default_factory=list)
+    driven: dict[int, float] = field(default_factory=dict)  # chainage of keyframes, of the encoder or the pictures
+    every: float = 0.0  # between places; 0: nothing is measured yet
     measured_at: int = 0  # keyframes at the last run
     why: str = ""  # the last run gave nothing
     void: bool = False  # the lens zoomed: from there on nothing is measured
@@ -122,41 +124,70 @@ class Course:
 
     def measure(self) -> list[str]:
         """Measures the next stretch; returns new warnings."""
-        from pipefish.measure import measure
-        from pipefish.measured_files import encoder_against_vision, stations
-
         indices = sorted(self.keyframes)
         # All that is new, or half a window of it where more has come at once: nothing is skipped.
         self.measured_at = min(len(indices), max(self.measured_at + WINDOW // 2, LEAST))
         indices = indices[max(0, self.measured_at - WINDOW) : self.measured_at]
         try:
-            m = measure(self._part(indices), method="incremental", threads=1, pictures=False)
+            return self._measure(indices)
         except PipefishError as error:
             self.why = str(error).removeprefix(f"{self.path}: ")
-            return self._warn("not measured", indices[-1], f"not measured: {self.why}", WINDOW)
+        except Exception as error:  # whatever it is, the next stretch is another one
+            self.why = f"internal error ({type(error).__name__}: {error})"
+        return self._warn("not measured", indices[-1], f"not measured: {self.why}", WINDOW)
+
+    def _measure(self, indices: list[int]) -> list[str]:
+        from pipefish.measure import measure
+        from pipefish.measured_files import stations
+
+        m = measure(self._part(indices), method="incremental", threads=1, pictures=False)
         self.why, self.unit = "", m.scale.unit
         told = self._warn("scale", 0, "no scale: diameters are not measured") if m.scale.unit != "metre" else []
         for gap in m.structure.gaps:
             if gap.reason == "zoom":
                 self.void, self.why = True, REASONS[gap.reason]
                 told += self._warn("zoom", int(m.index[gap.first]), f"not measured from here on: {self.why}")
-        along = self.along()
-        offset = next((along[i] - c for i, c in zip(indices, _driven(m), strict=True) if math.isfinite(c)), math.nan)
-        if not math.isfinite(offset):
-            offset = 0.0
+        offset = self._offset(indices, _driven(m))
+        middle = float(np.mean([self.driven[i] for i in indices if i in self.driven]))
         table = stations(m)
-        ends = np.array([along[i] for i in indices], float)
-        middle = float(np.nanmean(ends)) if np.isfinite(ends).any() else float(np.mean(table["chainage"]))
-        every = 0.25 * float(np.nanmedian(table["d_mean"]))
-        for k, at in enumerate(table["chainage"] + offset):
+        self._keep(table | {"chainage": table["chainage"] + offset}, middle)
+        return told + self._slips(m)
+
+    def _offset(self, indices: list[int], driven: np.ndarray) -> float:
+        """From a window's own chainage (K,) at these keyframes, NaN where it is not known, to the survey's: the
+        encoder's, else that of keyframes that a window before had, too, else on from where the last one ended."""
+        along = self.along()
+        known = {i: along[i] if math.isfinite(along[i]) else self.driven.get(i, math.nan) for i in indices}
+        apart = np.array([known[i] for i in indices]) - driven
+        measured = driven[np.isfinite(driven)]
+        if np.isfinite(apart).any():
+            offset = float(np.nanmedian(apart))
+        else:
+            offset = max(self.driven.values(), default=0.0) - float(measured.min())
+        for i, at in zip(indices, driven + offset, strict=True):
+            at = along[i] if math.isfinite(along[i]) else float(at)
+            if math.isfinite(at):
+                self.driven.setdefault(i, at)
+        return offset
+
+    def _keep(self, table: dict[str, np.ndarray], middle: float) -> None:
+        """Takes in stations by their chainage; middle: of the window that they are of."""
+        if not self.every:  # once: with another one each time a place far along the pipe would have several numbers
+            self.every = 0.25 * float(np.nanmedian(table["d_mean"]))
+        for k, at in enumerate(table["chainage"]):
             if not np.isfinite(table["d_mean"][k]):
                 continue
             row = {"at": float(at), "off": abs(float(at) - middle)}
             row |= {n: float(table[n][k]) for n in ("d_mean", "d_mean_sigma", "d_max", "d_min", "ovality")}
             row["systematic"] = float(table["d_mean_systematic"][k])
-            number = round(at / every)
+            number = round(at / self.every)
             if number not in self.places or self.places[number]["off"] > row["off"]:
                 self.places[number] = row
+
+    def _slips(self, m: Any) -> list[str]:
+        from pipefish.measured_files import encoder_against_vision
+
+        told: list[str] = []
         apart = encoder_against_vision(m)
         if apart is not None and m.scale.unit == "metre":
             excess, driven = np.array(apart["vision_minus_encoder"]), np.abs(np.diff(apart["chainage"]))

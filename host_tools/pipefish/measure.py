@@ -203,7 +203,8 @@ def _attitude(survey: Survey) -> tuple[np.ndarray | None, float]:
         told = frame.telemetry
         if "roll_rad" in told and "pitch_rad" in told:
             row[:] = told["roll_rad"], told["pitch_rad"]
-            sigmas.append(told.get("attitude_sigma_rad", 0.0) or DEFAULT_ATTITUDE_SIGMA)
+            sigma = told.get("attitude_sigma_rad", 0.0)
+            sigmas.append(sigma if sigma > 0.0 and math.isfinite(sigma) else DEFAULT_ATTITUDE_SIGMA)
     return (values, float(np.median(sigmas))) if sigmas else (None, DEFAULT_ATTITUDE_SIGMA)
 
 
@@ -292,6 +293,7 @@ def measure(
             sag_sigma=TRACK_SAG_PX2,
             hold_camera=camera.covariance is None,  # tracks are no better than what is assumed
             drift=drift_prior(weighed, camera, TRACK_SHARPER),
+            common_errors=True,  # the floor
             shutter=shutter,
         ),
         lambda: tell(0.05, "poses and points"),

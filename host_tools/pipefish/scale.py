@@ -288,7 +288,6 @@ def _arc_covariance(structure: Reconstruction, segment: int, tube: Tube, s: np.n
         np.add.at(total, back, row)
     found = structure.functions_covariance(first + on, jacobian)
     if structure.unit == "metre":
-        found = found / structure.variance_factor[segment]
         away = s - s[0]
         found = found - float(structure.scale_sigma or 0.0) ** 2 * np.outer(away, away)
     values, vectors = np.linalg.eigh(found)

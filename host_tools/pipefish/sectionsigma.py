@@ -23,7 +23,7 @@ LEAST = 30  # points
 class DiameterSigma:
     """Of the mean diameter along a stretch, in the structure's own unit.
 
-    s (K,); random (K,) standard deviations with the weights of the adjustment, the encoder's scale included; camera
+    s (K,); random (K,) standard deviations, the encoder's scale included; camera
     (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all
     """
 
@@ -35,21 +35,22 @@ class DiameterSigma:
 
 
 def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0, ellipse: float = 1.0) -> Shared:
-    """What the points of a segment share through the poses, at the weights of the adjustment. factor: by which the
-    structure was scaled since; ellipse: share of these weights' variance that counts in ovality, unless residuals show
-    more."""
+    """What the points of a segment share through the poses. factor: by which the structure was scaled since; ellipse:
+    share of this variance that counts in ovality, unless residuals show more."""
     first = int(np.searchsorted(structure.point_segment, segment))
-    weighed = structure.variance_factor[segment]
+    shown = structure.variance_factor[segment]
 
     def whole(places: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        return structure.functions_covariance(first + places, rows) * (factor**2 / weighed)
+        return structure.functions_covariance(first + places, rows) * factor**2
 
     def camera(places: np.ndarray, rows: np.ndarray) -> np.ndarray:
         return factor**2 * structure.functions_covariance(first + places, rows, systematic=True) - whole(places, rows)
 
-    own = structure.own_covariance[structure.point_segment == segment] / weighed
+    # The points' own part of `whole`: with the noise that the adjustment had, which is more than the residuals' where
+    # tracks err in common.
+    own = structure.own_covariance[structure.point_segment == segment] * (structure.noise[segment] ** 2 / shown)
     known = structure.parts[segment][1] is not None
-    return Shared(own, whole, camera if known else None, max(ellipse, min(1.0, weighed)))
+    return Shared(own, whole, camera if known else None, max(ellipse, min(1.0, shown)))
 
 
 def diameter_function(tube: Tube, s: float, diameter: float) -> tuple[np.ndarray, np.ndarray]:
@@ -76,21 +77,20 @@ def diameter_sigma(structure: Reconstruction, segment: int, tube: Tube) -> Diame
     total = np.zeros((len(tube.points["s"]), 3))
     places, random, camera = [], [], []
     whole = structure.parts[segment][1] is not None
-    factor = structure.variance_factor[segment]  # of the residuals: encoder and floor were weighed without it
     for k in chosen:
         on, by = diameter_function(tube, float(table["s"][k]), float(table["d_mean"][k]))
         if not len(on):
             continue
         total[on] += by
         places.append(float(table["s"][k]))
-        random.append(float(structure.functions_covariance(first + on, by[None])[0, 0]) / factor)
+        random.append(float(structure.functions_covariance(first + on, by[None])[0, 0]))
         if whole:
             camera.append(float(structure.functions_covariance(first + on, by[None], systematic=True)[0, 0]))
     if not places:
         return None
     on = np.flatnonzero(total.any(axis=1))
     by = total[None, on] / len(places)
-    mean = float(structure.functions_covariance(first + on, by)[0, 0]) / factor
+    mean = float(structure.functions_covariance(first + on, by)[0, 0])
     added = added_mean = None
     if whole:
         added = np.sqrt(np.maximum(0, np.array(camera) - random))

@@ -94,8 +94,9 @@ class Reconstruction:
     points           (N,3), track (N,) int64 the track of each, point_segment (N,)
     covariance       (N,3,3) of the points and pose_covariance (K,6,6) of the poses (rotation on the left, then centre),
                      random part, in the gauge of `gauge`; first frame of each segment: 0
-    own_covariance   (N,3,3) random part of the points, the poses held: what neighbours do not have in common. What fits
-                     a shape to the points wants this one: the other grows with the distance from the first frame
+    own_covariance   (N,3,3) random part of the points, the poses held, by the residuals: what neighbours do not have in
+                     common. What fits a shape to the points wants this one: the other grows with the distance from the
+                     first frame
     systematic       (N,3,3), pose_systematic (K,6,6): what the camera's own uncertainty adds; None where the profile
                      has no covariance
     unit             "metre", or "arbitrary" where there is no source of scale
@@ -103,7 +104,10 @@ class Reconstruction:
     scale_sigma      relative sigma of the scale, wheel included; None without a source
     wheel            (true distance over reading) - 1 as estimated, and wheel_sigma
     sigma            robust spread of the residuals, in units of the stated noise; variance_factor likewise, after
-                     outliers were removed, of each segment
+                     outliers were removed, of each segment's pixels
+    noise            of each segment: of the pixels over the stated one, as the estimate and its covariances have it:
+                     what the variance factor says (not less than 1 with common_errors). The encoder's, the
+                     inclinometer's and the camera's uncertainty stay as stated
     observations     used; outside: beyond the camera's model; repeated: the same track twice in a frame
     standing         frames not used: nothing had moved since the one before
     gaps             list of Gap
@@ -139,6 +143,7 @@ class Reconstruction:
     wheel_sigma: float
     sigma: list[float]
     variance_factor: list[float]
+    noise: list[float]
     observations: int
     outside: int
     repeated: int
@@ -211,7 +216,7 @@ class Reconstruction:
         found = random.functions(inside, rows)
         if systematic:
             return found + (total.functions(inside, rows) - found) / self.camera_share
-        return found * self.variance_factor[number]
+        return found
 
     def camera_of(self, camera: Camera, segment: int) -> Camera:
         """The camera with which a segment's poses and points agree: as estimated with its prior."""
@@ -238,6 +243,9 @@ def _steps(chainage: npt.ArrayLike, frames: int, encoder: Encoder) -> tuple[Floa
     given = np.asarray(chainage, dtype=np.float64)
     if given.ndim != 1 or len(given) < frames:
         raise ArgumentError(f"chainage: expected one number for each of {frames} frames, got shape {given.shape}")
+    sigmas = (encoder.noise_m_per_sqrt_m, encoder.scale_sigma, encoder.quantum)
+    if not (np.isfinite(sigmas).all() and min(sigmas) >= 0.0 and encoder.scale_sigma > 0.0):
+        raise ArgumentError(f"encoder: scale_sigma is not above 0, or another value of {encoder} is below")
     step = np.append(np.diff(given[:frames]), np.nan)
     noise = encoder.noise_m_per_sqrt_m**2 * np.abs(np.nan_to_num(step)) + encoder.quantum**2 / 6.0
     if not (noise[np.isfinite(step) & (step != 0.0)] > 0.0).all():
@@ -250,9 +258,10 @@ def _down(attitude: npt.ArrayLike, frames: int) -> Floats:
     given = np.asarray(attitude, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 2 or len(given) < frames:
         raise ArgumentError(f"attitude: expected roll and pitch for each of {frames} frames, got shape {given.shape}")
-    roll, pitch = given[:frames].T
+    known = np.isfinite(given[:frames]).all(axis=1)
+    roll, pitch = np.where(known[:, None], given[:frames], 0.0).T
     down = np.column_stack([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])
-    return np.ascontiguousarray(np.nan_to_num(down))
+    return np.ascontiguousarray(np.where(known[:, None], down, 0.0))
 
 
 def _checked(shutter: RollingShutter, frames: int, camera: Camera) -> RollingShutter | None:
@@ -307,6 +316,7 @@ class _Asked:
     down_sigma: float
     covariance: Floats | None
     drift: tuple[Sequence[str], Floats, float] | None
+    common_errors: bool
     sag_sigma: float
     shutter: RollingShutter | None
 
@@ -314,7 +324,7 @@ class _Asked:
         """What the engine finds of the frames before one, with these numbers of the observations' tracks."""
         tracks, drift, shutter = self.tracks, self.drift, self.shutter
         kept = tracks.frame < end
-        return _engine.reconstruct(
+        return _engine_run(
             self.camera._profile,
             end,
             len(self.names),
@@ -337,6 +347,7 @@ class _Asked:
             [PARAMETERS.index(name) for name in drift[0]] if drift else [],
             np.ascontiguousarray(drift[1]) if drift else None,
             float(drift[2]) if drift else 1.0,
+            self.common_errors,
             self.sag_sigma,
             None if shutter is None else np.asarray(shutter.time)[:end],
             0.0 if shutter is None else shutter.line_time,
@@ -385,6 +396,7 @@ def reconstruct(
     sag_sigma: float = 0.0,
     hold_camera: bool = False,
     drift: tuple[Sequence[str], Floats, float] | None = None,
+    common_errors: bool = False,
     shutter: RollingShutter | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
@@ -404,6 +416,8 @@ def reconstruct(
     drift      names of the camera's parameters, their covariance, as wide as they may have changed since it was
                calibrated, and a factor on the noise of the tracks: the adjustment is then made once more with them
                free, for Reconstruction.drift alone
+    common_errors   the stated noise holds errors that tracks have in common, too, which leave no residual: it counts
+               as stated even where residuals are smaller, against the encoder and in the covariances
     shutter    of a camera whose rows are exposed one after the other; None: all at once
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
@@ -420,6 +434,8 @@ def reconstruct(
     if chainage is not None:
         step, step_sigma = _steps(chainage, frames, encoder)
     if attitude is not None:
+        if not (np.isfinite(attitude_sigma) and attitude_sigma > 0.0):
+            raise ArgumentError(f"attitude_sigma: {attitude_sigma} is not above 0")
         down = _down(attitude, frames)
     if shutter is not None:
         shutter = _checked(shutter, frames, camera)
@@ -440,6 +456,7 @@ def reconstruct(
         down_sigma=float(attitude_sigma),
         covariance=None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
         drift=drift,
+        common_errors=common_errors,
         sag_sigma=float(sag_sigma),
         shutter=shutter,
     )
@@ -461,6 +478,13 @@ def reconstruct(
         part["noise"] = drift[2]
     out.own_covariance = _own_covariance(out, tracks, camera, sigma)
     return out
+
+
+def _engine_run(*arguments: Any) -> dict[str, Any]:
+    try:
+        return _engine.reconstruct(*arguments)
+    except ValueError as error:  # numbers that leave the range of an adjustment
+        raise ArgumentError(f"these tracks, chainage and priors cannot be adjusted: {error}") from error
 
 
 def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: float) -> Floats:
@@ -543,9 +567,8 @@ def _result(
         points.append(s["points"] @ r.T + t)
         spin = np.eye(6)
         spin[3:, 3:] = r
-        factor = s["variance_factor"]
-        covariances.append(factor * (r @ s["random"].point @ r.T))
-        pose_covariances.append(factor * (spin @ s["random"].pose @ spin.T))
+        covariances.append(r @ s["random"].point @ r.T)
+        pose_covariances.append(spin @ s["random"].pose @ spin.T)
         pose_covariances[-1][0] = 0.0  # held; the engine has the unit matrix there
         if s["total"] is not None:
             systematic.append(r @ (s["total"].point - s["random"].point) @ r.T / share)
@@ -576,6 +599,7 @@ def _result(
         wheel_sigma=_wheel_sigma(first) or 0.0,
         sigma=[s["sigma"] for s in segments],
         variance_factor=[s["variance_factor"] for s in segments],
+        noise=[s["noise"] for s in segments],
         observations=sum(s["observations"] for s in segments),
         outside=found["outside"],
         repeated=found["repeated"],

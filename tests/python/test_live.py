@@ -71,6 +71,46 @@ def test_the_newest_stretch_is_measured_as_it_arrives(objects, tmp_path):
     assert dict(summary_rows(summary))["warnings"] == "none"
 
 
+def test_without_an_encoder_places_are_where_the_pictures_say(drive, tmp_path):
+    """Each window's own path begins at 0: what windows have in common carries it on. In mean diameters."""
+    course, _ = fed(objects_of(drive, encoder=False), tmp_path / "a.mcap")
+    summary = course.summary()
+    assert summary["unit"] == "diameter"
+    assert course.driven[50] - course.driven[0] == pytest.approx(drive.driven[50] / 0.3, rel=0.02)
+    assert summary["from"] < 1 and 7.7 < summary["to"] < 9 and 30 < summary["stations"] < 36
+    assert np.diff([course.places[k]["at"] for k in sorted(course.places)]).min() > 0
+    newest = course.progress()["newest"]["at"]
+    assert newest == pytest.approx(summary["to"])
+
+
+def test_a_place_has_one_number_however_far_it_is():
+    """Two windows at 100 m whose mean diameters differ by 0.3 %, a whole place there."""
+    course, at = Course(Path("a.mcap")), 100 + 0.075 * np.arange(20)
+    for diameter, middle in ((0.3, 100.0), (0.301, 101.425)):
+        values = np.full(len(at), diameter)
+        names = ("d_mean", "d_mean_sigma", "d_max", "d_min", "ovality", "d_mean_systematic")
+        course._keep({"chainage": at} | dict.fromkeys(names, values), middle)
+    places = [course.places[k] for k in sorted(course.places)]
+    assert [p["at"] for p in places] == at.tolist()
+    assert [p["d_mean"] for p in places] == [0.3] * 10 + [0.301] * 10, "of the window nearer to its middle"
+
+
+def test_a_window_that_fails_does_not_end_the_measurement(objects, tmp_path, monkeypatch):
+    """Whatever goes wrong in one: it is told, and the rest is measured."""
+    measured, calls = Course._measure, []
+
+    def fails_once(self: Course, indices: list[int]) -> list[str]:
+        calls.append(indices)
+        if len(calls) == 2:
+            raise ValueError("a number")
+        return measured(self, indices)
+
+    monkeypatch.setattr(Course, "_measure", fails_once)
+    course, told = fed(objects, tmp_path / "a.mcap")
+    assert [t for t in told if "not measured" in t] == ["1.00 m: not measured: internal error (ValueError: a number)"]
+    assert len(calls) > 3 and course.summary()["to"] > 2.3 and not course.progress()["why"]
+
+
 def test_slip_darkness_and_a_break_are_told_once_and_where(objects, tmp_path):
     def slip(m: pb.Keyframe) -> None:
         m.telemetry.encoder_count += 60  # 30 mm that the camera did not go

@@ -131,6 +131,48 @@ def test_wheels_that_slip_do_not_stretch_the_pipe() -> None:
     assert rec.length == pytest.approx(drive.driven[-1], rel=0.003)
 
 
+@pytest.mark.parametrize("jump", [1.5, 8.0, 1e4])
+def test_one_wild_reading_of_the_encoder_does_not_end_the_survey(jump: float) -> None:
+    """A glitch of thousands of sigmas: there both exponentials of the slip's mixture are 0 in double precision."""
+    drive = tube_drive(7, 2.0)
+    chainage = readings(drive, 7)
+    chainage[20:] += jump
+    rec = pf.reconstruct(drive.tracks, drive.camera, chainage)
+    assert rec.status == "ok" and rec.length == pytest.approx(drive.driven[-1], rel=0.01)
+    assert rec.variance_factor[0] == pytest.approx(1, abs=0.1), "of the pixels: they know nothing of the glitch"
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 3.0])
+def test_the_pixels_noise_is_not_the_encoders(sigma: float) -> None:
+    """A wheel known to 1 %: no length is known better, however much better the pixels are than was stated, and the
+    encoder's own noise stays in it. Against the pixels it counts by what the residuals show."""
+    drive = tube_drive(7, 2.0)
+    chainage = readings(drive, 7)
+    rec = pf.reconstruct(drive.tracks, drive.camera, chainage, encoder=pf.Encoder(scale_sigma=0.01), sigma=sigma)
+    assert rec.variance_factor[0] == pytest.approx((0.3 / sigma) ** 2, rel=0.1)
+    axis = drive.poses[0, :, :3] @ np.array([0.0, 0.0, 1.0])
+    length = np.linalg.norm(rec.centres[-1] - rec.centres[0])
+    assert np.sqrt(axis @ rec.pose_covariance[-1, 3:, 3:] @ axis) / length == pytest.approx(0.0101, rel=0.02)
+    exact = pf.reconstruct(drive.tracks, drive.camera, chainage, encoder=pf.Encoder(scale_sigma=1e-5), sigma=sigma)
+    found = np.sqrt(axis @ exact.pose_covariance[-1, 3:, 3:] @ axis)
+    assert found == pytest.approx(0.0005 * np.sqrt(len(drive.driven) - 1), rel=0.1)
+    across = np.sqrt(np.trace(exact.own_covariance.mean(0)))
+    assert across == pytest.approx(np.sqrt(np.trace(rec.own_covariance.mean(0))), rel=0.05)
+
+
+def test_errors_in_common_keep_the_noise_as_stated() -> None:
+    """Nothing is taken off a noise that no residual shows; one that is too small grows to what residuals show."""
+    drive = tube_drive(18, 1.0)
+    small, large, plain = (
+        pf.reconstruct(drive.tracks, drive.camera, sigma=s, common_errors=c)
+        for s, c in ((0.2, True), (1.0, True), (0.3, False))
+    )
+    assert small.noise[0] == pytest.approx(1.5, rel=0.05) and large.noise == [1.0]
+    own = np.trace(plain.covariance.mean(0))
+    assert np.trace(small.covariance.mean(0)) == pytest.approx(own, rel=0.05)
+    assert np.trace(large.covariance.mean(0)) == pytest.approx(own / 0.09, rel=0.1)
+
+
 def test_inclinometer_says_where_down_is() -> None:
     drive = tube_drive(8, 2.0)
     world_down = drive.poses[:, :, :3] @ np.array([0.0, 1.0, 0.0])
@@ -319,12 +361,49 @@ def test_photographs_of_a_fountain(real_data: Callable[[str], Path], tmp_path: P
             assert np.degrees(np.arcsin(sine)) < 0.05
 
 
+@pytest.mark.parametrize("broken", [False, True], ids=["one stretch", "two"])
+def test_an_inclinometer_that_stops_takes_nothing_with_it(broken: bool) -> None:
+    """Its last readings come before a break of all tracks: the stretch behind it has none, and is measured without."""
+    drive = tube_drive(7, 2.0)
+    t, frames = drive.tracks, len(drive.poses)
+    cut = frames // 2
+    tracks = pf.Tracks(t.frame, t.track + 10**6 * (broken & (t.frame >= cut)), t.pixels)
+    attitude = np.zeros((frames, 2))
+    attitude[cut - 2 :] = np.nan
+    # Corners behind the break are not those before it, or the two would be joined.
+    if broken:
+        here = (t.frame < cut) | (t.track % 2 == 0)
+        before = (t.frame >= cut) | (t.track % 2 == 1)
+        tracks = pf.Tracks(t.frame[here & before], tracks.track[here & before], t.pixels[here & before])
+    rec = pf.reconstruct(tracks, drive.camera, readings(drive, 7), attitude=attitude)
+    assert len(rec.frames) == frames and len(rec.sigma) == (2 if broken else 1) and rec.down is not None
+
+
+def test_an_inclinometer_that_says_nothing_is_none() -> None:
+    """A roll that is not known is no roll of 0: gravity is taken from readings that are whole."""
+    drive = tube_drive(8, 1.0)
+    nothing = np.full((len(drive.poses), 2), np.nan)
+    rec = pf.reconstruct(drive.tracks, drive.camera, attitude=nothing)
+    assert rec.status == "ok" and rec.down is None
+    pitch_alone = np.column_stack([nothing[:, 0], np.full(len(drive.poses), -0.2)])
+    other = pf.reconstruct(drive.tracks, drive.camera, attitude=pitch_alone)
+    assert other.down is None and np.array_equal(other.poses, rec.poses)
+
+
 def test_wrong_arguments_are_named() -> None:
     drive = tube_drive(17, 0.5)
     with pytest.raises(pf.ArgumentError, match="method"):
         pf.reconstruct(drive.tracks, drive.camera, method="magic")
     with pytest.raises(pf.ArgumentError, match="chainage"):
         pf.reconstruct(drive.tracks, drive.camera, [0.0, 1.0])
+    flat = np.zeros((len(drive.poses), 2))
+    for sigma in (0.0, -1.0, np.nan):
+        with pytest.raises(pf.ArgumentError, match="attitude_sigma"):
+            pf.reconstruct(drive.tracks, drive.camera, attitude=flat, attitude_sigma=sigma)
+        with pytest.raises(pf.ArgumentError, match="encoder"):
+            pf.reconstruct(drive.tracks, drive.camera, drive.driven, encoder=pf.Encoder(scale_sigma=sigma))
+    with pytest.raises(pf.ArgumentError, match="encoder"):
+        pf.reconstruct(drive.tracks, drive.camera, drive.driven, encoder=pf.Encoder(noise_m_per_sqrt_m=np.nan))
     with pytest.raises(pf.ArgumentError, match="attitude"):
         pf.reconstruct(drive.tracks, drive.camera, attitude=[[0.0, 1.0]])
     with pytest.raises(pf.ArgumentError, match="pixels"):

@@ -20,7 +20,7 @@ import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import read_columns, read_points
-from pipefish.measure import measure
+from pipefish.measure import DEFAULT_ATTITUDE_SIGMA, _attitude, measure
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
 from synthetic import BOOT, SURVEY, Object, as_object, picture, write_survey
@@ -121,6 +121,19 @@ def test_places_are_taken_where_they_were_found(drive: Drive, tmp_path: Path) ->
     tracks = measure(Survey.open(path)).tracks
     np.testing.assert_allclose(tracks.pixels, drive.tracks.pixels, atol=1e-5)
     assert np.median(tracks.covariance[:, 0, 0]) > 0.09 + 0.05  # 0.3 px, and half of those 0.5 px at the median
+
+
+def test_an_inclinometer_that_does_not_know_its_sigma_has_the_usual_one(drive: Drive, tmp_path: Path) -> None:
+    objects = []
+    for item in objects_of(drive, attitude=True, frames=np.arange(4)):
+        if item[1] == OBJECT_KEYFRAME:
+            message = pb.Keyframe.FromString(item[2])
+            message.telemetry.attitude_sigma_rad = np.nan
+            item = as_object(OBJECT_KEYFRAME, message)
+        objects.append(item)
+    write_survey(tmp_path / "survey.mcap", objects=objects)
+    values, sigma = _attitude(Survey.open(tmp_path / "survey.mcap"))
+    assert np.isfinite(values).all() and sigma == DEFAULT_ATTITUDE_SIGMA
 
 
 def failure(capsys, *arguments: object) -> str:

@@ -51,7 +51,7 @@ def test_covariances_are_the_inverse_of_the_whole_normal_matrix() -> None:
     held = np.zeros(size)
     held[6 * views - 3 : 6 * views] = baseline / np.linalg.norm(baseline) ** 2 / 1e-7
     normal += np.outer(held, held)
-    inverse = np.linalg.inv(normal[6:, 6:]) * rec.variance_factor[0]
+    inverse = np.linalg.inv(normal[6:, 6:]) * rec.noise[0] ** 2
     poses = np.array([inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(views - 1)])
     start = 6 * (views - 1)
     points = np.array(
@@ -91,7 +91,7 @@ def test_two_gauges_say_the_same_of_what_no_gauge_changes() -> None:
     free = inner(there.points[a[some]])
     found = []
     for rec, places, by in ((there, a[some], np.eye(3)), (back, b[some], scale * turn)):
-        covariance = rec.functions_covariance(places, rows @ by) / rec.variance_factor[0]
+        covariance = rec.functions_covariance(places, rows @ by) / rec.noise[0] ** 2
         found.append(free @ covariance @ free.T)
         raw = np.trace(covariance)
     assert raw > 2 * np.trace(found[0]), "the gauges must matter"

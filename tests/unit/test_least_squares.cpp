@@ -398,6 +398,26 @@ void test_start_outside_the_domain_throws()
     TEST_ASSERT_TRUE(thrown);
 }
 
+// Proves: a mixture's loss is minus twice the logarithm of its density as long as that can be written down, and goes on
+// beyond, where both its exponentials are 0 in double precision: finite, rising, its weight the derivative and that of
+// the wide part.
+void test_mixture_is_finite_however_far_off()
+{
+    const RobustLoss loss{RobustLoss::Kind::mixture, 30.0, 0.05};
+    const auto density = [](double s) { return 0.95 * std::exp(-0.5 * s) + 0.05 / 30.0 * std::exp(-0.5 * s / 900.0); };
+    for (double s = 0.0; s < 5e4; s = 1.3 * s + 0.01) {
+        TEST_ASSERT_DOUBLE_WITHIN(1e-9 * (1.0 + s), -2.0 * std::log(density(s) / density(0.0)), loss(s).rho);
+        const double h = 1e-4 * (1.0 + s), slope = (loss(s + h).rho - loss(s).rho) / h;
+        TEST_ASSERT_TRUE(loss(s + h).weight <= loss(s).weight);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-3 * loss(s).weight, loss(s + 0.5 * h).weight, slope);
+    }
+    for (double s = 1e5, before = loss(5e4).rho; s < 1e300; before = loss(s).rho, s *= 1e3) {
+        const auto [rho, weight] = loss(s);
+        TEST_ASSERT_TRUE(std::isfinite(rho) && rho > before);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-12, 1.0 / 900.0, weight);
+    }
+}
+
 } // namespace
 
 int main()
@@ -411,5 +431,6 @@ int main()
     RUN_TEST(test_threads_do_not_change_a_bit);
     RUN_TEST(test_undetermined_parameter_is_refused_a_covariance);
     RUN_TEST(test_start_outside_the_domain_throws);
+    RUN_TEST(test_mixture_is_finite_however_far_off);
     return UNITY_END();
 }

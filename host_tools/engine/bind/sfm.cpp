@@ -224,8 +224,9 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["scale_sigma"] = segment.scale_sigma;
     out["variance_factor"] = segment.report.variance_factor;
     out["observations"] = segment.report.observations;
-    out["cost"] = segment.report.summary.final_cost;
-    out["iterations"] = segment.report.summary.iterations;
+    out["noise"] = segment.noise;
+    out["cost"] = segment.report.cost;
+    out["iterations"] = segment.iterations;
     out["converged"] = segment.report.summary.status == pipefish::optim::Status::converged;
     out["wheel"] = segment.report.wheel;
     out["sag"] = to_numpy<double>(segment.report.sag.data(), {3});
@@ -255,6 +256,7 @@ nb::dict adjust(const pf_profile &profile, const Poses &poses, const Triples &po
     options.max_iterations = max_iterations;
     sfm::Segment segment;
     segment.report = sfm::adjust(map, table, profile.camera, options, &segment.random);
+    segment.iterations = segment.report.summary.iterations;
     segment.map = std::move(map);
     return segment_dict(segment);
 }
@@ -285,7 +287,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::optional<Values> &step, const std::optional<Values> &step_sigma, double scale_sigma,
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
                      const std::optional<Square> &uncertainty, const std::vector<uint32_t> &drifting,
-                     const std::optional<Square> &drift, double drift_noise, double sag_sigma,
+                     const std::optional<Square> &drift, double drift_noise, bool common_errors, double sag_sigma,
                      const std::optional<Values> &frame_time, double line_time, double middle_row)
 {
     Extras extras;
@@ -311,6 +313,7 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     options.camera_prior = prior_of(uncertain, uncertainty, extras.camera);
     options.drift_prior = prior_of(drifting, drift, extras.drift);
     options.drift_noise = drift_noise;
+    options.common_errors = common_errors;
     if (frame_time) {
         extras.shutter.time.assign(frame_time->data(), frame_time->data() + frame_time->shape(0));
         extras.shutter.line_time = line_time;
@@ -366,7 +369,7 @@ void bind_sfm(nb::module_ &m)
           nb::arg("threads"), nb::arg("still"), nb::arg("step").noconvert().none(),
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("drifting"),
-          nb::arg("drift").noconvert().none(), nb::arg("drift_noise"), nb::arg("sag_sigma"),
+          nb::arg("drift").noconvert().none(), nb::arg("drift_noise"), nb::arg("common_errors"), nb::arg("sag_sigma"),
           nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"),
           "Poses and points from tracks; see pipefish.structure.");
     m.def("adjust", &adjust, nb::arg("camera"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(),

@@ -4,6 +4,7 @@
 #include "geometry/degenerate.hpp"
 #include "geometry/minimal.hpp"
 #include "geometry/triangulate.hpp"
+#include "median.hpp"
 
 #include <Eigen/Cholesky>
 
@@ -330,16 +331,6 @@ Best search(std::span<const Sight> a, std::span<const Sight> b, std::span<const 
     }
     *iterations = iteration;
     return best;
-}
-
-double median_of(std::vector<double> &values)
-{
-    if (values.empty()) {
-        return 0.0;
-    }
-    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    return *middle;
 }
 
 // A wrong pair that happens to lie on its epipolar curve mostly has a parallax far beyond the others', and pulls with

@@ -36,10 +36,11 @@ struct RobustLoss {
         case Kind::cauchy:
             return {c2 * std::log1p(s / c2), 1.0 / (1.0 + s / c2)};
         case Kind::mixture: {
-            // rho = -2 log of the density, less its value at 0; the weight is its derivative.
-            const double wide = share / scale, narrow = (1.0 - share) * std::exp(-0.5 * s);
-            const double broad = wide * std::exp(-0.5 * s / c2), sum = narrow + broad;
-            return {-2.0 * std::log(sum / (1.0 - share + wide)), (narrow + broad / c2) / sum};
+            // rho = -2 log of the density, less its value at 0; the weight is its derivative. With the exponential of
+            // the wide part taken out of the sum: far off, where both are 0 in double precision, it is that part alone.
+            const double wide = share / scale, decay = std::exp(-0.5 * s * (1.0 - 1.0 / c2));
+            const double sum = (1.0 - share) * decay + wide;
+            return {s / c2 - 2.0 * std::log(sum / (1.0 - share + wide)), ((1.0 - share) * decay + wide / c2) / sum};
         }
         default:
             return {s, 1.0};

@@ -115,8 +115,9 @@ public:
                                   camera_columns_ ? by_camera.data() : nullptr) != PF_OK) {
                 continue;
             }
-            const Vector2d r = o.whiten * (uv + sag_columns(o.sag) * state_.sag - o.sight.uv);
-            const Rows<2, 3> whitened = o.whiten * slope / yardstick();
+            const Eigen::Matrix2d whiten = o.whiten / options_.noise;
+            const Vector2d r = whiten * (uv + sag_columns(o.sag) * state_.sag - o.sight.uv);
+            const Rows<2, 3> whitened = whiten * slope / yardstick();
             const Rows<2, 3> j_point = whitened * turn.r;
             Rows<2, 3> j_turn;
             for (int row = 0; row < 2; row++) { // d(R (X - c)) = w x x - R dc
@@ -136,7 +137,7 @@ public:
                 j_border.col(0) = -whitened * x;
             }
             if (sag_at_ >= 0) {
-                j_border.middleCols<3>(sag_at_) = o.whiten * sag_columns(o.sag);
+                j_border.middleCols<3>(sag_at_) = whiten * sag_columns(o.sag);
             }
             if (late_at_ >= 0) { // further on the way: turned more, and moved
                 const size_t f = static_cast<size_t>(frames[0]), other = static_cast<size_t>(frames[1]);
@@ -145,7 +146,7 @@ public:
             }
             for (int c = 0; c < camera_columns_; c++) {
                 j_border.col(camera_at_ + c) =
-                    o.whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
+                    whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
             }
             const double *j_f[2] = {j_pose[0].data(), j_pose[1].data()};
             const size_t poses = rolls() ? 2 : 1;
@@ -160,6 +161,7 @@ public:
             return cost_rest();
         }
         const size_t point = static_cast<size_t>(e);
+        const double noise_squared = options_.noise * options_.noise;
         double sum = 0.0;
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
             if (!seen_[k]) {
@@ -168,7 +170,7 @@ public:
             const Observation &o = table_[place_[k]];
             const Vector2d error =
                 Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + sag_columns(o.sag) * state_.sag - o.sight.uv;
-            sum += 0.5 * options_.loss((o.whiten * error).squaredNorm()).rho;
+            sum += 0.5 * options_.loss((o.whiten * error).squaredNorm() / noise_squared).rho;
         }
         return sum;
     }
@@ -220,13 +222,14 @@ public:
     const std::vector<int> &used() const { return place_; }
     int observations() const { return static_cast<int>(place_.size()); }
     int late_at() const { return late_at_; }
+    Vector3d down() const { return options_.gravity ? state_.down : Vector3d(Vector3d::Zero()); }
 
-    // Degrees of freedom of the residuals, those of the rest included.
+    // Of the pixels alone: what shares the border with them (wheel, gravity, priors) tells that border, and the scale.
     int redundancy() const
     {
         const int frames = banded() - options_.held_front - options_.held_back;
-        const bool scale_free = options_.hold_scale && !options_.odometry;
-        return 2 * observations() - 6 * frames - 3 * eliminated() + (scale_free ? 1 : 0) + extra_rows_ - border_;
+        const bool scale_free = options_.hold_scale || options_.odometry;
+        return std::max(2 * observations() - 6 * frames - 3 * eliminated() + (scale_free ? 1 : 0), 1);
     }
 
 private:
@@ -321,40 +324,43 @@ private:
     {
         if (options_.odometry) {
             border_ = 1;
-            extra_rows_ = 1;
-            for (int f = 0; f + 1 < banded(); f++) {
-                extra_rows_ += has_step(f);
-            }
+        }
+        if (options_.gravity && !start_gravity()) {
+            options_.gravity = nullptr;
         }
         if (options_.gravity) {
             down_at_ = border_;
             border_ += 2;
-            Vector3d sum = Vector3d::Zero();
-            for (size_t f = 0; f < state_.rotation.size(); f++) {
-                const Vector3d &down = options_.gravity->down[f + static_cast<size_t>(first_)];
-                extra_rows_ += down.isZero() ? 0 : 2;
-                sum += state_.rotation[f].transpose() * down;
-            }
-            state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
         }
         if (options_.sag_sigma > 0.0) {
             sag_at_ = border_;
             border_ += 3;
-            extra_rows_ += 3;
         }
         if (options_.late_sigma > 0.0 && rolls()) {
             late_at_ = border_++;
-            extra_rows_++;
         }
         if (options_.camera_prior) {
             camera_at_ = border_;
             camera_columns_ = static_cast<int>(options_.camera_prior->parameter.size());
             border_ += camera_columns_;
-            extra_rows_ += camera_columns_;
             state_.camera = Eigen::VectorXd::Zero(camera_columns_);
             const Eigen::LLT<Eigen::MatrixXd> llt(options_.camera_prior->covariance);
             camera_root_ = llt.matrixL().solve(Eigen::MatrixXd::Identity(camera_columns_, camera_columns_));
         }
+    }
+
+    // False where the inclinometer says nothing of these frames: nothing would tell where down is.
+    bool start_gravity()
+    {
+        Vector3d sum = Vector3d::Zero();
+        bool known = false;
+        for (size_t f = 0; f < state_.rotation.size(); f++) {
+            const Vector3d &down = options_.gravity->down[f + static_cast<size_t>(first_)];
+            known = known || !down.isZero();
+            sum += state_.rotation[f].transpose() * down;
+        }
+        state_.down = sum.isZero() ? Vector3d(Vector3d::UnitY()) : Vector3d(sum.normalized());
+        return known;
     }
 
     bool has_step(int f) const { return std::isfinite(options_.odometry->step[static_cast<size_t>(f + first_)]); }
@@ -544,7 +550,7 @@ private:
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
     std::vector<int> wanted_; // ascending
-    int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_at_ = 0, camera_columns_ = 0, extra_rows_ = 0;
+    int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_at_ = 0, camera_columns_ = 0;
     Eigen::MatrixXd camera_root_;
     double start_length_ = 1.0;
 };
@@ -595,10 +601,12 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.observations = problem.observations();
     report.points = problem.eliminated();
     report.summary = solver.minimize(problem, settings);
-    report.variance_factor = 2.0 * report.summary.final_cost / std::max(problem.redundancy(), 1);
-    report.redundancy = std::max(problem.redundancy(), 1);
+    const double rest = problem.cost(-1), pixels = (report.summary.final_cost - rest) * options.noise * options.noise;
+    report.redundancy = problem.redundancy();
+    report.variance_factor = 2.0 * pixels / report.redundancy;
+    report.cost = pixels + rest;
     report.wheel = problem.state().wheel;
-    report.down = options.gravity ? problem.state().down : Vector3d(Vector3d::Zero());
+    report.down = problem.down();
     report.sag = problem.state().sag;
     report.late = problem.state().late;
     report.late_at = problem.late_at();

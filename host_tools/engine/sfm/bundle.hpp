@@ -53,9 +53,10 @@ struct BundleOptions {
     int max_iterations = 50;
     double cost_tolerance = 1e-8;
     double lambda =
-        1e-4;          // first damping: small where the start is good, for a chain's soft bends hardly change the cost
-    double gate = 0.0; // observations further off than this many sigmas are left out; 0: all that can be projected
-    int min_views = 2; // points with fewer are left out
+        1e-4;           // first damping: small where the start is good, for a chain's soft bends hardly change the cost
+    double noise = 1.0; // of the pixels, over the one their table states; odometry and priors stay as stated
+    double gate = 0.0;  // observations further off than this many sigmas are left out; 0: all that can be projected
+    int min_views = 2;  // points with fewer are left out
     int threads = 1;
     const Odometry *odometry = nullptr;
     const Gravity *gravity = nullptr;
@@ -70,8 +71,9 @@ struct BundleOptions {
 struct BundleReport {
     optim::Summary summary;
     int observations = 0, points = 0;
-    int redundancy = 1;           // degrees of freedom of the residuals
-    double variance_factor = 1.0; // cost over degrees of freedom: 1 = noise as stated
+    int redundancy = 1;           // degrees of freedom of the pixels' residuals
+    double variance_factor = 1.0; // of the pixels, cost over degrees of freedom: 1 = noise as the table states it
+    double cost = 0.0;            // half the sum of squares, pixels in the table's noise
     double wheel = 0.0;           // w
     Vector3d down = Vector3d::Zero();
     Vector3d sag = Vector3d::Zero(); // px^2, as sag_columns() takes it

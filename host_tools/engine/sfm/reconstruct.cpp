@@ -1,6 +1,7 @@
 #include "sfm/reconstruct.hpp"
 
 #include "geometry/triangulate.hpp"
+#include "median.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -11,17 +12,8 @@ namespace pipefish::sfm
 namespace
 {
 
-constexpr double LATE_SIGMA = 10.0; // stated line times may have the other sign, or be of other units
-
-double median_of(std::vector<double> &values)
-{
-    if (values.empty()) {
-        return 0.0;
-    }
-    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    return *middle;
-}
+constexpr double LEAST_FACTOR = 1e-6; // of the pixels' variance: sharper ones would leave the encoder no digits
+constexpr double LATE_SIGMA = 10.0;   // stated line times may have the other sign, or be of other units
 
 int common_tracks(const TrackTable &table, int first, int last)
 {
@@ -114,17 +106,21 @@ struct LeafPlan {
     int first, count;
 };
 
+LeafPlan leaf_from(const TrackTable &table, int first, const Limits &limits)
+{
+    int count = 3;
+    while (count < limits.longest_leaf && first + count < table.frames() &&
+           common_tracks(table, first, first + count) >= limits.wanted_common) {
+        count++;
+    }
+    return {first, count};
+}
+
 std::vector<LeafPlan> plan_leaves(const TrackTable &table, const Limits &limits)
 {
     std::vector<LeafPlan> plans;
-    for (int first = 0; first + 2 < table.frames();) {
-        int count = 3;
-        while (count < limits.longest_leaf && first + count < table.frames() &&
-               common_tracks(table, first, first + count) >= limits.wanted_common) {
-            count++;
-        }
-        plans.push_back({first, count});
-        first += count - 2;
+    for (int first = 0; first + 2 < table.frames(); first += plans.back().count - 2) {
+        plans.push_back(leaf_from(table, first, limits));
     }
     return plans;
 }
@@ -273,12 +269,7 @@ public:
     {
         Building out;
         for (int first = 0; first + 2 < table_.frames();) {
-            int count = 3;
-            while (count < options_.limits.longest_leaf && first + count < table_.frames() &&
-                   common_tracks(table_, first, first + count) >= options_.limits.wanted_common) {
-                count++;
-            }
-            Leaf leaf = try_leaf(table_, camera_, {first, count}, options_.limits);
+            Leaf leaf = try_leaf(table_, camera_, leaf_from(table_, first, options_.limits), options_.limits);
             if (leaf.trouble != Trouble::none) {
                 note(out, {first, first + 1, leaf.trouble, leaf.common});
                 first++;
@@ -345,10 +336,36 @@ void normalise(Submap &map)
     transform(map, s);
 }
 
+// Robust adjustment and selection in turn, until hardly a point comes or goes; how many observations there were.
+int select(Segment &segment, const TrackTable &table, const pf_camera &camera, BundleOptions settings,
+           const Limits &limits)
+{
+    Submap &map = segment.map;
+    int observations = 0;
+    settings.loss = {optim::RobustLoss::Kind::huber, 3.0};
+    for (int cycle = 0; cycle < 3; cycle++) {
+        settings.max_iterations = cycle == 0 ? 30 : 15;
+        settings.cost_tolerance = 1e-6;
+        settings.gate = cycle == 0 ? 50.0 : 15.0;
+        const BundleReport report = adjust(map, table, camera, settings);
+        observations = report.observations;
+        // Residuals are smaller than errors: poses and points were fitted to them.
+        segment.sigma = robust_sigma(map, table, camera) *
+                        std::sqrt(2.0 * report.observations / static_cast<double>(report.redundancy));
+        const size_t before = map.tracks.size();
+        fuse_points(map, table, limits, 3, map.first, map.end());
+        clean(map, table, camera, 3.5 * std::max(segment.sigma, 0.5), 3, limits);
+        const size_t after = map.tracks.size(), change = after > before ? after - before : before - after;
+        if (change * 200 < after) {
+            break;
+        }
+    }
+    return observations;
+}
+
 void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
-    const Limits &limits = options.limits;
     normalise(map);
     if (options.odometry) {
         const double ratio = path_ratio(map, *options.odometry, &segment.scale_sigma);
@@ -372,34 +389,25 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     // Hardly damped: the softest bend of 300 m has 1e-12 of the diagonal's curvature, and steps damped by more than
     // that straighten it bit by bit (26 of them from 1e-9, which fell by a third each; now 3).
     settings.lambda = 1e-15;
-    int observations = 0;
-    for (int cycle = 0; cycle < 3; cycle++) {
-        settings.loss = {optim::RobustLoss::Kind::huber, 3.0};
-        settings.max_iterations = cycle == 0 ? 30 : 15;
-        settings.cost_tolerance = 1e-6;
-        settings.gate = cycle == 0 ? 50.0 : 15.0;
-        const BundleReport report = adjust(map, table, central, settings);
-        observations = report.observations;
-        // Residuals are smaller than errors: poses and points were fitted to them.
-        segment.sigma = robust_sigma(map, table, central) *
-                        std::sqrt(2.0 * report.observations / static_cast<double>(report.redundancy));
-        const size_t before = map.tracks.size();
-        fuse_points(map, table, limits, 3, map.first, map.end());
-        clean(map, table, central, 3.5 * std::max(segment.sigma, 0.5), 3, limits);
-        const size_t after = map.tracks.size(), change = after > before ? after - before : before - after;
-        if (change * 200 < after) {
-            break;
-        }
-    }
+    const int observations = select(segment, table, central, settings, options.limits);
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
     settings.cost_tolerance = 0.01 / std::max(observations, 1);
-    segment.report = adjust(map, table, central, settings, &segment.random);
+    settings.camera_prior = options.camera_prior;
+    segment.report = adjust(map, table, central, settings);
     const std::vector<int> used = segment.report.used; // or the covariances would be of different points
     settings.only = &used;
+    // The residuals tell the pixels' noise, not that of the encoder, the inclinometer or a prior: beside those the
+    // pixels count by what they are.
+    segment.noise = std::sqrt(std::max(segment.report.variance_factor, options.common_errors ? 1.0 : LEAST_FACTOR));
+    settings.noise = segment.noise;
+    settings.camera_prior = nullptr;
+    const int before = segment.report.summary.iterations;
+    segment.report = adjust(map, table, central, settings, &segment.random);
+    segment.iterations = before + segment.report.summary.iterations;
     if (table.rolls()) { // what the rows themselves say of their time: a wrong sign or unit bends the pipe in silence
         Submap again = map;
         settings.late_sigma = LATE_SIGMA;
@@ -407,17 +415,17 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
         const BundleReport report = adjust(again, table, central, settings, &known);
         if (report.late_at >= 0) {
             segment.late = report.late;
-            segment.late_sigma = std::sqrt(report.variance_factor * known.border()(report.late_at, report.late_at));
+            segment.late_sigma = std::sqrt(known.border()(report.late_at, report.late_at));
         }
         settings.late_sigma = 0.0;
     }
     if (options.drift_prior) {
         segment.drift.map = map;
         settings.camera_prior = options.drift_prior;
-        TrackTable sharper = table;
-        sharper.scale_noise(options.drift_noise);
+        settings.noise = options.drift_noise;
         BundleCovariance known;
-        segment.drift.camera = adjust(segment.drift.map, sharper, central, settings, &known).camera;
+        segment.drift.camera = adjust(segment.drift.map, table, central, settings, &known).camera;
+        settings.noise = segment.noise;
         const Eigen::Index n = segment.drift.camera.size();
         segment.drift.covariance = known.border().bottomRightCorner(n, n);
     }

@@ -18,6 +18,7 @@ struct ReconstructOptions {
     const CameraPrior *camera_prior = nullptr;
     const CameraPrior *drift_prior = nullptr; // as wide as a camera may have changed since it was calibrated
     double drift_noise = 1.0;                 // factor on the observations' noise in that adjustment
+    bool common_errors = false;               // noise that no residual shows is in what is stated: it is the least
     double sag_sigma = 0.0;                   // as in BundleOptions
     const Shutter *shutter = nullptr;         // that rolls; times by frame of the table
 };
@@ -39,6 +40,8 @@ struct Drift {
 struct Segment {
     Submap map; // frames are numbers in `frames`
     BundleReport report;
+    double noise = 1.0;             // of the pixels over the stated one, in the covariances and the estimate
+    int iterations = 0;             // of least squares, until the pixels' noise is known and with it
     BundleCovariance random, total; // with the camera as it is; with its uncertainty (empty where that is not known)
     Drift drift;                    // empty without drift_prior
     double sigma = 1.0;             // robust, of the whitened residuals before the last selection

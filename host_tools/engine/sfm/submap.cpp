@@ -4,6 +4,7 @@
 #include "geometry/minimal.hpp"
 #include "geometry/triangulate.hpp"
 #include "geometry/two_view.hpp"
+#include "median.hpp"
 
 #include <Eigen/Cholesky>
 
@@ -19,16 +20,6 @@ namespace
 using geometry::View;
 
 constexpr uint64_t STREAM_LEAF = 10, STREAM_RESECT = 11;
-
-double median_of(std::vector<double> &values)
-{
-    if (values.empty()) {
-        return 0.0;
-    }
-    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    return *middle;
-}
 
 // Calls body(place of the point in the map, observation) for each observation in `frame` of a track that has a point.
 template <typename Body> void for_seen(const TrackTable &table, const Submap &map, int frame, const Body &body)

@@ -112,13 +112,4 @@ Moment moment_of(double late, int frame, int first, int end, std::span<const dou
     return {other, known ? late / apart : 0.0};
 }
 
-void TrackTable::scale_noise(double factor)
-{
-    for (Observation &o : all_) {
-        o.sight.root *= factor;
-        o.sight.b *= factor;
-        o.whiten /= factor;
-    }
-}
-
 } // namespace pipefish::sfm

@@ -87,7 +87,6 @@ public:
 
     int outside() const { return outside_; }   // observations left out: beyond the model
     int repeated() const { return repeated_; } // observations left out: their track was there already in their frame
-    void scale_noise(double factor);           // all covariances by factor^2
 
     // From here on rows count. `shutter`: by frame of this table.
     void roll(const Shutter &shutter);
