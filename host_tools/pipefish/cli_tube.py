@@ -140,15 +140,17 @@ def _text(tube: Any, files: list[str]) -> str:
     import numpy as np
 
     s, t = tube.summary, tube.stations
-    oval = np.isfinite(t["ovality"])
+    oval = (
+        f"{100 * s['ovality_rms']:.2f} % (rms along the pipe), most {100 * np.nanmax(t['ovality']):.2f} % "
+        "((max - min) / mean)"
+        if "ovality_rms" in s
+        else "not measured: one side only"
+    )
     spread = f", {1000 * np.nanmin(t['d_mean']):.1f} to {1000 * np.nanmax(t['d_mean']):.1f} along the pipe"
     rows: list[tuple[str, object]] = [
         ("length", f"{s['length']:.2f} m, {s['measured']} of {s['stations']} stations measured"),
         ("mean diameter", f"{1000 * s['d_mean']:.2f} +- {1960 * s['d_mean_sigma']:.2f} mm (95 %){spread}"),
-        (
-            "ovality",
-            f"{100 * s['ovality']:.2f} % ((max - min) / mean)" if oval.any() else "not measured: one side only",
-        ),
+        ("ovality", oval),
         ("roughness", f"{1000 * s['roughness']:.2f} mm"),
         ("clock", f"zero {tube.clock_zero}"),
     ]

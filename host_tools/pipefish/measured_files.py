@@ -22,6 +22,7 @@ from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
+from pipefish.tube import rms_ovality
 from pipefish.tube_findings import COLUMNS
 
 RING = 72  # vertices of tube.ply around the pipe
@@ -117,7 +118,7 @@ def summary(m: Measurement) -> dict[str, Any]:
         out |= {
             "d_max": float(np.nanmax(table["d_max"])),
             "d_min": float(np.nanmin(table["d_min"])),
-            "ovality_mean": float(np.nanmean(oval)),
+            "ovality_rms": rms_ovality(table),
             "ovality_most": float(oval[worst]),
             "ovality_most_at": float(table["chainage"][worst]),
             "ovality_sigma": float(np.nanmedian(table["ovality_sigma"])),

@@ -48,7 +48,8 @@ class Tube:
       ovality_astm             (d_mean - d_min) / d_mean (ASTM F1216);  ovality_astm_max: (d_max - d_mean) / d_mean
       reduction_nominal        (d_nominal - d_min) / d_nominal (EN 13508-2 BAA, relative to nominal)
       ovality_lo, ovality_hi   95 % interval of `ovality`, with ovality_systematic: what the camera leaves open
-      e2, e2_sigma             unclamped debiased squared ellipse amplitude, m^2 (for averages)
+      ovality_squared          square of the ovality less the noise's share, below zero as often as above where the
+                               pipe is round: what averages are made of (`rms_ovality`)
       <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
       curvature, curvature_sigma, inliers, gap, rms, roughness
     events: one dictionary a finding; see `pipefish.tube_findings`."""
@@ -226,8 +227,8 @@ def fit_tube(
         common = Common(surface, shared, known, diameter)
     tube = Tube("ok", "", {}, nominal=nominal, surface=surface, _up=up_vector)
     tube.clock_zero = "against gravity" if up_vector is not None else "-y of the points' frame at the start"
-    tube.stations = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
-    tube.summary = _summary(tube, len(cloud), used)
+    tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
+    tube.summary = _summary(tube, by_shape, used)
     if not np.isin(tube.stations["status"], MEASURED).any():
         worst = str(tube.stations["status"][0])
         return _none(worst, "", nominal)
@@ -447,7 +448,10 @@ def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return seen, low, high
 
 
-def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) -> dict[str, np.ndarray]:
+def _stations(
+    tube: Tube, spacing: float, scale_sigma: float, common: Common
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The stations' table, and the derivatives (n,k) of their mean diameters by the section's parameters."""
     s, piece = [], []
     for k, (start, end) in enumerate(tube.surface.pieces):
         count = max(2, round((end - start) / spacing) + 1)
@@ -464,15 +468,11 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out.update(zip("xyz", f["centre"].T, strict=True))
     out.update(zip(("tx", "ty", "tz"), f["tangent"].T, strict=True))
     out["centre_sigma"] = np.sqrt(np.maximum(0, full[:, 0, 0] + full[:, 1, 1]))
-    # The ellipse's amplitude without the noise's share; unclamped for averages.
+    # The ellipse's amplitude without the noise's share.
     e = np.hypot(shape[:, 1], shape[:, 2])
-    unit = shape[:, 1:3] / np.maximum(e, 1e-300)[:, None]
-    e_sigma = np.sqrt(np.einsum("ni,nij,nj->n", unit, cov[:, 1:3, 1:3], unit))
     trace = cov[:, 1, 1] + cov[:, 2, 2]
-    out["e2"] = e**2 - trace
-    out["e2_sigma"] = np.sqrt(4 * np.maximum(out["e2"], 0) * e_sigma**2 + trace**2)
     debiased = shape.copy()
-    debiased[:, 1:3] *= (np.sqrt(np.maximum(out["e2"], 0)) / np.maximum(e, 1e-300))[:, None]
+    debiased[:, 1:3] *= (np.sqrt(np.maximum(e**2 - trace, 0)) / np.maximum(e, 1e-300))[:, None]
     raw = _calipers(shape)
     sound = _calipers(debiased)
     gradient = _gradients(shape, raw)
@@ -504,6 +504,7 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out["reduction_nominal_sigma"] = out["d_min_sigma"] / nominal
     seen, low, high = _rice_table()
     amplitude = (raw["max"] - raw["min"]) / d_mean
+    out["ovality_squared"] = amplitude**2 - 16 * trace / d_mean**2  # the widths differ by 4 |e|
     one = np.maximum(np.hypot(out["ovality_sigma"], out["ovality_systematic"]), 1e-300)
     inside = amplitude / one < seen[-1]
     out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - 1.96 * one)
@@ -514,7 +515,7 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out["inliers"] = f["inliers"].astype(int)
     out["status"] = _station_status(out, f["ellipse"] > 0)
     _blank(out)
-    return out
+    return out, gradient["d_mean"]
 
 
 def _station_status(out: dict[str, np.ndarray], ellipse: np.ndarray) -> np.ndarray:
@@ -525,7 +526,7 @@ def _station_status(out: dict[str, np.ndarray], ellipse: np.ndarray) -> np.ndarr
     return status
 
 
-OF_ELLIPSE = ("d_max", "d_min", "ovality", "clock_max", "reduction", "e2")
+OF_ELLIPSE = ("d_max", "d_min", "ovality", "clock_max", "reduction")
 OF_SIZE = ("d_mean", "d_area", "circumference")
 
 
@@ -539,7 +540,15 @@ def _blank(out: dict[str, np.ndarray]) -> None:
     out["oval"] = out["oval"] & (out["status"] == "ok")
 
 
-def _summary(tube: Tube, count: int, used: np.ndarray) -> dict[str, Any]:
+def rms_ovality(stations: dict[str, np.ndarray]) -> float:
+    """Root of the mean square of the ovality along the pipe, each station with the same weight: the one average that
+    noise does not raise, as squares may be had without its share. NaN where no station has an ellipse."""
+    squares = stations["ovality_squared"]
+    known = np.isfinite(squares)
+    return math.sqrt(max(0.0, float(np.mean(squares[known])))) if known.any() else math.nan
+
+
+def _summary(tube: Tube, by_shape: np.ndarray, used: np.ndarray) -> dict[str, Any]:
     t = tube.stations
     good = np.isfinite(t["d_mean"])
     out: dict[str, Any] = {
@@ -556,20 +565,14 @@ def _summary(tube: Tube, count: int, used: np.ndarray) -> dict[str, Any]:
     if not good.any():
         out["d_mean"] = float(2 * np.median(tube.frames(t["s"])["shape"][:, 0]))
         return out
-    weight = 1 / t["d_mean_sigma"][good] ** 2
-    out["d_mean"] = float(np.average(t["d_mean"][good], weights=weight))
-    # Stations within a knot's support tell the same: count one a diameter.
-    independent = max(1.0, good.sum() * tube.length / len(t["s"]) / out["d_mean"])
-    out["d_mean_sigma"] = float(np.sqrt(1 / weight.mean() / min(independent, good.sum())))
+    # Stations are evenly spaced: a mean along the pipe. What smoothing makes them share is in its variance.
+    out["d_mean"] = float(np.mean(t["d_mean"][good]))
+    by_mean = by_shape[good] / good.sum()
+    out["d_mean_sigma"] = math.sqrt(tube.surface.variance(t["s"][good].tolist(), t["piece"][good].tolist(), by_mean))
     out["d_mean_spread"] = float(np.std(t["d_mean"][good]))
-    oval = np.isfinite(t["e2"])
+    oval = np.isfinite(t["ovality"])
     if oval.any():
-        e2 = float(np.average(t["e2"][oval], weights=1 / t["e2_sigma"][oval] ** 2))
-        out["ovality"] = (
-            4 * math.sqrt(max(0.0, e2)) / out["d_mean"]
-            if tube.surface.order == 2
-            else float(np.mean(t["ovality"][oval]))
-        )
+        out["ovality_rms"] = rms_ovality(t)
         out["d_max"] = float(np.max(t["d_max"][oval]))
         out["d_min"] = float(np.min(t["d_min"][oval]))
     out["roughness"] = float(np.median(t["roughness"]))

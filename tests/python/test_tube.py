@@ -65,6 +65,52 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert 0.85 <= np.std(z) <= 1.15
 
 
+def test_the_mean_diameter_is_as_uncertain_as_it_scatters() -> None:
+    """A straight pipe's stations are nearly one figure: they do not average out. No estimate is better than that of
+    one who knows axis and shape, 2 sigma / sqrt(n)."""
+    z, known = [], 2 * 0.0015 / math.sqrt(1600)
+    for seed in range(16):
+        pipe = Pipe(length=4, seed=200 + seed)
+        summary = pf.fit_tube(pipe.points(1600), None, pipe.cameras()).summary
+        assert 0.9 * known < summary["d_mean_sigma"] < 1.4 * known
+        z.append((summary["d_mean"] - 0.3) / summary["d_mean_sigma"])
+    assert 3.9 < np.sum(np.square(z)) < 39.3  # 99.8 % of chi-squared of 16
+
+
+def test_the_mean_diameter_s_sigma_is_that_of_its_own_change_with_the_points() -> None:
+    """Where the diameter changes along the pipe the stations are not one figure: moving points by their noise tells."""
+    pipe = Pipe(length=3, ovality=0.0, seed=5, noise=0.0)
+    exact, found = pipe.points(1200), []
+    exact[:, :2] *= (1 + 0.02 * np.sin(4 * exact[:, 2]))[:, None]
+    for seed in range(16):
+        noisy = exact + np.random.default_rng(seed).normal(0, 0.001, exact.shape)
+        summary = pf.fit_tube(noisy, 0.001, pipe.cameras()).summary
+        found.append((summary["d_mean"], summary["d_mean_sigma"]))
+    mean, sigma = np.array(found).T
+    assert 4.1 < 15 * np.var(mean, ddof=1) / np.mean(sigma**2) < 37.7  # 99.6 % of chi-squared of 15
+
+
+def test_the_ovality_of_the_pipe_is_that_of_all_of_it() -> None:
+    """Where it is oval the square of the ovality is the less certain: that must not weigh it out."""
+    random = np.random.default_rng(1)
+    angle, z = random.uniform(0, 2 * np.pi, 3000), random.uniform(0, 3, 3000)
+    oval = np.clip((z - 1.2) / 0.6, 0, 1) * 0.05
+    points = np.column_stack([0.15 * (1 + oval / 2) * np.cos(angle), 0.15 * (1 - oval / 2) * np.sin(angle), z])
+    tube = pf.fit_tube(points + random.normal(0, 0.001, points.shape))
+    truth = math.sqrt(np.mean((np.clip((np.linspace(0, 3, 400) - 1.2) / 0.6, 0, 1) * 0.05) ** 2))
+    assert tube.summary["ovality_rms"] == pytest.approx(truth, abs=0.001)
+
+
+def test_noise_makes_no_ovality_on_average() -> None:
+    squares = []
+    for seed in range(8):
+        pipe = Pipe(seed=60 + seed)
+        t = pf.fit_tube(pipe.points(1500), None, pipe.cameras()).stations
+        assert (t["ovality_squared"] < 0).any() or t["oval"].any()
+        squares.append(np.mean(t["ovality_squared"]))
+    assert abs(np.mean(squares)) < 3 * np.std(squares, ddof=1) / math.sqrt(len(squares))
+
+
 def test_an_ovality_that_grows_is_followed() -> None:
     pipe = Pipe(ovality=0.0, ovality_end=0.05, length=4, noise=0.001, seed=6)
     t = pf.fit_tube(pipe.points(3000), pipe.noise, pipe.cameras(), nominal=0.3).stations

@@ -242,6 +242,16 @@ nb::dict stations(const Fitted &fitted, const std::vector<double> &s, const std:
     return out;
 }
 
+// Of the sum over stations of weight . shape.
+double variance(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece, const Rows &weight)
+{
+    if (piece.size() != s.size() || weight.rows() != static_cast<Eigen::Index>(s.size()) ||
+        weight.cols() != shape_parameters(fitted.surface->order())) {
+        throw nb::value_error("variance: a piece and a row of weights for each station");
+    }
+    return fitted.surface->variance(s, piece, weight);
+}
+
 Eigen::VectorXd distances(const Eigen::Vector3d &shape, const Eigen::Matrix<double, Eigen::Dynamic, 2> &y)
 {
     Eigen::VectorXd out(y.rows());
@@ -269,7 +279,8 @@ void bind_tube(nb::module_ &m)
         .def("medians", &medians, nb::arg("radius"), nb::arg("k"), nb::arg("every"), nb::arg("reach"), nb::arg("most"))
         .def("placed", &placed)
         .def("project", &project, nb::arg("points"))
-        .def("stations", &stations, nb::arg("s"), nb::arg("piece"));
+        .def("stations", &stations, nb::arg("s"), nb::arg("piece"))
+        .def("variance", &variance, nb::arg("s"), nb::arg("piece"), nb::arg("weight"));
     m.def("tube_surface", &fit_surface, nb::arg("points"), nb::arg("noise").none(), nb::arg("centres"), nb::arg("rho"),
           nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"));
     m.def("tube_trace", &trace_all, nb::arg("points"), nb::arg("noise").none(), nb::arg("path"), nb::arg("threads"));

@@ -4,6 +4,7 @@
 #include "tube/cylinder.hpp"
 #include "tube/nearest.hpp"
 #include "tube/section.hpp"
+#include "tube/surface_problem.hpp"
 
 #include <Eigen/Geometry>
 
@@ -94,10 +95,13 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
             converged_ = solve(options.rounds / 2, true);
         }
     }
+    keep_information();
     tabulate();
     reweigh(true);
     describe();
 }
+
+Surface::~Surface() = default;
 
 void Surface::lay_out(const Reference &reference, double knot)
 {

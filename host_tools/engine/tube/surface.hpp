@@ -9,6 +9,8 @@
 
 #include <array>
 #include <functional>
+#include <memory>
+#include <span>
 #include <vector>
 
 namespace pipefish::tube
@@ -61,6 +63,7 @@ class Surface
 public:
     // Throws std::invalid_argument where the reference has no length.
     Surface(const Cloud &cloud, const Reference &reference, const SurfaceOptions &options);
+    ~Surface();
 
     double length() const { return piece_.back().end_s; }
     int order() const { return order_; }
@@ -71,6 +74,8 @@ public:
     std::vector<std::pair<double, double>> pieces() const; // chainages
 
     Station station(double s, int piece = -1) const; // piece -1: the one that holds s
+    // Variance of sum over i of weight.row(i) . shape at (s[i], piece[i]), with all that the places have in common.
+    double variance(std::span<const double> s, std::span<const int> piece, const Eigen::MatrixXd &weight) const;
     OnSurface place(int point) const { return placed_[static_cast<size_t>(point)]; }
     // Chainage, angle, distances of any point; piece -1 where it is beyond the ends.
     OnSurface project(const Eigen::Vector3d &x) const;
@@ -99,6 +104,7 @@ private:
     bool solve(int rounds, bool adapt);
     void widen(int order);
     void smooth(const SurfaceProblem &problem, const SurfaceVariance &variance, bool adapt);
+    void keep_information();
     void tabulate();
     void describe();
     void count_around(Station &station) const;
@@ -119,6 +125,8 @@ private:
     std::vector<double> shape_;                            // floats_ a control
     std::vector<char> pinned_;                             // a control: no ellipse
     std::vector<std::vector<Eigen::MatrixXd>> covariance_; // [control][back]
+    struct Information;
+    std::unique_ptr<Information> information_; // of the points that were fitted, at the end
     std::array<double, 4> stiffness_{}; // 1 / variance of second differences: axis, rho, ellipse, harmonics
     std::vector<std::array<double, 4>>
         give_;                  // a control: factor of the stiffness, small where the pipe changes at once

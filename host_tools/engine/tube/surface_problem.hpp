@@ -11,6 +11,11 @@
 namespace pipefish::tube
 {
 
+struct Surface::Information {
+    optim::NormalMatrix<1, 1> normal;
+    optim::ArrowFactor<1, 1> factor;
+};
+
 class SurfaceProblem
 {
 public:
