@@ -182,6 +182,21 @@ def test_half_a_pipe_gives_diameters_but_no_ovality() -> None:
     assert (np.abs(t["d_mean"] - 0.3) < 4 * t["d_mean_sigma"]).all()
 
 
+def test_what_half_a_pipe_hides_is_in_its_interval() -> None:
+    """Pipes as oval as is assumed, in any direction: a circle through the half that is seen is off by per cents."""
+    random, z, sigmas = np.random.default_rng(3), [], []
+    for seed in range(12):
+        oval, direction = 0.03 / math.sqrt(2) * np.hypot(*random.normal(size=2)), random.uniform(0, math.pi)
+        pipe = Pipe(cover=0.96 * math.pi, ovality=oval, clock_max=direction, length=2, noise=0.001, seed=seed)
+        t = pf.fit_tube(pipe.points(1000), None, pipe.cameras()).stations
+        assert (t["status"] == "circle_only").all()
+        middle = len(t["s"]) // 2
+        z.append((t["d_mean"][middle] - 0.3) / t["d_mean_sigma"][middle])
+        sigmas.append(t["d_mean_sigma"][middle])
+    assert 2.2 < np.sum(np.square(z)) < 32.9  # 99.8 % of chi-squared of 12
+    assert np.median(sigmas) < 0.3 * 0.01  # and tells something
+
+
 @pytest.mark.parametrize(
     ("points", "status"),
     [

@@ -145,7 +145,7 @@ struct Fitted {
 
 std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &noise, const Points &centres,
                                     const std::vector<double> &rho, const std::vector<double> &breaks, double knot,
-                                    int order, int rounds, bool smooth_only)
+                                    int order, int rounds, bool smooth_only, double ovality)
 {
     auto out = std::make_unique<Fitted>();
     out->cloud = cloud_of(points, noise);
@@ -155,7 +155,7 @@ std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &nois
     const nb::gil_scoped_release release;
     out->surface = std::make_unique<Surface>(
         out->cloud, reference,
-        SurfaceOptions{.knot = knot, .order = order, .rounds = rounds, .smooth_only = smooth_only});
+        SurfaceOptions{.knot = knot, .order = order, .rounds = rounds, .ovality = ovality, .smooth_only = smooth_only});
     return out;
 }
 
@@ -282,6 +282,7 @@ void bind_tube(nb::module_ &m)
         .def("stations", &stations, nb::arg("s"), nb::arg("piece"))
         .def("variance", &variance, nb::arg("s"), nb::arg("piece"), nb::arg("weight"));
     m.def("tube_surface", &fit_surface, nb::arg("points"), nb::arg("noise").none(), nb::arg("centres"), nb::arg("rho"),
-          nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"));
+          nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"),
+          nb::arg("ovality"));
     m.def("tube_trace", &trace_all, nb::arg("points"), nb::arg("noise").none(), nb::arg("path"), nb::arg("threads"));
 }

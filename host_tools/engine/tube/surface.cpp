@@ -70,6 +70,7 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
         throw std::invalid_argument("tube: the reference has no length");
     }
     diameter_ = 2.0 * median(reference.rho);
+    ovality_ = options.ovality;
     reach_ = std::max(1, static_cast<int>(std::lround(0.5 / options.knot)));
     lay_out(reference, options.knot);
     assign(reference);

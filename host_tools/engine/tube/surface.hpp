@@ -29,6 +29,7 @@ struct SurfaceOptions {
     double knot = 0.25;       // spacing of the knots, in diameters
     int order = 2;            // of the section's harmonics, 2 to 6; 0: by BIC
     int rounds = 12;          // of reweighting and smoothing
+    double ovality = 0.03;    // rms of pipes, (max - min) / mean: assumed where half the wall is seen at most
     bool smooth_only = false; // keep the smoothness as it starts: stiff, for looking for joints
 };
 
@@ -43,7 +44,7 @@ struct Station {
     Eigen::MatrixXd covariance;                   // of the centre along first and second, then the shape
     int inliers = 0;                              // within half a window
     double gap = 0.0, rms = 0.0, roughness = 0.0; // radians, metres, metres
-    bool ellipse = true;                          // false: pinned to a circle for want of points around
+    bool ellipse = true;                          // false: points on one side, an ellipse is half assumption
 };
 
 struct OnSurface {      // a point's place
@@ -117,17 +118,17 @@ private:
     double parameter(const Piece &piece, double s) const;
 
     const Cloud &cloud_;
-    double diameter_ = 0.0;
+    double diameter_ = 0.0, ovality_ = 0.0;
     int reach_ = 1; // knots each way that count as around one: half a diameter
     int order_ = 2, floats_ = 3;
     std::vector<Piece> piece_;
     std::vector<Eigen::Vector3d> control_, first_, second_;
-    std::vector<double> shape_;                            // floats_ a control
-    std::vector<char> pinned_;                             // a control: no ellipse
+    std::vector<double> shape_; // floats_ a control
+    std::vector<int> pinned_;   // a control: of how many in a row that see too little of the wall for an ellipse; or 0
     std::vector<std::vector<Eigen::MatrixXd>> covariance_; // [control][back]
     struct Information;
     std::unique_ptr<Information> information_; // of the points that were fitted, at the end
-    std::array<double, 4> stiffness_{}; // 1 / variance of second differences: axis, rho, ellipse, harmonics
+    std::array<double, 4> stiffness_{};        // 1 / variance of second differences: axis, rho, ellipse, harmonics
     std::vector<std::array<double, 4>>
         give_;                  // a control: factor of the stiffness, small where the pipe changes at once
     std::vector<int> of_piece_; // a point: piece or -1

@@ -108,8 +108,17 @@ void Surface::find_gaps()
             count[static_cast<size_t>(c)][bin]++;
         }
     }
-    for (size_t c = 0; c < control_.size(); c++) {
-        pinned_[c] = widest_gap(count[c]) > ELLIPSE_GAP;
+    for (const Piece &piece : piece_) {
+        const int end = piece.first + piece.intervals + 3;
+        for (int c = piece.first, run = 0; c < end; c++) {
+            const bool gap = widest_gap(count[static_cast<size_t>(c)]) > ELLIPSE_GAP;
+            run = gap ? run + 1 : 0;
+            pinned_[static_cast<size_t>(c)] = run;
+        }
+        for (int c = end - 2; c >= piece.first; c--) { // the length of the run, at each of it
+            int &here = pinned_[static_cast<size_t>(c)];
+            here = here > 0 ? std::max(here, pinned_[static_cast<size_t>(c) + 1]) : 0;
+        }
     }
 }
 
