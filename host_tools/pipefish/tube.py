@@ -22,6 +22,7 @@ SECTION = 0.75  # length of the stretch that counts as one section, diameters
 # between knots half a diameter apart, which no sigma knows; the smoothness decides how many of them a pipe uses.
 KNOT = 0.25
 STATION = 0.25  # spacing of the stations, diameters
+NODES = 64  # of a path at least: how far its wall is away is measured from the nearest
 MIN_INLIERS = 20  # in a section, for its values to be given
 # Root mean square of pipes' ovality, its direction anywhere: 95 % are below 5.2 %, about what is allowed of a laid
 # flexible pipe. What an ellipse through half a wall leans on.
@@ -302,12 +303,12 @@ def _forward(centres: np.ndarray) -> np.ndarray:
         heading = move / length if heading is None else heading + 0.3 * (move / length - heading)
         kept.append(c)
     line = np.array(kept)
-    if len(line) < 3:
+    if len(line) < 2:
         return line
     for _ in range(3):
         line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
     s = np.r_[0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    even = np.linspace(0, s[-1], max(len(line), 8))
+    even = np.linspace(0, s[-1], max(len(line), NODES))
     return np.ascontiguousarray(np.column_stack([np.interp(even, s, line[:, k]) for k in range(3)]))
 
 

@@ -237,6 +237,14 @@ def test_a_drive_shorter_than_the_pipe_is_wide_is_measured_where_it_saw_the_wall
         assert (np.abs(t["d_mean"] - 0.3) < 4.5 * t["d_mean_sigma"]).all()
 
 
+@pytest.mark.parametrize("centres", [2, 3])
+def test_a_straight_pipe_s_two_ends_are_a_path(centres: int) -> None:
+    pipe = Pipe(seed=16)
+    path = np.column_stack([np.zeros((centres, 2)), np.linspace(0, pipe.length, centres)])
+    tube = pf.fit_tube(pipe.points(1500), pipe.noise, path)
+    assert tube.status == "ok" and tube.length == pytest.approx(pipe.length, abs=0.02)
+
+
 def test_wrong_arguments_are_named() -> None:
     points = Pipe().points(200)
     for wrong, name in (
