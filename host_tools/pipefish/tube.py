@@ -22,6 +22,8 @@ SECTION = 0.75  # length of the stretch that counts as one section, diameters
 # between knots half a diameter apart, which no sigma knows; the smoothness decides how many of them a pipe uses.
 KNOT = 0.25
 STATION = 0.25  # spacing of the stations, diameters
+AGAINST_GRAVITY, FROM_FRAME = "against gravity", "-y of the points' frame at the start"  # twelve o'clock
+UPRIGHT = 0.1  # sine of the angle between a pipe and gravity that gives no clock
 NODES = 64  # of a path at least: how far its wall is away is measured from the nearest
 MIN_INLIERS = 20  # in a section, for its values to be given
 # Root mean square of pipes' ovality, its direction anywhere: 95 % are below 5.2 %, about what is allowed of a laid
@@ -229,8 +231,8 @@ def fit_tube(
     if len(kept) < len(breaks):
         surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False, ASSUMED_OVALITY)
         common = Common(surface, shared, known, diameter)
-    tube = Tube("ok", "", {}, nominal=nominal, surface=surface, _up=up_vector)
-    tube.clock_zero = "against gravity" if up_vector is not None else "-y of the points' frame at the start"
+    tube = Tube("ok", "", {}, nominal=nominal, surface=surface)
+    tube._up, tube.clock_zero = _clock_of(surface, up_vector)
     tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
     tube.summary = _summary(tube, by_shape, used)
     if not np.isin(tube.stations["status"], MEASURED).any():
@@ -350,6 +352,18 @@ def _reference(cloud: np.ndarray, sections: list[dict[str, Any]], path: Any) -> 
     return np.ascontiguousarray(np.array([nodes[i] for i in keep])), [rho[i] for i in keep]
 
 
+def _clock_of(surface: Any, up: np.ndarray | None) -> tuple[np.ndarray | None, str]:
+    """The direction of twelve o'clock, None where the points' frame tells it, and what it is."""
+    if up is None:
+        return None, FROM_FRAME
+    s = np.concatenate([np.linspace(a, b, 20) for a, b in surface.pieces])
+    piece = np.repeat(np.arange(len(surface.pieces)), 20)
+    tangent = surface.stations(s.tolist(), piece.tolist())["tangent"]
+    if (np.linalg.norm(up - (tangent @ up)[:, None] * tangent, axis=1) > UPRIGHT).any():
+        return up, AGAINST_GRAVITY
+    return None, f"{FROM_FRAME}: the pipe stands upright, gravity tells no clock"
+
+
 def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: Any) -> np.ndarray:
     """The section's own angle at twelve o'clock, at each station."""
     start = surface.stations([0.0], [0])
@@ -360,7 +374,7 @@ def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: An
         return np.full(len(found["first"]), angle)
     a, b = found["first"] @ up, found["second"] @ up
     zero = np.arctan2(b, a)
-    upright = np.hypot(a, b) > 0.1  # steeper shafts keep the last clock
+    upright = np.hypot(a, b) > UPRIGHT  # steeper shafts keep the last clock
     if not upright.all():
         index = np.arange(len(zero))
         zero = np.interp(index, index[upright], np.unwrap(zero[upright])) if upright.any() else np.zeros(len(zero))

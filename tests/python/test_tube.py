@@ -163,6 +163,15 @@ def test_up_turns_the_clock() -> None:
     assert np.abs(off).max() < 0.1
 
 
+def test_gravity_along_a_shaft_is_no_twelve_o_clock() -> None:
+    pipe = Pipe(ovality=0.05, seed=10)
+    points, path = pipe.points(1500), pipe.cameras()
+    shaft, frame = (pf.fit_tube(points, pipe.noise, path, up=up) for up in ((0.05, 0, 1), None))
+    assert shaft.clock_zero.startswith(frame.clock_zero) and "gravity tells no clock" in shaft.clock_zero
+    assert np.array_equal(shaft.stations["clock_max"], frame.stations["clock_max"], equal_nan=True)
+    assert pf.fit_tube(points, pipe.noise, path, up=(0.2, 0, 1)).clock_zero == "against gravity"
+
+
 def test_the_same_bits_for_any_number_of_threads() -> None:
     points = Pipe(outliers=0.2, seed=11).points(1500)
     one, four = (pf.fit_tube(points, 0.0015, threads=n).stations for n in (1, 4))
