@@ -12,6 +12,7 @@ from typing import Any
 
 from pipefish.cli import Result, UsageError, add_command, table
 
+APART = 0.1  # share of points that scattered gross ones do not reach
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -53,10 +54,10 @@ def run_tube(args: argparse.Namespace) -> Result:
             points * unit,
             None if sigma is None else sigma * unit,
             path,
-            nominal=args.nominal / 1000 if args.nominal else None,
+            nominal=args.nominal / 1000 if args.nominal is not None else None,
             up=_direction(args.up) if args.up else None,
             scale_sigma=args.scale_sigma,
-            spacing=args.spacing / 1000 if args.spacing else None,
+            spacing=args.spacing / 1000 if args.spacing is not None else None,
             progress=lambda done, word: bar.update(round(100 * done), word),
         )
     if tube.status != "ok":
@@ -154,6 +155,9 @@ def _text(tube: Any, files: list[str]) -> str:
         ("roughness", f"{1000 * s['roughness']:.2f} mm"),
         ("clock", f"zero {tube.clock_zero}"),
     ]
+    if s["points_apart"] > APART:
+        text = f"{100 * s['points_apart']:.0f} % of the points are far from this pipe or beyond its ends: not measured"
+        rows.append(("left out", text))
     rows += [(e["kind"], event_text(e)) for e in tube.events]
     return table([*rows, *(("written", f) for f in files)])
 

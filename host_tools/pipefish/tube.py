@@ -36,6 +36,7 @@ REASONS = {
     "too_few_points": "too few points for a tube",
     "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
     "one_sided": "points on one side only: neither centre nor diameter is determined",
+    "not_determined": "the points are too uncertain for a tube",
     "too_short": "the wall is shorter than half a radius",
 }
 
@@ -206,6 +207,10 @@ def fit_tube(
     cloud, noise, centres, up_vector, used = _checked(points, sigma, path, up)
     if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
+    if not (math.isfinite(scale_sigma) and scale_sigma >= 0):
+        raise ArgumentError(f"scale_sigma: {scale_sigma} is not a relative standard deviation")
+    if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
+        raise ArgumentError(f"spacing: {spacing} is not a positive length")
     if order not in (0, 2, 3, 4, 6):
         raise ArgumentError(f"order: {order} is not 0, 2, 3, 4 or 6")
     tell = progress or (lambda fraction, word: None)
@@ -221,10 +226,16 @@ def fit_tube(
         return _none("too_short", "", nominal)
     diameter = 2 * float(np.median(rho))
     tell(0.4, "looking for joints")
-    coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+    try:
+        coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+    except ValueError as error:  # the normal matrix is singular
+        return _none("not_determined", str(error), nominal)
     breaks = tube_findings.break_candidates(coarse, nodes, diameter)
     tell(0.55, "fitting the surface")
-    surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False, ASSUMED_OVALITY)
+    try:
+        surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False, ASSUMED_OVALITY)
+    except ValueError as error:
+        return _none("not_determined", str(error), nominal)
     known = np.flatnonzero(used)
     common = Common(surface, shared, known, diameter)
     kept = tube_findings.confirmed(surface, diameter, breaks, common)
@@ -239,6 +250,7 @@ def fit_tube(
         worst = str(tube.stations["status"][0])
         return _none(worst, "", nominal)
     tube.points = _all_points(tube._places(surface.placed()), used)
+    tube.summary["points_apart"] = float(np.mean(tube.points["piece"][used] < 0))
     tell(0.9, "looking for what departs from it")
     tube.events = tube_findings.events(tube, common)
     tube.summary["events"] = len(tube.events)
@@ -254,12 +266,16 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
     if sigma is not None:
         noise = np.asarray(sigma, float)
         if noise.ndim == 0:
+            if not np.isfinite(noise):
+                raise ArgumentError(f"sigma: {noise} is not a standard deviation")
             noise = np.full(len(cloud), float(noise))
         if noise.shape not in ((len(cloud),), (len(cloud), 3, 3)):
             raise ArgumentError(f"sigma: shape {noise.shape} is neither ({len(cloud)},) nor ({len(cloud)}, 3, 3)")
         sound = np.isfinite(noise) if noise.ndim == 1 else np.isfinite(noise).all((1, 2))
         if noise.ndim == 1 and (noise[sound] < 0).any():
             raise ArgumentError("sigma: negative standard deviations")
+        if noise.ndim == 3 and not _are_covariances(noise[sound]):
+            raise ArgumentError("sigma: what is given as covariances is not symmetric or has negative variances")
         used &= sound
         noise = np.ascontiguousarray(noise[used])
     centres = None
@@ -277,6 +293,13 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
             raise ArgumentError("up: not a direction")
         vector = vector / np.linalg.norm(vector)
     return np.ascontiguousarray(cloud[used]), noise, centres, vector, used
+
+
+def _are_covariances(noise: np.ndarray) -> bool:
+    """Symmetric and nowhere negative, but for the rounding of whoever computed them."""
+    blur = 1e-6 * np.abs(noise).max(axis=(1, 2), initial=0.0)
+    even = (np.abs(noise - noise.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0) <= blur).all()
+    return bool(even and (np.linalg.eigvalsh(noise)[:, 0] >= -blur).all())
 
 
 def _array(values: Any, name: str, shape: tuple[int | None, int]) -> np.ndarray:

@@ -264,6 +264,14 @@ def test_wrong_arguments_are_named() -> None:
         (dict(points=points, nominal=-1.0), "nominal"),
         (dict(points=points, order=5), "order"),
         (dict(points=points, up=(0, 0, 0)), "up"),
+        (dict(points=points, sigma=math.nan), "sigma"),
+        (dict(points=points, sigma=np.tile(-1e-6 * np.eye(3), (200, 1, 1))), "sigma"),
+        (dict(points=points, sigma=np.tile(1e-6 * np.triu(np.ones((3, 3))), (200, 1, 1))), "sigma"),
+        (dict(points=points, spacing=-0.1), "spacing"),
+        (dict(points=points, spacing=0.0), "spacing"),
+        (dict(points=points, spacing=math.nan), "spacing"),
+        (dict(points=points, scale_sigma=-1.0), "scale_sigma"),
+        (dict(points=points, scale_sigma=math.nan), "scale_sigma"),
     ):
         with pytest.raises(pf.ArgumentError, match=name):
             pf.fit_tube(**wrong)
@@ -285,6 +293,28 @@ def test_real_pipes_have_the_diameter_that_a_careful_fit_finds(
     tube = pf.fit_tube(points)
     assert tube.status == "ok"
     assert abs(tube.summary["d_mean"] - diameter) < within
+
+
+def test_points_that_say_nothing_are_an_answer() -> None:
+    pipe = Pipe(seed=17)
+    tube = pf.fit_tube(pipe.points(1500), 1e3, pipe.cameras())
+    assert tube.status == "not_determined" and "uncertain" in tube.reason
+
+
+@pytest.mark.filterwarnings("error")
+def test_exact_points_are_no_division_by_zero() -> None:
+    pipe = Pipe(noise=0.0, seed=18)
+    tube = pf.fit_tube(pipe.points(1500), None, pipe.cameras())
+    assert tube.summary["d_mean"] == pytest.approx(0.3, abs=1e-6) and not tube.events
+
+
+def test_a_second_pipe_is_not_passed_over_in_silence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = Pipe(seed=19).points(1500)
+    for cloud, told in ((points, False), (np.vstack([points, points + np.array([0.0, 0.0, 8.0])]), True)):
+        np.save(tmp_path / "cloud.npy", cloud)
+        assert main(["tube", str(tmp_path / "cloud.npy")]) == 0
+        text = capsys.readouterr().out
+        assert ("left out" in text) == told and ("50 % of the points" in text) == told
 
 
 def test_files_hold_the_same_points(tmp_path: Path) -> None:

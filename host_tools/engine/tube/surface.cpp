@@ -312,7 +312,7 @@ void Surface::describe()
         p.angle = std::atan2(d.dot(f.second), d.dot(f.first));
         p.r = d.norm();
         p.distance = distance_[i];
-        p.sigma = std::sqrt(noise_[i] + tau_[c] * tau_[c]);
+        p.sigma = std::sqrt(noise_[i] + tau_[c] * tau_[c] + EXACT * EXACT * diameter_ * diameter_);
         p.weight = robust_[i];
         if (robust_[i] > 0.0) {
             by_s_.emplace_back(p.s, static_cast<int>(i));

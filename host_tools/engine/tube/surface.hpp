@@ -17,6 +17,7 @@ namespace pipefish::tube
 {
 
 constexpr int MAX_ORDER = 6;
+constexpr double EXACT = 1e-9; // of the diameter: no point is known better
 
 // Where the fit starts: nodes along the pipe, at least two.
 struct Reference {

@@ -44,7 +44,7 @@ void Surface::reweigh(bool all)
         noise_[i] = cloud_.variance(static_cast<int>(i), (o.n[0] * f.first + o.n[1] * f.second).normalized());
     }
     measure_roughness();
-    const double information = 1.0 / (TUKEY_VARIANCE * correlation_), floor = 1e-9 * diameter_;
+    const double information = 1.0 / (TUKEY_VARIANCE * correlation_), floor = EXACT * diameter_;
     for (size_t i = 0; i < u_.size(); i++) {
         if (of_piece_[i] < 0 || (!all && !used_[i]) || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
             continue;
