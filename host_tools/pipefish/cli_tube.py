@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -79,7 +77,9 @@ def _direction(text: str) -> list[float]:
 
 def document_of(tube: Any) -> dict[str, Any]:
     """Everything about a tube for JSON; what was not measured is null."""
-    return _plain(
+    from pipefish.files import plain
+
+    return plain(
         {
             "status": tube.status,
             "reason": tube.reason,
@@ -92,49 +92,26 @@ def document_of(tube: Any) -> dict[str, Any]:
     )
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if hasattr(value, "tolist"):  # arrays and numbers of NumPy, whose import would slow down --help
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
     """Writes profile.csv, events.csv, tube.ply and tube.json; returns their paths."""
     import numpy as np
 
     from pipefish.cloudfile import ply_bytes
-    from pipefish.files import write_atomically
+    from pipefish.files import csv_bytes, write_atomically
     from pipefish.tube_findings import COLUMNS
 
     folder.mkdir(parents=True, exist_ok=True)
     vertices, faces = tube.mesh()
     columns = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
     contents = {
-        "profile.csv": _csv(
-            list(tube.stations),
-            [dict(zip(tube.stations, row, strict=True)) for row in zip(*tube.stations.values(), strict=True)],
-        ),
-        "events.csv": _csv(COLUMNS, tube.events),
+        "profile.csv": csv_bytes(tube.stations),
+        "events.csv": csv_bytes({name: [event.get(name) for event in tube.events] for name in COLUMNS}),
         "tube.ply": ply_bytes(columns, faces, ("units: metres",)),
         "tube.json": json.dumps(document).encode(),
     }
     for name, data in contents.items():
         write_atomically(folder / name, data)
     return [str(folder / name) for name in contents]
-
-
-def _csv(names: list[str], rows: list[dict[str, Any]]) -> bytes:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        values = (_plain(row.get(name)) for name in names)
-        writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in values])
-    return stream.getvalue().encode()
 
 
 def _text(tube: Any, files: list[str]) -> str:

@@ -247,8 +247,8 @@ def fit_tube(
     tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
     tube.summary = _summary(tube, by_shape, used)
     if not np.isin(tube.stations["status"], MEASURED).any():
-        worst = str(tube.stations["status"][0])
-        return _none(worst, "", nominal)
+        statuses, count = np.unique(tube.stations["status"], return_counts=True)
+        return _none(str(statuses[count.argmax()]), "", nominal)  # of most of it
     tube.points = _all_points(tube._places(surface.placed()), used)
     tube.summary["points_apart"] = float(np.mean(tube.points["piece"][used] < 0))
     tell(0.9, "looking for what departs from it")
