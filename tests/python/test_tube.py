@@ -44,9 +44,13 @@ def test_sizes_shapes_and_gross_points_are_within_their_intervals(pipe: Pipe, wi
     r = pipe.radius(s[:1], clock)
     mean = 2 * r.mean()
     assert np.abs(t["d_mean"] / mean - 1).max() < 0.005
-    assert (np.abs(t["d_mean"] - mean) < 1.96 * t["d_mean_sigma"]).mean() > 0.7
-    assert (np.abs(t["d_mean"] - mean) < 4.5 * t["d_mean_sigma"]).all()
-    assert ((t["ovality_lo"] <= pipe.ovality + 1e-3) & (pipe.ovality - 1e-3 <= t["ovality_hi"])).mean() > 0.7
+    # Smoothing makes one pipe's stations nearly one figure, which is beyond 2.58 sigma in one of a hundred.
+    z = (t["d_mean"] - mean) / t["d_mean_sigma"]
+    assert np.sqrt(np.mean(z**2)) < 2.58 and np.abs(z).max() < 4.5
+    assert abs(tube.summary["d_mean"] - mean) < 2.58 * tube.summary["d_mean_sigma"]
+    known = t["status"] == "ok"
+    z = (np.sqrt(np.maximum(t["ovality_squared"], 0)) - pipe.ovality)[known] / t["ovality_sigma"][known]
+    assert np.sqrt(np.mean(z**2)) < (2.58 if pipe.ovality else 3.03)  # of two normals where it is round: 99 %
     assert abs(tube.length - pipe.length) < 0.02 * pipe.diameter + 0.01 * pipe.length
     assert not [e for e in tube.events if e["kind"] != "bend"]
 
