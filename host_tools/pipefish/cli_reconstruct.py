@@ -208,11 +208,11 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
             f"{s['stations_measured']} of {s['stations']} stations",
         )
     )
-    if "ovality_mean" in s:
+    if "ovality_rms" in s:
         rows.append(
             (
                 "ovality",
-                f"mean {percent_text(s['ovality_mean'])}, most {percent_text(s['ovality_most'])} at "
+                f"{percent_text(s['ovality_rms'])} (rms along the pipe), most {percent_text(s['ovality_most'])} at "
                 f"{length_text(s['ovality_most_at'], unit, metres=True)} ((max - min) / mean)",
             )
         )

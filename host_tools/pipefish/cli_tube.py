@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 
 from pipefish.cli import Result, UsageError, add_command, table
 
+APART = 0.1  # share of points that scattered gross ones do not reach
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -53,10 +52,10 @@ def run_tube(args: argparse.Namespace) -> Result:
             points * unit,
             None if sigma is None else sigma * unit,
             path,
-            nominal=args.nominal / 1000 if args.nominal else None,
+            nominal=args.nominal / 1000 if args.nominal is not None else None,
             up=_direction(args.up) if args.up else None,
             scale_sigma=args.scale_sigma,
-            spacing=args.spacing / 1000 if args.spacing else None,
+            spacing=args.spacing / 1000 if args.spacing is not None else None,
             progress=lambda done, word: bar.update(round(100 * done), word),
         )
     if tube.status != "ok":
@@ -78,7 +77,9 @@ def _direction(text: str) -> list[float]:
 
 def document_of(tube: Any) -> dict[str, Any]:
     """Everything about a tube for JSON; what was not measured is null."""
-    return _plain(
+    from pipefish.files import plain
+
+    return plain(
         {
             "status": tube.status,
             "reason": tube.reason,
@@ -91,33 +92,20 @@ def document_of(tube: Any) -> dict[str, Any]:
     )
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if hasattr(value, "tolist"):  # arrays and numbers of NumPy, whose import would slow down --help
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
     """Writes profile.csv, events.csv, tube.ply and tube.json; returns their paths."""
     import numpy as np
 
     from pipefish.cloudfile import ply_bytes
-    from pipefish.files import write_atomically
+    from pipefish.files import csv_bytes, write_atomically
     from pipefish.tube_findings import COLUMNS
 
     folder.mkdir(parents=True, exist_ok=True)
     vertices, faces = tube.mesh()
     columns = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
     contents = {
-        "profile.csv": _csv(
-            list(tube.stations),
-            [dict(zip(tube.stations, row, strict=True)) for row in zip(*tube.stations.values(), strict=True)],
-        ),
-        "events.csv": _csv(COLUMNS, tube.events),
+        "profile.csv": csv_bytes(tube.stations),
+        "events.csv": csv_bytes({name: [event.get(name) for event in tube.events] for name in COLUMNS}),
         "tube.ply": ply_bytes(columns, faces, ("units: metres",)),
         "tube.json": json.dumps(document).encode(),
     }
@@ -126,32 +114,27 @@ def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
     return [str(folder / name) for name in contents]
 
 
-def _csv(names: list[str], rows: list[dict[str, Any]]) -> bytes:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        values = (_plain(row.get(name)) for name in names)
-        writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in values])
-    return stream.getvalue().encode()
-
-
 def _text(tube: Any, files: list[str]) -> str:
     import numpy as np
 
     s, t = tube.summary, tube.stations
-    oval = np.isfinite(t["ovality"])
+    oval = (
+        f"{100 * s['ovality_rms']:.2f} % (rms along the pipe), most {100 * np.nanmax(t['ovality']):.2f} % "
+        "((max - min) / mean)"
+        if "ovality_rms" in s
+        else "not measured: one side only"
+    )
     spread = f", {1000 * np.nanmin(t['d_mean']):.1f} to {1000 * np.nanmax(t['d_mean']):.1f} along the pipe"
     rows: list[tuple[str, object]] = [
         ("length", f"{s['length']:.2f} m, {s['measured']} of {s['stations']} stations measured"),
         ("mean diameter", f"{1000 * s['d_mean']:.2f} +- {1960 * s['d_mean_sigma']:.2f} mm (95 %){spread}"),
-        (
-            "ovality",
-            f"{100 * s['ovality']:.2f} % ((max - min) / mean)" if oval.any() else "not measured: one side only",
-        ),
+        ("ovality", oval),
         ("roughness", f"{1000 * s['roughness']:.2f} mm"),
         ("clock", f"zero {tube.clock_zero}"),
     ]
+    if s["points_apart"] > APART:
+        text = f"{100 * s['points_apart']:.0f} % of the points are far from this pipe or beyond its ends: not measured"
+        rows.append(("left out", text))
     rows += [(e["kind"], event_text(e)) for e in tube.events]
     return table([*rows, *(("written", f) for f in files)])
 

@@ -269,7 +269,7 @@ def measured(survey: Any, truth: Any, out: Path, quiet: bool) -> dict[str, Any]:
     report = out / "report.html"
     verdicts = write_report(out / "pipe", report, limits=LIMITS, title="Demo pipe, measured")
     figures_of = document["summary"]
-    names = ("d_mean", "d_mean_sigma", "d_mean_systematic", "ovality_mean", "ovality_most", "path_length", "points")
+    names = ("d_mean", "d_mean_sigma", "d_mean_systematic", "ovality_rms", "ovality_most", "path_length", "points")
     return {
         **{key: value for key, value in (against_truth(result, truth) or {}).items() if not key.startswith("stations")},
         "measured": {name: figures_of.get(name) for name in (*names, "stations", "stations_measured", "events")},

@@ -17,8 +17,7 @@ from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.dense import DenseWall
 from pipefish.dense_findings import FORMAT, VERSION, findings_of, findings_table
-from pipefish.files import write_atomically
-from pipefish.measured_files import plain
+from pipefish.files import plain, write_atomically
 from pipefish.measured_texts import clock_text
 from pipefish.wall import Piece
 from pipefish.wallmodel import Floats, WallModel

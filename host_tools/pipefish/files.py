@@ -1,10 +1,14 @@
-"""Writing files."""
+"""Writing files, and what is written as JSON and CSV."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
+import math
 import os
 from pathlib import Path
+from typing import Any
 
 from .errors import file_error
 
@@ -31,3 +35,24 @@ def write_atomically(path: Path, data: bytes) -> None:
     finally:
         with contextlib.suppress(OSError):  # the folder may be no folder
             temporary.unlink(missing_ok=True)
+
+
+def plain(value: Any) -> Any:
+    """For JSON: lists and Python's numbers; what is not finite is null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if hasattr(value, "tolist"):  # arrays and numbers of NumPy, whose import would slow down --help
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def csv_bytes(columns: dict[str, Any]) -> bytes:
+    """A CSV table from columns of one length; what is not finite or None is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*(plain(c) for c in columns.values()), strict=True):
+        writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in row])
+    return stream.getvalue().encode()

@@ -24,7 +24,7 @@ from pipefish.sectionsigma import diameter_sigma, shared_of
 from pipefish.structure import Encoder, Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
-from pipefish.tube import Tube, fit_tube
+from pipefish.tube import AGAINST_GRAVITY, Tube, fit_tube
 from pipefish.tube_water import depth, mirrored
 
 T = TypeVar("T")
@@ -477,7 +477,8 @@ def _fit_stretches(m: Measurement, threads: int | None, tell: Tell) -> None:
             for w in water:
                 at = w.pop("at")
                 w["depth"] = depth(tube, at) if tube.status == "ok" else None
-        tube.clock_zero = "against gravity" if structure.down is not None else "up in the first keyframe"
+        if structure.down is None and tube.clock_zero == AGAINST_GRAVITY:
+            tube.clock_zero = "up in the first keyframe"
         origin, sign = _origin(tube, structure.centres[here], along[here], m.backwards)
         m.stretches.append(Stretch(segment, tube, structure.frames[here], origin, sign, water=water))
 

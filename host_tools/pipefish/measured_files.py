@@ -3,8 +3,6 @@ docs/reconstruction.md tells each file and column."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -17,11 +15,12 @@ from pipefish.assumed import assumed_px
 from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
-from pipefish.files import write_atomically
+from pipefish.files import csv_bytes, plain, write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.simulate import quaternion
+from pipefish.tube import rms_ovality
 from pipefish.tube_findings import COLUMNS
 
 RING = 72  # vertices of tube.ply around the pipe
@@ -29,27 +28,6 @@ COLMAP_THETA = math.radians(89)  # its functions divide by z
 COLMAP_ERROR_PX = 0.1
 COLOUR_SPAN = 0.03  # of the diameter: full colour of a deviation in the point clouds
 CENTRELINE = ("s", "x", "y", "z", "tx", "ty", "tz", "centre_sigma", "curvature", "curvature_sigma")
-
-
-def plain(value: Any) -> Any:
-    """For JSON: lists and Python's numbers; what is not finite is null."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def csv_bytes(columns: dict[str, Any]) -> bytes:
-    """A CSV table from columns of one length; what is not finite or None is empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*(plain(c) for c in columns.values()), strict=True):
-        writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in row])
-    return stream.getvalue().encode()
 
 
 def stations(m: Measurement) -> dict[str, np.ndarray]:
@@ -117,7 +95,7 @@ def summary(m: Measurement) -> dict[str, Any]:
         out |= {
             "d_max": float(np.nanmax(table["d_max"])),
             "d_min": float(np.nanmin(table["d_min"])),
-            "ovality_mean": float(np.nanmean(oval)),
+            "ovality_rms": rms_ovality(table),
             "ovality_most": float(oval[worst]),
             "ovality_most_at": float(table["chainage"][worst]),
             "ovality_sigma": float(np.nanmedian(table["ovality_sigma"])),

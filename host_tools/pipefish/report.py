@@ -54,8 +54,8 @@ class Report(Charts):
                 text = f"{word} anywhere, at {at}; ± {own:.{digits}f} repeatability (95 %)"
                 tiles.append((f"{self.factor * s[name]:.{digits}f}", self.short, text))
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
-            mean = 100 * s["ovality_mean"]
-            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; mean {mean:.2f} %"))
+            rms = 100 * s["ovality_rms"]
+            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; {rms:.2f} % rms along the pipe"))
         figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
         tiles.append(figure)
         return tiles

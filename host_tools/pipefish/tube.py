@@ -22,14 +22,21 @@ SECTION = 0.75  # length of the stretch that counts as one section, diameters
 # between knots half a diameter apart, which no sigma knows; the smoothness decides how many of them a pipe uses.
 KNOT = 0.25
 STATION = 0.25  # spacing of the stations, diameters
+AGAINST_GRAVITY, FROM_FRAME = "against gravity", "-y of the points' frame at the start"  # twelve o'clock
+UPRIGHT = 0.1  # sine of the angle between a pipe and gravity that gives no clock
+NODES = 64  # of a path at least: how far its wall is away is measured from the nearest
 MIN_INLIERS = 20  # in a section, for its values to be given
-GAP_CIRCLE, GAP_NONE = math.radians(150), math.radians(220)  # azimuth without points: no ellipse, nothing
+# Root mean square of pipes' ovality, its direction anywhere: 95 % are below 5.2 %, about what is allowed of a laid
+# flexible pipe. What an ellipse through half a wall leans on.
+ASSUMED_OVALITY = 0.03
+GAP_CIRCLE, GAP_NONE = math.radians(150), math.radians(220)  # azimuth without points: no ovality, nothing
 MEASURED = ("ok", "circle_only")
 REASONS = {
     "ok": "",
     "too_few_points": "too few points for a tube",
     "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
     "one_sided": "points on one side only: neither centre nor diameter is determined",
+    "not_determined": "the points are too uncertain for a tube",
     "too_short": "the wall is shorter than half a radius",
 }
 
@@ -48,7 +55,8 @@ class Tube:
       ovality_astm             (d_mean - d_min) / d_mean (ASTM F1216);  ovality_astm_max: (d_max - d_mean) / d_mean
       reduction_nominal        (d_nominal - d_min) / d_nominal (EN 13508-2 BAA, relative to nominal)
       ovality_lo, ovality_hi   95 % interval of `ovality`, with ovality_systematic: what the camera leaves open
-      e2, e2_sigma             unclamped debiased squared ellipse amplitude, m^2 (for averages)
+      ovality_squared          square of the ovality less the noise's share, below zero as often as above where the
+                               pipe is round: what averages are made of (`rms_ovality`)
       <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
       curvature, curvature_sigma, inliers, gap, rms, roughness
     events: one dictionary a finding; see `pipefish.tube_findings`."""
@@ -199,6 +207,10 @@ def fit_tube(
     cloud, noise, centres, up_vector, used = _checked(points, sigma, path, up)
     if nominal is not None and not (math.isfinite(nominal) and nominal > 0):
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
+    if not (math.isfinite(scale_sigma) and scale_sigma >= 0):
+        raise ArgumentError(f"scale_sigma: {scale_sigma} is not a relative standard deviation")
+    if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
+        raise ArgumentError(f"spacing: {spacing} is not a positive length")
     if order not in (0, 2, 3, 4, 6):
         raise ArgumentError(f"order: {order} is not 0, 2, 3, 4 or 6")
     tell = progress or (lambda fraction, word: None)
@@ -214,24 +226,31 @@ def fit_tube(
         return _none("too_short", "", nominal)
     diameter = 2 * float(np.median(rho))
     tell(0.4, "looking for joints")
-    coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True)
+    try:
+        coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+    except ValueError as error:  # the normal matrix is singular
+        return _none("not_determined", str(error), nominal)
     breaks = tube_findings.break_candidates(coarse, nodes, diameter)
     tell(0.55, "fitting the surface")
-    surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False)
+    try:
+        surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False, ASSUMED_OVALITY)
+    except ValueError as error:
+        return _none("not_determined", str(error), nominal)
     known = np.flatnonzero(used)
     common = Common(surface, shared, known, diameter)
     kept = tube_findings.confirmed(surface, diameter, breaks, common)
     if len(kept) < len(breaks):
-        surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False)
+        surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False, ASSUMED_OVALITY)
         common = Common(surface, shared, known, diameter)
-    tube = Tube("ok", "", {}, nominal=nominal, surface=surface, _up=up_vector)
-    tube.clock_zero = "against gravity" if up_vector is not None else "-y of the points' frame at the start"
-    tube.stations = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
-    tube.summary = _summary(tube, len(cloud), used)
+    tube = Tube("ok", "", {}, nominal=nominal, surface=surface)
+    tube._up, tube.clock_zero = _clock_of(surface, up_vector)
+    tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
+    tube.summary = _summary(tube, by_shape, used)
     if not np.isin(tube.stations["status"], MEASURED).any():
-        worst = str(tube.stations["status"][0])
-        return _none(worst, "", nominal)
+        statuses, count = np.unique(tube.stations["status"], return_counts=True)
+        return _none(str(statuses[count.argmax()]), "", nominal)  # of most of it
     tube.points = _all_points(tube._places(surface.placed()), used)
+    tube.summary["points_apart"] = float(np.mean(tube.points["piece"][used] < 0))
     tell(0.9, "looking for what departs from it")
     tube.events = tube_findings.events(tube, common)
     tube.summary["events"] = len(tube.events)
@@ -247,12 +266,16 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
     if sigma is not None:
         noise = np.asarray(sigma, float)
         if noise.ndim == 0:
+            if not np.isfinite(noise):
+                raise ArgumentError(f"sigma: {noise} is not a standard deviation")
             noise = np.full(len(cloud), float(noise))
         if noise.shape not in ((len(cloud),), (len(cloud), 3, 3)):
             raise ArgumentError(f"sigma: shape {noise.shape} is neither ({len(cloud)},) nor ({len(cloud)}, 3, 3)")
         sound = np.isfinite(noise) if noise.ndim == 1 else np.isfinite(noise).all((1, 2))
         if noise.ndim == 1 and (noise[sound] < 0).any():
             raise ArgumentError("sigma: negative standard deviations")
+        if noise.ndim == 3 and not _are_covariances(noise[sound]):
+            raise ArgumentError("sigma: what is given as covariances is not symmetric or has negative variances")
         used &= sound
         noise = np.ascontiguousarray(noise[used])
     centres = None
@@ -270,6 +293,13 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
             raise ArgumentError("up: not a direction")
         vector = vector / np.linalg.norm(vector)
     return np.ascontiguousarray(cloud[used]), noise, centres, vector, used
+
+
+def _are_covariances(noise: np.ndarray) -> bool:
+    """Symmetric and nowhere negative, but for the rounding of whoever computed them."""
+    blur = 1e-6 * np.abs(noise).max(axis=(1, 2), initial=0.0)
+    even = (np.abs(noise - noise.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0) <= blur).all()
+    return bool(even and (np.linalg.eigvalsh(noise)[:, 0] >= -blur).all())
 
 
 def _array(values: Any, name: str, shape: tuple[int | None, int]) -> np.ndarray:
@@ -298,12 +328,12 @@ def _forward(centres: np.ndarray) -> np.ndarray:
         heading = move / length if heading is None else heading + 0.3 * (move / length - heading)
         kept.append(c)
     line = np.array(kept)
-    if len(line) < 3:
+    if len(line) < 2:
         return line
     for _ in range(3):
         line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
     s = np.r_[0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    even = np.linspace(0, s[-1], max(len(line), 8))
+    even = np.linspace(0, s[-1], max(len(line), NODES))
     return np.ascontiguousarray(np.column_stack([np.interp(even, s, line[:, k]) for k in range(3)]))
 
 
@@ -345,6 +375,18 @@ def _reference(cloud: np.ndarray, sections: list[dict[str, Any]], path: Any) -> 
     return np.ascontiguousarray(np.array([nodes[i] for i in keep])), [rho[i] for i in keep]
 
 
+def _clock_of(surface: Any, up: np.ndarray | None) -> tuple[np.ndarray | None, str]:
+    """The direction of twelve o'clock, None where the points' frame tells it, and what it is."""
+    if up is None:
+        return None, FROM_FRAME
+    s = np.concatenate([np.linspace(a, b, 20) for a, b in surface.pieces])
+    piece = np.repeat(np.arange(len(surface.pieces)), 20)
+    tangent = surface.stations(s.tolist(), piece.tolist())["tangent"]
+    if (np.linalg.norm(up - (tangent @ up)[:, None] * tangent, axis=1) > UPRIGHT).any():
+        return up, AGAINST_GRAVITY
+    return None, f"{FROM_FRAME}: the pipe stands upright, gravity tells no clock"
+
+
 def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: Any) -> np.ndarray:
     """The section's own angle at twelve o'clock, at each station."""
     start = surface.stations([0.0], [0])
@@ -355,7 +397,7 @@ def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: An
         return np.full(len(found["first"]), angle)
     a, b = found["first"] @ up, found["second"] @ up
     zero = np.arctan2(b, a)
-    upright = np.hypot(a, b) > 0.1  # steeper shafts keep the last clock
+    upright = np.hypot(a, b) > UPRIGHT  # steeper shafts keep the last clock
     if not upright.all():
         index = np.arange(len(zero))
         zero = np.interp(index, index[upright], np.unwrap(zero[upright])) if upright.any() else np.zeros(len(zero))
@@ -447,7 +489,10 @@ def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return seen, low, high
 
 
-def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) -> dict[str, np.ndarray]:
+def _stations(
+    tube: Tube, spacing: float, scale_sigma: float, common: Common
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The stations' table, and the derivatives (n,k) of their mean diameters by the section's parameters."""
     s, piece = [], []
     for k, (start, end) in enumerate(tube.surface.pieces):
         count = max(2, round((end - start) / spacing) + 1)
@@ -464,15 +509,11 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out.update(zip("xyz", f["centre"].T, strict=True))
     out.update(zip(("tx", "ty", "tz"), f["tangent"].T, strict=True))
     out["centre_sigma"] = np.sqrt(np.maximum(0, full[:, 0, 0] + full[:, 1, 1]))
-    # The ellipse's amplitude without the noise's share; unclamped for averages.
+    # The ellipse's amplitude without the noise's share.
     e = np.hypot(shape[:, 1], shape[:, 2])
-    unit = shape[:, 1:3] / np.maximum(e, 1e-300)[:, None]
-    e_sigma = np.sqrt(np.einsum("ni,nij,nj->n", unit, cov[:, 1:3, 1:3], unit))
     trace = cov[:, 1, 1] + cov[:, 2, 2]
-    out["e2"] = e**2 - trace
-    out["e2_sigma"] = np.sqrt(4 * np.maximum(out["e2"], 0) * e_sigma**2 + trace**2)
     debiased = shape.copy()
-    debiased[:, 1:3] *= (np.sqrt(np.maximum(out["e2"], 0)) / np.maximum(e, 1e-300))[:, None]
+    debiased[:, 1:3] *= (np.sqrt(np.maximum(e**2 - trace, 0)) / np.maximum(e, 1e-300))[:, None]
     raw = _calipers(shape)
     sound = _calipers(debiased)
     gradient = _gradients(shape, raw)
@@ -504,6 +545,7 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out["reduction_nominal_sigma"] = out["d_min_sigma"] / nominal
     seen, low, high = _rice_table()
     amplitude = (raw["max"] - raw["min"]) / d_mean
+    out["ovality_squared"] = amplitude**2 - 16 * trace / d_mean**2  # the widths differ by 4 |e|
     one = np.maximum(np.hypot(out["ovality_sigma"], out["ovality_systematic"]), 1e-300)
     inside = amplitude / one < seen[-1]
     out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - 1.96 * one)
@@ -514,7 +556,7 @@ def _stations(tube: Tube, spacing: float, scale_sigma: float, common: Common) ->
     out["inliers"] = f["inliers"].astype(int)
     out["status"] = _station_status(out, f["ellipse"] > 0)
     _blank(out)
-    return out
+    return out, gradient["d_mean"]
 
 
 def _station_status(out: dict[str, np.ndarray], ellipse: np.ndarray) -> np.ndarray:
@@ -525,7 +567,7 @@ def _station_status(out: dict[str, np.ndarray], ellipse: np.ndarray) -> np.ndarr
     return status
 
 
-OF_ELLIPSE = ("d_max", "d_min", "ovality", "clock_max", "reduction", "e2")
+OF_ELLIPSE = ("d_max", "d_min", "ovality", "clock_max", "reduction")
 OF_SIZE = ("d_mean", "d_area", "circumference")
 
 
@@ -539,7 +581,15 @@ def _blank(out: dict[str, np.ndarray]) -> None:
     out["oval"] = out["oval"] & (out["status"] == "ok")
 
 
-def _summary(tube: Tube, count: int, used: np.ndarray) -> dict[str, Any]:
+def rms_ovality(stations: dict[str, np.ndarray]) -> float:
+    """Root of the mean square of the ovality along the pipe, each station with the same weight: the one average that
+    noise does not raise, as squares may be had without its share. NaN where no station has an ellipse."""
+    squares = stations["ovality_squared"]
+    known = np.isfinite(squares)
+    return math.sqrt(max(0.0, float(np.mean(squares[known])))) if known.any() else math.nan
+
+
+def _summary(tube: Tube, by_shape: np.ndarray, used: np.ndarray) -> dict[str, Any]:
     t = tube.stations
     good = np.isfinite(t["d_mean"])
     out: dict[str, Any] = {
@@ -556,20 +606,16 @@ def _summary(tube: Tube, count: int, used: np.ndarray) -> dict[str, Any]:
     if not good.any():
         out["d_mean"] = float(2 * np.median(tube.frames(t["s"])["shape"][:, 0]))
         return out
+    # A depth camera's far end must not count as its near one. What smoothing makes stations share is in the variance.
     weight = 1 / t["d_mean_sigma"][good] ** 2
-    out["d_mean"] = float(np.average(t["d_mean"][good], weights=weight))
-    # Stations within a knot's support tell the same: count one a diameter.
-    independent = max(1.0, good.sum() * tube.length / len(t["s"]) / out["d_mean"])
-    out["d_mean_sigma"] = float(np.sqrt(1 / weight.mean() / min(independent, good.sum())))
+    weight /= weight.sum()
+    out["d_mean"] = float(weight @ t["d_mean"][good])
+    by_mean = weight[:, None] * by_shape[good]
+    out["d_mean_sigma"] = math.sqrt(tube.surface.variance(t["s"][good].tolist(), t["piece"][good].tolist(), by_mean))
     out["d_mean_spread"] = float(np.std(t["d_mean"][good]))
-    oval = np.isfinite(t["e2"])
+    oval = np.isfinite(t["ovality"])
     if oval.any():
-        e2 = float(np.average(t["e2"][oval], weights=1 / t["e2_sigma"][oval] ** 2))
-        out["ovality"] = (
-            4 * math.sqrt(max(0.0, e2)) / out["d_mean"]
-            if tube.surface.order == 2
-            else float(np.mean(t["ovality"][oval]))
-        )
+        out["ovality_rms"] = rms_ovality(t)
         out["d_max"] = float(np.max(t["d_max"][oval]))
         out["d_min"] = float(np.min(t["d_min"][oval]))
     out["roughness"] = float(np.median(t["roughness"]))

@@ -156,7 +156,7 @@ def test_the_diameter_is_the_truth_within_what_is_stated(out):
     # Perimeter / pi of an ellipse of 0.3 (1 +- 0.015): above 0.3 by a quarter of 0.015^2.
     assert s["d_mean"] == pytest.approx(0.3 * (1 + 0.015**2 / 4), abs=3 * sigma) and sigma < 0.0012
     assert s["unit"] == "metre" and not s["diameter_from_prior"]
-    assert s["ovality_mean"] == pytest.approx(0.03, abs=0.0015)
+    assert s["ovality_rms"] == pytest.approx(0.03, abs=0.0015)
 
 
 def test_tables_say_the_same_as_the_document(out):
@@ -239,7 +239,7 @@ def test_without_scale_everything_is_relative_and_says_so(drive, tmp_path, capsy
     assert "no scale" in text and "mm" not in re.sub(r"note.*|written.*", "", text)
     s = document_of(tmp_path / "out")["summary"]
     assert s["unit"] == "diameter" and s["d_mean"] == pytest.approx(1, abs=0.01)
-    assert s["ovality_mean"] == pytest.approx(0.03, abs=0.0015)
+    assert s["ovality_rms"] == pytest.approx(0.03, abs=0.0015)
     assert s["path_length"] == pytest.approx(drive.driven[-1] / 0.3, rel=0.02)
 
 

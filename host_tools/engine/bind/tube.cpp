@@ -145,7 +145,7 @@ struct Fitted {
 
 std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &noise, const Points &centres,
                                     const std::vector<double> &rho, const std::vector<double> &breaks, double knot,
-                                    int order, int rounds, bool smooth_only)
+                                    int order, int rounds, bool smooth_only, double ovality)
 {
     auto out = std::make_unique<Fitted>();
     out->cloud = cloud_of(points, noise);
@@ -155,7 +155,7 @@ std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &nois
     const nb::gil_scoped_release release;
     out->surface = std::make_unique<Surface>(
         out->cloud, reference,
-        SurfaceOptions{.knot = knot, .order = order, .rounds = rounds, .smooth_only = smooth_only});
+        SurfaceOptions{.knot = knot, .order = order, .rounds = rounds, .ovality = ovality, .smooth_only = smooth_only});
     return out;
 }
 
@@ -242,6 +242,16 @@ nb::dict stations(const Fitted &fitted, const std::vector<double> &s, const std:
     return out;
 }
 
+// Of the sum over stations of weight . shape.
+double variance(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece, const Rows &weight)
+{
+    if (piece.size() != s.size() || weight.rows() != static_cast<Eigen::Index>(s.size()) ||
+        weight.cols() != shape_parameters(fitted.surface->order())) {
+        throw nb::value_error("variance: a piece and a row of weights for each station");
+    }
+    return fitted.surface->variance(s, piece, weight);
+}
+
 Eigen::VectorXd distances(const Eigen::Vector3d &shape, const Eigen::Matrix<double, Eigen::Dynamic, 2> &y)
 {
     Eigen::VectorXd out(y.rows());
@@ -269,8 +279,10 @@ void bind_tube(nb::module_ &m)
         .def("medians", &medians, nb::arg("radius"), nb::arg("k"), nb::arg("every"), nb::arg("reach"), nb::arg("most"))
         .def("placed", &placed)
         .def("project", &project, nb::arg("points"))
-        .def("stations", &stations, nb::arg("s"), nb::arg("piece"));
+        .def("stations", &stations, nb::arg("s"), nb::arg("piece"))
+        .def("variance", &variance, nb::arg("s"), nb::arg("piece"), nb::arg("weight"));
     m.def("tube_surface", &fit_surface, nb::arg("points"), nb::arg("noise").none(), nb::arg("centres"), nb::arg("rho"),
-          nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"));
+          nb::arg("breaks"), nb::arg("knot"), nb::arg("order"), nb::arg("rounds"), nb::arg("smooth_only"),
+          nb::arg("ovality"));
     m.def("tube_trace", &trace_all, nb::arg("points"), nb::arg("noise").none(), nb::arg("path"), nb::arg("threads"));
 }

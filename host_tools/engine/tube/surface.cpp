@@ -5,6 +5,7 @@
 #include "tube/cylinder.hpp"
 #include "tube/nearest.hpp"
 #include "tube/section.hpp"
+#include "tube/surface_problem.hpp"
 
 #include <Eigen/Geometry>
 
@@ -70,6 +71,7 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
         throw std::invalid_argument("tube: the reference has no length");
     }
     diameter_ = 2.0 * median(reference.rho);
+    ovality_ = options.ovality;
     reach_ = std::max(1, static_cast<int>(std::lround(0.5 / options.knot)));
     lay_out(reference, options.knot);
     assign(reference);
@@ -95,10 +97,13 @@ Surface::Surface(const Cloud &cloud, const Reference &reference, const SurfaceOp
             converged_ = solve(options.rounds / 2, true);
         }
     }
+    keep_information();
     tabulate();
     reweigh(true);
     describe();
 }
+
+Surface::~Surface() = default;
 
 void Surface::lay_out(const Reference &reference, double knot)
 {
@@ -308,7 +313,7 @@ void Surface::describe()
         p.angle = std::atan2(d.dot(f.second), d.dot(f.first));
         p.r = d.norm();
         p.distance = distance_[i];
-        p.sigma = std::sqrt(noise_[i] + tau_[c] * tau_[c]);
+        p.sigma = std::sqrt(noise_[i] + tau_[c] * tau_[c] + EXACT * EXACT * diameter_ * diameter_);
         p.weight = robust_[i];
         if (robust_[i] > 0.0) {
             by_s_.emplace_back(p.s, static_cast<int>(i));

@@ -9,12 +9,15 @@
 
 #include <array>
 #include <functional>
+#include <memory>
+#include <span>
 #include <vector>
 
 namespace pipefish::tube
 {
 
 constexpr int MAX_ORDER = 6;
+constexpr double EXACT = 1e-9; // of the diameter: no point is known better
 
 // Where the fit starts: nodes along the pipe, at least two.
 struct Reference {
@@ -27,6 +30,7 @@ struct SurfaceOptions {
     double knot = 0.25;       // spacing of the knots, in diameters
     int order = 2;            // of the section's harmonics, 2 to 6; 0: by BIC
     int rounds = 12;          // of reweighting and smoothing
+    double ovality = 0.03;    // rms of pipes, (max - min) / mean: assumed where half the wall is seen at most
     bool smooth_only = false; // keep the smoothness as it starts: stiff, for looking for joints
 };
 
@@ -41,7 +45,7 @@ struct Station {
     Eigen::MatrixXd covariance;                   // of the centre along first and second, then the shape
     int inliers = 0;                              // within half a window
     double gap = 0.0, rms = 0.0, roughness = 0.0; // radians, metres, metres
-    bool ellipse = true;                          // false: pinned to a circle for want of points around
+    bool ellipse = true;                          // false: points on one side, an ellipse is half assumption
 };
 
 struct OnSurface {      // a point's place
@@ -61,6 +65,7 @@ class Surface
 public:
     // Throws std::invalid_argument where the reference has no length.
     Surface(const Cloud &cloud, const Reference &reference, const SurfaceOptions &options);
+    ~Surface();
 
     double length() const { return piece_.back().end_s; }
     int order() const { return order_; }
@@ -71,6 +76,8 @@ public:
     std::vector<std::pair<double, double>> pieces() const; // chainages
 
     Station station(double s, int piece = -1) const; // piece -1: the one that holds s
+    // Variance of sum over i of weight.row(i) . shape at (s[i], piece[i]), with all that the places have in common.
+    double variance(std::span<const double> s, std::span<const int> piece, const Eigen::MatrixXd &weight) const;
     OnSurface place(int point) const { return placed_[static_cast<size_t>(point)]; }
     // Chainage, angle, distances of any point; piece -1 where it is beyond the ends.
     OnSurface project(const Eigen::Vector3d &x) const;
@@ -99,6 +106,7 @@ private:
     bool solve(int rounds, bool adapt);
     void widen(int order);
     void smooth(const SurfaceProblem &problem, const SurfaceVariance &variance, bool adapt);
+    void keep_information();
     void tabulate();
     void describe();
     void count_around(Station &station) const;
@@ -111,15 +119,17 @@ private:
     double parameter(const Piece &piece, double s) const;
 
     const Cloud &cloud_;
-    double diameter_ = 0.0;
+    double diameter_ = 0.0, ovality_ = 0.0;
     int reach_ = 1; // knots each way that count as around one: half a diameter
     int order_ = 2, floats_ = 3;
     std::vector<Piece> piece_;
     std::vector<Eigen::Vector3d> control_, first_, second_;
-    std::vector<double> shape_;                            // floats_ a control
-    std::vector<char> pinned_;                             // a control: no ellipse
+    std::vector<double> shape_; // floats_ a control
+    std::vector<int> pinned_;   // a control: of how many in a row that see too little of the wall for an ellipse; or 0
     std::vector<std::vector<Eigen::MatrixXd>> covariance_; // [control][back]
-    std::array<double, 4> stiffness_{}; // 1 / variance of second differences: axis, rho, ellipse, harmonics
+    struct Information;
+    std::unique_ptr<Information> information_; // of the points that were fitted, at the end
+    std::array<double, 4> stiffness_{};        // 1 / variance of second differences: axis, rho, ellipse, harmonics
     std::vector<std::array<double, 4>>
         give_;                  // a control: factor of the stiffness, small where the pipe changes at once
     std::vector<int> of_piece_; // a point: piece or -1

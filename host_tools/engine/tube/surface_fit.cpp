@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <stdexcept>
 
 namespace pipefish::tube
 {
@@ -43,7 +44,7 @@ void Surface::reweigh(bool all)
         noise_[i] = cloud_.variance(static_cast<int>(i), (o.n[0] * f.first + o.n[1] * f.second).normalized());
     }
     measure_roughness();
-    const double information = 1.0 / (TUKEY_VARIANCE * correlation_), floor = 1e-9 * diameter_;
+    const double information = 1.0 / (TUKEY_VARIANCE * correlation_), floor = EXACT * diameter_;
     for (size_t i = 0; i < u_.size(); i++) {
         if (of_piece_[i] < 0 || (!all && !used_[i]) || std::abs(distance_[i]) > GATE * 0.5 * diameter_) {
             continue;
@@ -107,8 +108,17 @@ void Surface::find_gaps()
             count[static_cast<size_t>(c)][bin]++;
         }
     }
-    for (size_t c = 0; c < control_.size(); c++) {
-        pinned_[c] = widest_gap(count[c]) > ELLIPSE_GAP;
+    for (const Piece &piece : piece_) {
+        const int end = piece.first + piece.intervals + 3;
+        for (int c = piece.first, run = 0; c < end; c++) {
+            const bool gap = widest_gap(count[static_cast<size_t>(c)]) > ELLIPSE_GAP;
+            run = gap ? run + 1 : 0;
+            pinned_[static_cast<size_t>(c)] = run;
+        }
+        for (int c = end - 2; c >= piece.first; c--) { // the length of the run, at each of it
+            int &here = pinned_[static_cast<size_t>(c)];
+            here = here > 0 ? std::max(here, pinned_[static_cast<size_t>(c) + 1]) : 0;
+        }
     }
 }
 
@@ -147,6 +157,43 @@ bool Surface::solve(int rounds, bool adapt)
     }
     reweigh(false);
     return moved < 0.3;
+}
+
+void Surface::keep_information()
+{
+    const SurfaceProblem problem(*this);
+    information_ = std::make_unique<Information>();
+    information_->normal.prepare(problem);
+    information_->normal.linearize(problem, 1);
+    if (!information_->factor.compute(information_->normal, 0.0)) {
+        throw std::domain_error("tube: the surface is not determined");
+    }
+}
+
+double Surface::variance(std::span<const double> s, std::span<const int> piece, const Eigen::MatrixXd &weight) const
+{
+    const size_t each = static_cast<size_t>(floats_) + 2;
+    std::vector<double> by(control_.size() * each, 0.0);
+    for (size_t i = 0; i < s.size(); i++) {
+        const Piece &of = piece_.at(static_cast<size_t>(piece[i]));
+        const Basis b = basis_at(parameter(of, s[i]), of.intervals);
+        for (size_t k = 0; k < 4; k++) {
+            const size_t first = (static_cast<size_t>(of.first + b.first) + k) * each + 2;
+            for (Eigen::Index p = 0; p < weight.cols(); p++) {
+                by[first + static_cast<size_t>(p)] += b.value[k] * weight(static_cast<Eigen::Index>(i), p);
+            }
+        }
+    }
+    optim::NormalMatrix<1, 1> system = information_->normal;
+    for (size_t i = 0; i < by.size(); i++) {
+        system.common.b_f[i][0] = -by[i];
+    }
+    const optim::Step<1, 1> solved = information_->factor.solve(system); // N^-1 by
+    double sum = 0.0;
+    for (size_t i = 0; i < by.size(); i++) {
+        sum += by[i] * solved.f[i][0];
+    }
+    return sum;
 }
 
 // Fellner and Schall: the variance of each group of second differences, from their sizes and from what the data left of

@@ -6,10 +6,17 @@
 #include "tube/section.hpp"
 #include "tube/surface.hpp"
 
+#include <cmath>
 #include <limits>
+#include <numbers>
 
 namespace pipefish::tube
 {
+
+struct Surface::Information {
+    optim::NormalMatrix<1, 1> normal;
+    optim::ArrowFactor<1, 1> factor;
+};
 
 class SurfaceProblem
 {
@@ -109,10 +116,10 @@ public:
     }
 
     // Calls take(residual, scalars, derivatives, group) for each second difference along the pipe, those of a control
-    // one after the other; group -1: a pin.
+    // one after the other; group -1: what is assumed where half the wall is seen at most.
     template <class Take> void each_prior(const Take &take) const
     {
-        constexpr double PIN = 1e-4; // of the radius: a circle for all that matters
+        constexpr double PIN = 1e-4; // of the radius, harmonics: none for all that matters
         constexpr double FACTOR[3] = {1.0, -2.0, 1.0};
         double j[6];
         const double *rows[6] = {j, j + 1, j + 2, j + 3, j + 4, j + 5};
@@ -145,9 +152,10 @@ public:
                 }
             }
         }
-        const double scale = 1.0 / (PIN * 0.5 * t_.diameter_);
         for (size_t c = 0; c < t_.control_.size(); c++) {
-            for (int p = 3; t_.pinned_[c] && p < each_; p++) {
+            for (int p = 3; t_.pinned_[c] > 0 && p < each_; p++) {
+                const double scale =
+                    p < 5 ? std::sqrt(ellipse_information(t_.pinned_[c])) : 1.0 / (PIN * 0.5 * t_.diameter_);
                 f[0] = static_cast<int>(c) * each_ + p;
                 j[0] = scale;
                 take(scale * shape(c)[p - 2], std::span<const int>(f, 1), std::span<const double *const>(rows, 1), -1);
@@ -159,6 +167,17 @@ public:
     static int group(int p) { return p < 2 ? 0 : p == 2 ? 1 : p < 5 ? 2 : 3; }
 
 private:
+    // Of one parameter of the ellipse, a control of a run of so many that see half the wall at most: what is assumed of
+    // pipes. Independent rows and the second differences' together give any one place of a long run the variance v
+    // where each row has (2 sqrt(2) v l^(1/4))^(-4/3), l the differences' stiffness; a short or stiff run is one
+    // ellipse, whose variance the rows have together.
+    double ellipse_information(int run) const
+    {
+        const double sigma = t_.ovality_ * 0.5 * t_.diameter_ / (2.0 * std::numbers::sqrt2), v = sigma * sigma;
+        const double along = std::pow(2.0 * std::numbers::sqrt2 * v * std::pow(t_.stiffness_[2], 0.25), -4.0 / 3.0);
+        return std::max(along, 1.0 / (run * v));
+    }
+
     static constexpr size_t MOST = shape_parameters(MAX_ORDER) + 2;
 
     const double *shape(size_t c) const { return t_.shape_.data() + c * static_cast<size_t>(t_.floats_); }
