@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from pipefish.dense_findings import finding_parts
-from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_texts import LIMITS, Z95, clock_text, column, length_text, scale_texts, size_parts, verdict
+from pipefish.measured_limits import LIMITS, check_limits, verdict
+from pipefish.measured_texts import Z95, clock_text, column, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
@@ -27,6 +27,7 @@ class Report(Charts):
         super().__init__(folder)
         self.picture = picture
         self.dense = dense
+        check_limits(limits, self.summary["d_mean"] if self.unit == "metre" else None)
         self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
 
     # ---- texts
@@ -66,9 +67,9 @@ class Report(Charts):
             return "<p class='muted'>No limits were given (<code>--limit ovality=5</code>).</p>"
         shown = [v | {"word": "FAILED" if v["state"] == "failed" else v["state"]} for v in self.verdicts]
         rows = "".join(
-            f"<tr><th scope='row'>{html.escape(v['name'].replace('_', ' '))}</th>"
+            f"<tr><th scope='row'>{html.escape(LIMITS[v['name']].words)}</th>"
             f"<td><span class='state {v['state'].split()[0]}'>{v['word']}</span></td>"
-            f"<td>{'at most' if LIMITS[v['name']][1] == 'most' else 'at least'} {v['bound']:g} {v['unit']}</td>"
+            f"<td>{LIMITS[v['name']].side} {v['bound']:g} {v['unit']}</td>"
             f"<td>worst: {html.escape(v['worst'])}</td></tr>"
             for v in shown
         )
@@ -255,10 +256,8 @@ def write_report(
     """Writes the page about a folder of `pipefish reconstruct`; returns the verdicts on the limits (name of LIMITS,
     bound in per cent or millimetres). survey: the file with the pictures [where it was when it was measured]; where it
     is not, the page says so. dense: folder of `pipefish dense` [`folder`/dense, where there is one]. Raises
-    PipefishError, OSError."""
-    for name, _ in limits or []:
-        if name not in LIMITS:
-            raise PipefishError(f"limit {name}: not one of {', '.join(LIMITS)}")
+    LimitError, PipefishError, OSError."""
+    check_limits(limits or [])
     by_map = dense_part(folder, dense)
     report = Report(folder, limits or [], wall_picture(folder, survey, tell, by_map.findings), by_map)
     write_atomically(out, report.render(title).encode())

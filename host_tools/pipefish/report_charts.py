@@ -14,19 +14,12 @@ from pipefish.cloudfile import read_columns
 from pipefish.colours import DIVERGING
 from pipefish.errors import FormatError
 from pipefish.measured_files import COLOUR_SPAN, RING
-from pipefish.measured_texts import Z95, column, events_text, read_measured
+from pipefish.measured_texts import OVALITIES, Z95, column, events_text, read_measured
 from pipefish.page import Chart
 
 MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # of the 3-D scene: a phone turns that
 NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
 
-OVALITIES = (
-    ("ovality", "(max - min) / mean"),
-    ("ovality_nominal", "(max - min) / nominal"),
-    ("ovality_astm", "ASTM F1216: (mean - min) / mean"),
-    ("ovality_astm_max", "ASTM F1216: (max - mean) / mean"),
-    ("reduction_nominal", "EN 13508-2 BAA: (nominal - min) / nominal"),
-)
 DIAMETERS = (
     ("d_mean", "mean (perimeter / pi)"),
     ("d_max", "widest"),
@@ -164,7 +157,7 @@ class Charts:
         """The definitions of ovality, to choose from."""
         data: list[dict[str, Any]] = []
         names = []
-        for name, words in OVALITIES:
+        for name, words in OVALITIES.items():
             value = 100 * column(self.document, name)
             if not np.isfinite(value).any():
                 continue

@@ -360,12 +360,14 @@ def test_a_profile_that_does_not_fit_is_refused_or_warned_of(drive, tmp_path, ca
 
 def test_the_report_stands_alone_and_its_scene_has_geometry(out, tmp_path, capsys):
     page = tmp_path / "report.html"
-    limits = ("ovality=5", "ovality_astm=0.5", "d_min=295.5")
+    limits = ("ovality=5", "ovality_astm=0.5", "ovality_astm_max=5", "d_min=295.5")
     arguments = [x for limit in limits for x in ("--limit", limit)]
-    assert main(["report", str(out), "-o", str(page), *arguments, "--json"]) == 0
+    assert main(["report", str(out), "-o", str(page), *arguments, "--json"]) == 1
     verdicts = {v["name"]: v["state"] for v in json.loads(capsys.readouterr().out)["limits"]}
     assert verdicts["ovality"] == "passed" and verdicts["ovality_astm"] == "failed"
     text = page.read_text()
+    assert verdicts["ovality_astm_max"] == "passed" and "ASTM F1216: (max - mean) / mean</th>" in text
+    assert "narrowest caliper width</th>" in text
     outline = Outline(text)
     assert not outline.open and all(a.startswith("data:") for a in outline.addresses)
     charts = {c["id"]: c for c in data_of(text)["charts"]}
@@ -378,8 +380,43 @@ def test_the_report_stands_alone_and_its_scene_has_geometry(out, tmp_path, capsy
     assert any("F1216" in m for m in menu) and any("13508" in m for m in menu) and len(menu) == 5
 
 
+@pytest.mark.parametrize(
+    ("limit", "code"),
+    [
+        *(("ovality=5", 0), ("ovality=2", 1), ("ovality=3", 1), ("ovality_nominal=5", 0)),  # it is 3 % oval: undecided
+        *(("ovality=-5", 2), ("ovality=100", 2), ("d_min=-3", 2), ("d_min=0.285", 2), ("d_max=30500", 2)),
+    ],
+)
+def test_a_script_learns_from_the_exit_code_whether_all_limits_hold(out, tmp_path, capsys, limit, code):
+    """1 for what failed and what was not shown; 2 for a bound that nobody can have meant, with its unit."""
+    page = tmp_path / "r.html"
+    assert main(["report", str(out), "-o", str(page), "--limit", "d_max=320", "--limit", limit]) == code
+    said = capsys.readouterr()
+    assert page.exists() == (code != 2)
+    if code == 2:
+        assert limit.split("=")[0] in said.err and ("per cent" in said.err or "millimetres" in said.err)
+
+
+def test_stations_without_a_value_are_not_taken_for_passed(out, tmp_path, capsys):
+    document = document_of(out)
+    document["stations"]["ovality"][3] = None
+    (tmp_path / "reconstruction.json").write_text(json.dumps(document))
+    shutil.copy(out / "points.ply", tmp_path)
+    shutil.copy(out / "tube.ply", tmp_path)
+    assert main(["report", str(tmp_path), "-o", str(tmp_path / "r.html"), "--limit", "ovality=5", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["limits"][0]["state"] == "passed where measured"
+
+
+def test_the_help_names_every_limit(capsys):
+    from pipefish.measured_limits import LIMITS
+
+    assert main(["report", "--help"]) == 0
+    assert set(LIMITS) <= set(re.findall(r"\w+", capsys.readouterr().out))
+
+
 def test_limits_hold_the_interval_against_the_bound(out):
-    from pipefish.measured_texts import read_measured, verdict
+    from pipefish.measured_limits import verdict
+    from pipefish.measured_texts import read_measured
 
     document = read_measured(out)
     worst = max(v for v in document["stations"]["d_max"] if v is not None) * 1000
