@@ -21,6 +21,7 @@ from pipefish.files import write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
+from pipefish.pupil import pupil_is_known
 from pipefish.simulate import quaternion
 from pipefish.tube_findings import COLUMNS
 
@@ -98,7 +99,12 @@ def summary(m: Measurement) -> dict[str, Any]:
         "d_mean_least": float(np.nanmin(d)),
         "d_mean_most": float(np.nanmax(d)),
         "station_sigma": float(np.nanmedian(table["d_mean_sigma"])),
-        "systematic": {"relative": m.systematic, "scale": m.scale.sigma, "camera": m.camera_sigma},
+        "systematic": {
+            "relative": m.systematic,
+            "scale": m.scale.sigma,
+            "camera": m.camera_sigma,
+            "pupil": m.pupil_sigma,
+        },
         "nominal": m.nominal,
         "path_length": m.structure.length,
         "tube_length": float(sum(s.tube.length for s in m.measured)),
@@ -177,6 +183,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "theta_max_deg": math.degrees(camera.theta_max),
                 "rms_px": camera.rms_px,
                 "pupil_e1": camera.pupil_e1,
+                "pupil_known": pupil_is_known(camera),
                 "covariance": camera.covariance is not None,
                 "assumed_px": None if camera.covariance is not None else assumed_px(camera),
                 "source": camera.source,

@@ -90,6 +90,19 @@ class Report(Charts):
         used = dict.fromkeys(r["name"] for r in scale["sources"] if r["used"]) or {scale["source"]: None}
         return " and ".join(words.get(name, name) for name in used)
 
+    def camera_text(self) -> str:
+        """What the camera's calibration leaves open in all diameters."""
+        camera = self.summary["systematic"]["camera"]
+        return f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance"
+
+    def pupil_text(self) -> str:
+        """What the pupil's shift leaves open in all diameters. Documents of older versions have none."""
+        pupil = self.summary["systematic"].get("pupil", 0.0)
+        if pupil:
+            return f"± {Z95 * 100 * pupil:.2f} %, assumed: the profile does not say how well it knows it"
+        known = self.document["camera"].get("pupil_known", False)
+        return "in the camera's, as calibrated" if known else "not counted: no diameter was measured"
+
     def accuracy_rows(self) -> list[tuple[str, str]]:
         """Repeatability and systematic error side by side."""
         s = self.summary
@@ -103,13 +116,10 @@ class Report(Charts):
                 ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
                 (f"  of which scale ({self.scale_source()})", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
             ]
-        camera = s["systematic"]["camera"]
-        rows.append(
-            (
-                "  of which camera",
-                f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance",
-            )
-        )
+        rows += [
+            ("  of which camera, by its calibration", self.camera_text()),
+            ("  of which pupil shift", self.pupil_text()),
+        ]
         if "ovality_sigma" in s:
             rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
             if s["ovality_systematic"] > 0:
