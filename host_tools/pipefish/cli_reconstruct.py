@@ -170,6 +170,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
+    from pipefish.measured_reach import reach_text
     from pipefish.measured_texts import events_text, length_text, percent_text, scale_texts
 
     s = document["summary"]
@@ -218,6 +219,9 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
             )
         )
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
+    rows.append(
+        ("findings", reach_text(document["findings_reach"], unit) + " `pipefish dense` finds smaller ones, and cracks.")
+    )
     verdict = document["quality"]["profile"]
     if verdict and not any(remark.startswith(verdict["text"].rstrip(".")) for remark in document["remarks"]):
         rows.append(("profile", verdict["text"]))

@@ -19,6 +19,7 @@ from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
+from pipefish.measured_reach import reach
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.pupil import pupil_is_known
@@ -238,6 +239,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
             "stations": stations(m),
             "events": events(m),
             "not_measured": not_measured(m),
+            "findings_reach": reach(m),
             "quality": {
                 "residuals_by_angle": trend(residuals, camera, m.tracks),
                 "residual_rms_px": float(np.sqrt(np.mean(residuals.pixels[residuals.inlier] ** 2))),

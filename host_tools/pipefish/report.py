@@ -12,6 +12,7 @@ import numpy as np
 from pipefish.dense_findings import finding_parts
 from pipefish.files import write_atomically
 from pipefish.measured_limits import LIMITS, check_limits, verdict
+from pipefish.measured_reach import UNSEEN, reach_text
 from pipefish.measured_texts import Z95, clock_text, column, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
@@ -143,11 +144,20 @@ class Report(Charts):
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
             cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
             rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+        told = f"<p class='note'>{html.escape(self.reach_text())}</p>"
         if not rows:
-            return "<p class='muted'>Nothing departs from a smooth pipe, and all of it was measured.</p>"
+            return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
         head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
         table = f"<table class='list'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-        return f"<div class='wide'>{table}</div>"
+        return f"<div class='wide'>{table}</div>{told}"
+
+    def reach_text(self) -> str:
+        """What the findings can show at all."""
+        found = self.document.get("findings_reach")  # older ones have none
+        by_tracks = reach_text(found, self.unit) if found else f"Tracked points do not show {UNSEEN}."
+        if self.dense.reach:
+            return f"{by_tracks} {self.dense.reach}"
+        return by_tracks + " `pipefish dense` maps the wall between the tracks: smaller deposits, joint steps, cracks."
 
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(heading, rows) of what stands at the end."""

@@ -415,6 +415,21 @@ def test_the_help_names_every_limit(capsys):
     assert set(LIMITS) <= set(re.findall(r"\w+", capsys.readouterr().out))
 
 
+def test_findings_say_what_they_cannot_show(out, tmp_path, capsys):
+    """How small a thing the survey could have found, from its own points, on the page and in the terminal."""
+    from pipefish.cli_reconstruct import reconstruct_text
+
+    document = document_of(out)
+    found = document["findings_reach"]
+    wall = np.pi * 0.3 * document["summary"]["tube_length"] / document["summary"]["points"]
+    assert 0.95 < found["spacing"] / np.sqrt(wall) < 2 and 2 < found["patch_size"] / found["spacing"] < 3
+    assert 0.0015 < found["patch_height"] < 0.01 and found["joint_step"] is None
+    assert main(["report", str(out), "-o", str(tmp_path / "r.html")]) == 0
+    for text in ((tmp_path / "r.html").read_text(), reconstruct_text(document, [])):
+        assert "open joints without a step" in text and "pipefish dense" in text
+        assert f"over {1000 * found['patch_size']:.1f} mm across" in text
+
+
 def test_limits_hold_the_interval_against_the_bound(out):
     from pipefish.measured_limits import verdict
     from pipefish.measured_texts import read_measured
