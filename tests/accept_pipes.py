@@ -15,7 +15,6 @@ its rows with it; then the exit code is 2.
 """
 
 import argparse
-import hashlib
 import itertools
 import json
 import shutil
@@ -24,7 +23,8 @@ import sys
 import time
 from pathlib import Path
 
-from pipefish import _engine
+from accept_rows import state
+
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.files import write_atomically
 
@@ -41,15 +41,6 @@ def pipefish(*arguments: str | Path) -> str:
     if done.returncode != 0:
         raise SystemExit(f"pipefish {' '.join(map(str, arguments))}: {done.stderr.strip()}")
     return done.stdout
-
-
-def state(frames: int) -> str:
-    """What the rows of a drive depend on: frames, the daemon, this package with its engine."""
-    digest = hashlib.sha256(str(frames).encode())
-    package = sorted((ROOT / "host_tools/pipefish").rglob("*.py"))
-    for path in [find_programs(None).daemon, Path(_engine.__file__), *package]:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def drive(material: str, diameter_mm: int, speed_cm_s: int, frames: int) -> list[dict]:
@@ -90,7 +81,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--minutes", type=float, default=float("inf"))
     arguments = parser.parse_args()
-    began, key, late = time.monotonic(), state(arguments.frames), False
+    began, key, late = time.monotonic(), f"{state()}, {arguments.frames} frames", False
     rows: list[dict] = []
     for material, diameter, speed in itertools.product(MATERIALS, DIAMETERS_MM, SPEEDS_CM_S):
         name = f"{material}-dn{diameter}-{speed}cms"
