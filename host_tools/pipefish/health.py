@@ -323,7 +323,8 @@ def _nothing(budget: float, why: str, alpha_sigma: float = math.inf) -> ProfileC
     text = f"Cannot tell: {why}."
     if math.isfinite(alpha_sigma):
         text = (
-            f"Cannot tell: sigma(alpha) is {100 * alpha_sigma:.2g} % of the diameter, all that a lens may drift; {why}."
+            f"Cannot tell: all that a lens may drift leaves the diameter open by {100 * alpha_sigma:.2g} % (sigma); "
+            f"{why}."
         )
     return ProfileCheck(VERDICTS["unknown"], text, alpha_sigma, budget, changes, 1.0, 0, why)
 
@@ -402,7 +403,7 @@ def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget:
     what = likeliest.text() + (
         ", if nothing else changed" if likeliest.rest >= FALSE_ALARM else ", which does not explain all of it"
     )
-    open_text = f"sigma(alpha) is {100 * open_sigma:.2g} % of the diameter"
+    open_text = f"a drift that the survey cannot see leaves the diameter open by {100 * open_sigma:.2g} % (one sigma)"
     if open_sigma > budget:
         verdict = VERDICTS["unknown"]
         text = (

@@ -31,7 +31,10 @@ class Limit(NamedTuple):
 
 
 LIMITS = {
-    **{name: Limit(name, words, "at most", 100.0, "%") for name, words in OVALITIES.items()},
+    **{
+        name: Limit(name, f"{name.split('_', 1)[0]}, {words}", "at most", 100.0, "%")
+        for name, words in OVALITIES.items()
+    },
     "d_max": Limit("d_max", "widest caliper width", "at most", 1000.0, "mm"),
     "d_min": Limit("d_min", "narrowest caliper width", "at least", 1000.0, "mm"),
 }

@@ -74,7 +74,7 @@ class Report(Charts):
             f"<td>worst: {html.escape(v['worst'])}</td></tr>"
             for v in shown
         )
-        note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
+        note = "Undecided: the 95 % interval at the worst station, systematic part included, reaches across the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
 
     def date(self) -> str:
@@ -148,7 +148,7 @@ class Report(Charts):
         if not rows:
             return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
         head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
-        table = f"<table class='list'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        table = f"<table class='list findings'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         return f"<div class='wide'>{table}</div>{told}"
 
     def reach_text(self) -> str:

@@ -377,6 +377,12 @@ def test_the_report_stands_alone_and_its_scene_has_geometry(out, tmp_path, capsy
     assert mesh["type"] == "mesh3d" and len(mesh["i"]) > 500 and max(mesh["k"]) < len(mesh["x"])
     z = np.array([mesh["x"], mesh["y"], mesh["z"]])
     assert np.ptp(z, axis=1).max() > LENGTH and len(charts["tube"]["data"][1]["x"]) > 500
+    scene, mean = charts["tube"]["layout"]["scene"], charts["diameter"]["data"][-1]
+    assert max(scene["aspectratio"].values()) == 2.5 and scene["domain"]["y"][0] > 0.1, (
+        "all of it, above the colour bar"
+    )
+    assert mean["name"].startswith("mean") and mean["line"]["dash"] == "dash", "seen where all diameters are alike"
+    assert "sigma(alpha)" not in text, "in a surveyor's words"
     menu = charts["ovality"]["choice"]["names"]
     assert any("F1216" in m for m in menu) and any("13508" in m for m in menu) and len(menu) == 5
 
