@@ -21,7 +21,6 @@ its rows with it; then the exit code is 2.
 """
 
 import argparse
-import hashlib
 import itertools
 import json
 import shutil
@@ -30,7 +29,8 @@ import sys
 import time
 from pathlib import Path
 
-from pipefish import _engine
+from accept_rows import state
+
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.files import write_atomically
 
@@ -47,15 +47,6 @@ def pipefish(*arguments: str | Path) -> str:
     if done.returncode != 0:
         raise SystemExit(f"pipefish {' '.join(map(str, arguments))}: {done.stderr.strip()}")
     return done.stdout
-
-
-def state(frames: int) -> str:
-    """What the rows of a drive depend on: frames, the daemon, this package with its engine."""
-    digest = hashlib.sha256(str(frames).encode())
-    package = sorted((ROOT / "host_tools/pipefish").rglob("*.py"))
-    for path in [find_programs(None).daemon, Path(_engine.__file__), *package]:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def drive(material: str, diameter_mm: int, speed_cm_s: int, frames: int) -> list[dict]:
@@ -98,7 +89,7 @@ def main() -> int:
     length.add_argument("--frames", type=int)
     parser.add_argument("--minutes", type=float, default=float("inf"))
     arguments = parser.parse_args()
-    began, late = time.monotonic(), False
+    began, product, late = time.monotonic(), state(), False
     rows: list[dict] = []
     for material, diameter, speed in itertools.product(MATERIALS, DIAMETERS_MM, SPEEDS_CM_S):
         name = f"{material}-dn{diameter}-{speed}cms"
@@ -106,7 +97,7 @@ def main() -> int:
         if arguments.word not in name:
             continue
         frames = arguments.frames or round(100 * arguments.metres / speed * RATE)
-        key = state(frames)
+        key = f"{product}, {frames} frames"
         stored = json.loads(kept.read_text()) if kept.exists() else {}
         if stored.get("state") != key:
             if time.monotonic() - began > 60 * arguments.minutes:

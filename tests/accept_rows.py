@@ -5,6 +5,7 @@ Kept results hold for one state of the product and of the scripts: after any cha
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -15,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from pipefish import _engine
+from pipefish.demo import find_programs
+from pipefish.errors import PipefishError
 
 Row = dict[str, Any]
 
@@ -50,12 +53,25 @@ def print_rows(rows: list[Row]) -> None:
 
 
 @functools.cache
+def product() -> bytes:
+    """Digest of what is measured: the engine, the package with all below it and its scenarios, and the programs of the
+    build, through which surveys go."""
+    package = (ROOT / "host_tools/pipefish").rglob("*")
+    files = [Path(_engine.__file__), *sorted(p for p in package if p.suffix in (".py", ".toml"))]
+    with contextlib.suppress(PipefishError):  # not built: then nothing can be measured through them
+        programs = find_programs(None)
+        files += [programs.daemon, programs.line]
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
 def state() -> str:
-    """What the figures depend on: the engine, the package, the script that runs and its scenes."""
-    loaded = {Path(m.__file__) for m in sys.modules.values() if getattr(m, "__file__", None)}
-    scripts = [p for p in loaded if p.is_relative_to(ROOT / "tests")]
-    digest = hashlib.sha256(Path(_engine.__file__).read_bytes())
-    for path in sorted([*(ROOT / "host_tools" / "pipefish").glob("*.py"), *scripts]):
+    """What the figures depend on: the product, the script that runs and its scenes, those imported later too."""
+    loaded = {Path(m.__file__) for m in list(sys.modules.values()) if getattr(m, "__file__", None)}
+    digest = hashlib.sha256(product())
+    for path in sorted(p for p in loaded if p.is_relative_to(ROOT / "tests")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -56,9 +56,9 @@ def seconds_text(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min {rest:02d} s"
 
 
-# ---- commands: each returns (document for --json, text for people)
+# ---- commands: each returns (document for --json, text for people), and an exit code where that is not DONE
 
-Result = tuple[dict[str, Any], str]
+Result = tuple[dict[str, Any], str] | tuple[dict[str, Any], str, int]
 
 
 def run_demo(args: argparse.Namespace) -> Result:
@@ -553,9 +553,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(argv)
         args.check(args)
-        document, text = args.run(args)
+        document, text, *code = args.run(args)
         print(json.dumps(document, indent=2) if args.json else printable(text), flush=True)
-        return DONE
+        return code[0] if code else DONE
     except SystemExit as exit_:  # --help and --version
         return int(exit_.code or 0)
     except BrokenPipeError:

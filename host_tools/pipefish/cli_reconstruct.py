@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from pipefish.cli import Result, UsageError, add_command, table
+from pipefish.cli import DONE, FAILED, Result, UsageError, add_command, table
 
 
 def _millimetres(text: str) -> float:
@@ -126,7 +126,8 @@ def add_reconstruct(commands: Any) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
-        "reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm)",
+        "ovality_astm_max, reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm). Unless all "
+        "passed the exit code is 1",
     )
     p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
     p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
@@ -169,6 +170,7 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
+    from pipefish.measured_reach import reach_text
     from pipefish.measured_texts import events_text, length_text, percent_text, scale_texts
 
     s = document["summary"]
@@ -217,6 +219,9 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
             )
         )
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
+    rows.append(
+        ("findings", reach_text(document["findings_reach"], unit) + " `pipefish dense` finds smaller ones, and cracks.")
+    )
     verdict = document["quality"]["profile"]
     if verdict and not any(remark.startswith(verdict["text"].rstrip(".")) for remark in document["remarks"]):
         rows.append(("profile", verdict["text"]))
@@ -259,24 +264,25 @@ def run_unroll(args: argparse.Namespace) -> Result:
 
 def run_report(args: argparse.Namespace) -> Result:
     """Runs the command."""
-    from pipefish.measured_texts import LIMITS
+    from pipefish.measured_limits import LimitError, all_hold, check_limits
     from pipefish.progress import Progress
     from pipefish.report import write_report
 
-    unknown = [name for name, _ in args.limit if name not in LIMITS]
-    if unknown:
-        raise UsageError(f"--limit {unknown[0]}: not one of {', '.join(LIMITS)}")
     out = Path(args.output)
-    with Progress("report", 100, args.json) as bar:
-        verdicts = write_report(
-            Path(args.folder),
-            out,
-            limits=args.limit,
-            title=args.title,
-            survey=Path(args.survey) if args.survey else None,
-            dense=Path(args.dense) if args.dense else None,
-            tell=lambda done, word: bar.update(round(100 * done), word),
-        )
+    try:
+        check_limits(args.limit)
+        with Progress("report", 100, args.json) as bar:
+            verdicts = write_report(
+                Path(args.folder),
+                out,
+                limits=args.limit,
+                title=args.title,
+                survey=Path(args.survey) if args.survey else None,
+                dense=Path(args.dense) if args.dense else None,
+                tell=lambda done, word: bar.update(round(100 * done), word),
+            )
+    except LimitError as error:
+        raise UsageError(f"report: --limit {error}") from error
     document = {"file": str(out), "bytes": out.stat().st_size, "limits": verdicts}
     rows = [(f"limit {v['name']}", v["text"]) for v in verdicts]
-    return document, table([*rows, ("written", str(out))])
+    return document, table([*rows, ("written", str(out))]), DONE if all_hold(verdicts) else FAILED

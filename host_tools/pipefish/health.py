@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .assumed import PUPIL_MOST
 from .camera import PARAMETERS, Camera
 from .errors import ArgumentError
 from .structure import Encoder, Reconstruction, RollingShutter, reconstruct
@@ -27,9 +28,6 @@ BUDGET = 0.005  # of the diameter: what profilers are required to hold, and cali
 FALSE_ALARM = 0.01  # probability: half of what is allowed, as the noise is never quite the one stated
 CPOLY_POWERS = (1,) * 2 + (2,) * 6 + (3,) * 6  # of theta, by coefficient
 FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1", *(f"cpoly[{n}]" for n in range(14)))
-#: Metres, of a profile that says nothing of the pupil's shift: two millimetres at 57 degrees, five at 90. A wall 75 mm
-#: away looks through it as if the angles had drifted.
-PUPIL_SIGMA = 0.002
 # What a good profile does not know of its lens, pixels: ripples of the radius over LENS_LENGTH radians, and terms that
 # are not round, each at the rim. Three directions of drift are radial curves that are nearly alike, so that 0.07 px of
 # ripple look like 1.7 % of the angle scale with 1 % along alpha and a bend, to a sigma of 0.4 %.
@@ -121,7 +119,8 @@ def _directions(camera: Camera, theta_end: float) -> Floats:
 
 def _own_covariance(camera: Camera, theta_end: float) -> Floats:
     """The covariance of FREE without a drift, (23,23): the profile's, and what it does not know of its lens."""
-    pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_SIGMA
+    # A wall 75 mm away looks through a shift that the profile does not know as if the angles had drifted.
+    pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_MOST
     theta = np.linspace(0.2, 1.0, 60) * theta_end
     ripple = (LENS_RADIAL_PX / camera.f_u) ** 2 * np.exp(-0.5 * ((theta[:, None] - theta) / LENS_LENGTH) ** 2)
     fit = _into_free(camera) @ _radial_fit(camera, theta)
@@ -324,7 +323,8 @@ def _nothing(budget: float, why: str, alpha_sigma: float = math.inf) -> ProfileC
     text = f"Cannot tell: {why}."
     if math.isfinite(alpha_sigma):
         text = (
-            f"Cannot tell: sigma(alpha) is {100 * alpha_sigma:.2g} % of the diameter, all that a lens may drift; {why}."
+            f"Cannot tell: all that a lens may drift leaves the diameter open by {100 * alpha_sigma:.2g} % (sigma); "
+            f"{why}."
         )
     return ProfileCheck(VERDICTS["unknown"], text, alpha_sigma, budget, changes, 1.0, 0, why)
 
@@ -403,7 +403,7 @@ def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget:
     what = likeliest.text() + (
         ", if nothing else changed" if likeliest.rest >= FALSE_ALARM else ", which does not explain all of it"
     )
-    open_text = f"sigma(alpha) is {100 * open_sigma:.2g} % of the diameter"
+    open_text = f"a drift that the survey cannot see leaves the diameter open by {100 * open_sigma:.2g} % (one sigma)"
     if open_sigma > budget:
         verdict = VERDICTS["unknown"]
         text = (

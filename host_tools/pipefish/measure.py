@@ -16,6 +16,7 @@ from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.pupil import pupil_sigma
 from pipefish.repeated import Repetition, cut, jumps, renamed, repetition
 from pipefish.rolling import shutter_of
 from pipefish.scale import Known, Scale, with_diameter
@@ -101,6 +102,7 @@ class Measurement:
     structure   in the unit of `scale`
     camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
                 not known
+    pupil_sigma    the same by a pupil shift that the profile does not know, and so assumed
     health      what the survey says of its profile
     repeats     how often the wall looks the same elsewhere; None: its pictures were not looked at
     jumped      frames at which tracks had gone on to the next repeat, and were cut
@@ -120,6 +122,7 @@ class Measurement:
     camera_sigma: float | None
     residuals: Residuals
     backwards: bool
+    pupil_sigma: float = 0.0
     health: ProfileCheck | None = None
     repeats: Repetition | None = None
     jumped: list[int] = field(default_factory=list)
@@ -134,7 +137,7 @@ class Measurement:
     @property
     def systematic(self) -> float:
         """Relative sigma that all diameters share."""
-        return math.hypot(self.scale.sigma, self.camera_sigma or 0.0)
+        return math.hypot(self.scale.sigma, self.camera_sigma or 0.0, self.pupil_sigma)
 
     @property
     def up(self) -> np.ndarray:
@@ -503,7 +506,7 @@ def _origin(tube: Tube, centres: np.ndarray, along: np.ndarray, backwards: bool)
 def _sigmas(m: Measurement) -> None:
     """Sets the stations' sigmas from the adjustment: the tube takes its points' errors as their own, and knows neither
     camera nor wheel. Random: what the encoder's noise, the poses and the points leave open, the wheel's scale taken
-    out; systematic: that scale and the camera."""
+    out; systematic: that scale, the camera and what is assumed of its pupil."""
     found = {s.segment: diameter_sigma(m.structure, s.segment, s.tube) for s in m.measured}
     cameras: dict[int, np.ndarray] = {}  # of each stretch, relative, at the stations
     for stretch in m.measured:
@@ -531,12 +534,17 @@ def _sigmas(m: Measurement) -> None:
         rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
     m.camera_sigma = float(np.nanmedian(np.concatenate(list(cameras.values())))) if cameras else None
+    if m.scale.unit == "metre" and not m.scale.diameter_from_prior:  # else it is in what the diameter was set to
+        seen = m.residuals.inlier
+        m.pupil_sigma = pupil_sigma(
+            m.camera, m.residuals.theta[seen], m.residuals.point[seen], 0.5 * mean_diameter(m)[0]
+        )
     _systematic_columns(m)
 
 
 def _systematic_columns(m: Measurement) -> None:
     for stretch in m.measured:
-        stations, shared = stretch.tube.stations, np.hypot(m.scale.sigma, stretch.camera)
+        stations, shared = stretch.tube.stations, np.hypot(math.hypot(m.scale.sigma, m.pupil_sigma), stretch.camera)
         for name in ("d_mean", "d_area", "d_max", "d_min"):
             stations[name + "_systematic"] = shared * stations[name]
         half = 0.5 * stations["ovality_systematic"] * stations["d_mean"]
@@ -557,5 +565,7 @@ def _check_diameter(m: Measurement, known: Known | None) -> None:
     if known is None or m.scale.diameter_from_prior:
         return
     measured, random = mean_diameter(m)
-    m.scale = with_diameter(m.scale, known, measured, math.hypot(random / measured, m.camera_sigma or 0.0))
+    m.scale = with_diameter(
+        m.scale, known, measured, math.hypot(random / measured, m.camera_sigma or 0.0, m.pupil_sigma)
+    )
     _systematic_columns(m)

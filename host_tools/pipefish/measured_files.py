@@ -17,8 +17,10 @@ from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import csv_bytes, plain, write_atomically
 from pipefish.measure import Measurement, Tell, mean_diameter
+from pipefish.measured_reach import reach
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
+from pipefish.pupil import pupil_is_known
 from pipefish.simulate import quaternion
 from pipefish.tube import rms_ovality
 from pipefish.tube_findings import COLUMNS
@@ -76,7 +78,12 @@ def summary(m: Measurement) -> dict[str, Any]:
         "d_mean_least": float(np.nanmin(d)),
         "d_mean_most": float(np.nanmax(d)),
         "station_sigma": float(np.nanmedian(table["d_mean_sigma"])),
-        "systematic": {"relative": m.systematic, "scale": m.scale.sigma, "camera": m.camera_sigma},
+        "systematic": {
+            "relative": m.systematic,
+            "scale": m.scale.sigma,
+            "camera": m.camera_sigma,
+            "pupil": m.pupil_sigma,
+        },
         "nominal": m.nominal,
         "path_length": m.structure.length,
         "tube_length": float(sum(s.tube.length for s in m.measured)),
@@ -155,6 +162,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
                 "theta_max_deg": math.degrees(camera.theta_max),
                 "rms_px": camera.rms_px,
                 "pupil_e1": camera.pupil_e1,
+                "pupil_known": pupil_is_known(camera),
                 "covariance": camera.covariance is not None,
                 "assumed_px": None if camera.covariance is not None else assumed_px(camera),
                 "source": camera.source,
@@ -209,6 +217,7 @@ def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
             "stations": stations(m),
             "events": events(m),
             "not_measured": not_measured(m),
+            "findings_reach": reach(m),
             "quality": {
                 "residuals_by_angle": trend(residuals, camera, m.tracks),
                 "residual_rms_px": float(np.sqrt(np.mean(residuals.pixels[residuals.inlier] ** 2))),

@@ -95,8 +95,8 @@ def remark(m: Measurement) -> None:
     if m.camera.covariance is None:
         whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
         remarks.append(
-            "The camera profile has no covariance: what its radial function and its pupil are off is not in the "
-            f"intervals of diameters. Ovality counts it as asymmetric by {assumed_px(m.camera):.2g} px all over the "
+            "The camera profile has no covariance: what its radial function is off is not in the intervals of "
+            f"diameters. Ovality counts it as asymmetric by {assumed_px(m.camera):.2g} px all over the "
             f"picture ({whence})."
         )
     if m.structure.down is None:

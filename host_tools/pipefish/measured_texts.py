@@ -1,4 +1,4 @@
-"""What `pipefish reconstruct` measured, in words and against limits: for the report, the terminal and scripts."""
+"""What `pipefish reconstruct` measured, in words: for the report, the terminal and scripts."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from pipefish.errors import FormatError
 FORMAT, VERSION = "pipefish-reconstruction", 1
 Z95 = 1.96
 
-# Limits that can be asked for: column, whether the value must stay at most or at least, factor to people's unit, unit.
-LIMITS = {
-    "ovality": ("ovality", "most", 100.0, "%"),
-    "ovality_nominal": ("ovality_nominal", "most", 100.0, "%"),
-    "ovality_astm": ("ovality_astm", "most", 100.0, "%"),
-    "reduction_nominal": ("reduction_nominal", "most", 100.0, "%"),
-    "d_max": ("d_max", "most", 1000.0, "mm"),
-    "d_min": ("d_min", "least", 1000.0, "mm"),
+#: What an ovality of the tables is of, in words.
+OVALITIES = {
+    "ovality": "(max - min) / mean",
+    "ovality_nominal": "(max - min) / nominal",
+    "ovality_astm": "ASTM F1216: (mean - min) / mean",
+    "ovality_astm_max": "ASTM F1216: (max - mean) / mean",
+    "reduction_nominal": "EN 13508-2 BAA: (nominal - min) / nominal",
 }
 
 
@@ -111,46 +110,3 @@ def read_measured(folder: Path) -> dict[str, Any]:
 def column(document: dict[str, Any], name: str) -> np.ndarray:
     """A column of the stations, (N,) with NaN where not measured."""
     return np.array([np.nan if v is None else v for v in document["stations"][name]], float)
-
-
-# ---- limits
-
-
-def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
-    """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
-    together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""
-    quantity, side, factor, unit = LIMITS[name]
-    scale = document["summary"]
-    if unit == "mm" and scale["unit"] != "metre":
-        return _verdict(name, bound, unit, "not measured", "there is no scale")
-    value = factor * column(document, quantity)
-    sigma = factor * column(document, f"{quantity}_sigma")
-    camera = column(document, "ovality_systematic")  # of (max - min) / mean
-    if quantity.startswith("ovality"):
-        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
-        share = {"ovality": 1.0, "ovality_nominal": over_nominal, "ovality_astm": 0.5}[quantity]
-        sigma = np.hypot(sigma, factor * share * camera)
-    elif quantity in ("d_max", "d_min"):
-        sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
-    elif quantity == "reduction_nominal":
-        sigma = np.sqrt(sigma**2 + (factor * scale["systematic"]["relative"]) ** 2 + (0.5 * factor * camera) ** 2)
-    if not np.isfinite(value).any():
-        return _verdict(name, bound, unit, "not measured", "no station has it")
-    excess = (value - bound) * (1 if side == "most" else -1)
-    worst = int(np.nanargmax(excess))
-    at = length_text(column(document, "chainage")[worst], scale["unit"], metres=True)
-    shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
-    outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
-    known = np.isfinite(value)
-    missing = len(value) - int(known.sum())
-    state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
-    if state == "passed" and missing:
-        state = "passed where measured"
-    more = f"; {missing} of {len(value)} stations have no value" if missing else ""
-    return _verdict(name, bound, unit, state, shown + more)
-
-
-def _verdict(name: str, bound: float, unit: str, state: str, shown: str) -> dict[str, Any]:
-    word = "at most" if LIMITS[name][1] == "most" else "at least"
-    text = f"{state}: {word} {bound:g} {unit}; worst {shown}" if state != "not measured" else f"not measured: {shown}"
-    return {"name": name, "bound": bound, "unit": unit, "state": state, "worst": shown, "text": text}

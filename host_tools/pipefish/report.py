@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from pipefish.dense_findings import finding_parts
-from pipefish.errors import PipefishError
 from pipefish.files import write_atomically
-from pipefish.measured_texts import LIMITS, Z95, clock_text, column, length_text, scale_texts, size_parts, verdict
+from pipefish.measured_limits import LIMITS, check_limits, verdict
+from pipefish.measured_reach import UNSEEN, reach_text
+from pipefish.measured_texts import Z95, clock_text, column, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
@@ -27,6 +28,7 @@ class Report(Charts):
         super().__init__(folder)
         self.picture = picture
         self.dense = dense
+        check_limits(limits, self.summary["d_mean"] if self.unit == "metre" else None)
         self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
 
     # ---- texts
@@ -66,13 +68,13 @@ class Report(Charts):
             return "<p class='muted'>No limits were given (<code>--limit ovality=5</code>).</p>"
         shown = [v | {"word": "FAILED" if v["state"] == "failed" else v["state"]} for v in self.verdicts]
         rows = "".join(
-            f"<tr><th scope='row'>{html.escape(v['name'].replace('_', ' '))}</th>"
+            f"<tr><th scope='row'>{html.escape(LIMITS[v['name']].words)}</th>"
             f"<td><span class='state {v['state'].split()[0]}'>{v['word']}</span></td>"
-            f"<td>{'at most' if LIMITS[v['name']][1] == 'most' else 'at least'} {v['bound']:g} {v['unit']}</td>"
+            f"<td>{LIMITS[v['name']].side} {v['bound']:g} {v['unit']}</td>"
             f"<td>worst: {html.escape(v['worst'])}</td></tr>"
             for v in shown
         )
-        note = "Undecided: the 95 % interval at the worst station, systematic part included, holds the limit."
+        note = "Undecided: the 95 % interval at the worst station, systematic part included, reaches across the limit."
         return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
 
     def date(self) -> str:
@@ -89,6 +91,19 @@ class Report(Charts):
         used = dict.fromkeys(r["name"] for r in scale["sources"] if r["used"]) or {scale["source"]: None}
         return " and ".join(words.get(name, name) for name in used)
 
+    def camera_text(self) -> str:
+        """What the camera's calibration leaves open in all diameters."""
+        camera = self.summary["systematic"]["camera"]
+        return f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance"
+
+    def pupil_text(self) -> str:
+        """What the pupil's shift leaves open in all diameters. Documents of older versions have none."""
+        pupil = self.summary["systematic"].get("pupil", 0.0)
+        if pupil:
+            return f"± {Z95 * 100 * pupil:.2f} %, assumed: the profile does not say how well it knows it"
+        known = self.document["camera"].get("pupil_known", False)
+        return "in the camera's, as calibrated" if known else "not counted: no diameter was measured"
+
     def accuracy_rows(self) -> list[tuple[str, str]]:
         """Repeatability and systematic error side by side."""
         s = self.summary
@@ -102,13 +117,10 @@ class Report(Charts):
                 ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
                 (f"  of which scale ({self.scale_source()})", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
             ]
-        camera = s["systematic"]["camera"]
-        rows.append(
-            (
-                "  of which camera",
-                f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance",
-            )
-        )
+        rows += [
+            ("  of which camera, by its calibration", self.camera_text()),
+            ("  of which pupil shift", self.pupil_text()),
+        ]
         if "ovality_sigma" in s:
             rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
             if s["ovality_systematic"] > 0:
@@ -132,11 +144,20 @@ class Report(Charts):
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
             cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
             rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+        told = f"<p class='note'>{html.escape(self.reach_text())}</p>"
         if not rows:
-            return "<p class='muted'>Nothing departs from a smooth pipe, and all of it was measured.</p>"
+            return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
         head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
-        table = f"<table class='list'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-        return f"<div class='wide'>{table}</div>"
+        table = f"<table class='list findings'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        return f"<div class='wide'>{table}</div>{told}"
+
+    def reach_text(self) -> str:
+        """What the findings can show at all."""
+        found = self.document.get("findings_reach")  # older ones have none
+        by_tracks = reach_text(found, self.unit) if found else f"Tracked points do not show {UNSEEN}."
+        if self.dense.reach:
+            return f"{by_tracks} {self.dense.reach}"
+        return by_tracks + " `pipefish dense` maps the wall between the tracks: smaller deposits, joint steps, cracks."
 
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(heading, rows) of what stands at the end."""
@@ -255,10 +276,8 @@ def write_report(
     """Writes the page about a folder of `pipefish reconstruct`; returns the verdicts on the limits (name of LIMITS,
     bound in per cent or millimetres). survey: the file with the pictures [where it was when it was measured]; where it
     is not, the page says so. dense: folder of `pipefish dense` [`folder`/dense, where there is one]. Raises
-    PipefishError, OSError."""
-    for name, _ in limits or []:
-        if name not in LIMITS:
-            raise PipefishError(f"limit {name}: not one of {', '.join(LIMITS)}")
+    LimitError, PipefishError, OSError."""
+    check_limits(limits or [])
     by_map = dense_part(folder, dense)
     report = Report(folder, limits or [], wall_picture(folder, survey, tell, by_map.findings), by_map)
     write_atomically(out, report.render(title).encode())

@@ -14,19 +14,13 @@ from pipefish.cloudfile import read_columns
 from pipefish.colours import DIVERGING
 from pipefish.errors import FormatError
 from pipefish.measured_files import COLOUR_SPAN, RING
-from pipefish.measured_texts import Z95, column, events_text, read_measured
+from pipefish.measured_texts import OVALITIES, Z95, column, events_text, read_measured
 from pipefish.page import Chart
 
 MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # of the 3-D scene: a phone turns that
+SCENE_LENGTH = 2.5  # of the scene's longest side, in Plotly's units, in which the eye stands 2.1 off its middle
 NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
 
-OVALITIES = (
-    ("ovality", "(max - min) / mean"),
-    ("ovality_nominal", "(max - min) / nominal"),
-    ("ovality_astm", "ASTM F1216: (mean - min) / mean"),
-    ("ovality_astm_max", "ASTM F1216: (max - mean) / mean"),
-    ("reduction_nominal", "EN 13508-2 BAA: (nominal - min) / nominal"),
-)
 DIAMETERS = (
     ("d_mean", "mean (perimeter / pi)"),
     ("d_max", "widest"),
@@ -130,11 +124,13 @@ class Charts:
     def chart_diameter(self) -> Chart:
         """All named diameters with their bands, one at a time and together with nominal."""
         data: list[dict[str, Any]] = []
-        for (name, words), colour in zip(DIAMETERS, COLOURS, strict=False):
+        # The mean last and dashed: where a pipe is round it lies on the others.
+        for (name, words), colour in [*zip(DIAMETERS, COLOURS, strict=False)][::-1]:
             value, sigma = (self.factor * column(self.document, n) for n in (name, name + "_sigma"))
             shown: dict[str, Any] = {} if name != "d_area" else {"visible": "legendonly"}
             reach = Z95 * sigma
             data += _band(self.x, value, value - reach, value + reach, self.stretch, words, colour, **shown)
+        data[-1]["line"]["dash"] = "dash"
         for trace in data[1::2]:
             trace["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} {self.short}"
         shapes = self.shapes()
@@ -157,14 +153,20 @@ class Charts:
             "switch on "
             "and off.",
             "data": data,
-            "layout": {"xaxis": self.along(), "yaxis": _axis(self.short), "shapes": shapes, "hovermode": "x unified"},
+            "layout": {
+                "xaxis": self.along(),
+                "yaxis": _axis(self.short),
+                "shapes": shapes,
+                "hovermode": "x unified",
+                "legend": {"traceorder": "reversed"},
+            },
         }
 
     def chart_ovality(self) -> Chart:
         """The definitions of ovality, to choose from."""
         data: list[dict[str, Any]] = []
         names = []
-        for name, words in OVALITIES:
+        for name, words in OVALITIES.items():
             value = 100 * column(self.document, name)
             if not np.isfinite(value).any():
                 continue
@@ -220,6 +222,7 @@ class Charts:
             # Plotly's third axis points upwards: camera x, z, -y.
             return {"x": _numbers(moved[:, 0], 4), "y": _numbers(moved[:, 2], 4), "z": _numbers(-moved[:, 1], 4)}
 
+        extent = np.maximum(np.ptp(xyz.reshape(-1, 3), axis=0), 1e-9)[[0, 2, 1]]
         reach = max(1e-6, min(float(np.nanpercentile(np.abs(deviation), 99)), self.factor * COLOUR_SPAN))
         size = self.summary["nominal"] if self.summary["nominal"] and self.unit == "metre" else self.summary["d_mean"]
         scale = [[k / (len(DIVERGING) - 1), "rgb({:.0f},{:.0f},{:.0f})".format(*c)] for k, c in enumerate(DIVERGING)]
@@ -275,7 +278,12 @@ class Charts:
             "data": data,
             "layout": {
                 "scene": {
-                    "aspectmode": "data",
+                    "domain": {"y": [0.13, 1]},  # above the colours' bar
+                    # True proportions, with the longest side so that the whole pipe is in view.
+                    "aspectmode": "manual",
+                    "aspectratio": dict(
+                        zip("xyz", (SCENE_LENGTH * extent / extent.max()).round(4).tolist(), strict=True)
+                    ),
                     "xaxis": {"title": {"text": ""}},
                     "yaxis": {"title": {"text": self.along_unit}},
                     "zaxis": {"title": {"text": ""}},

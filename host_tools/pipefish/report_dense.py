@@ -13,15 +13,18 @@ from PIL import Image
 
 from pipefish.dense_findings import findings_of, read_dense
 from pipefish.errors import FormatError, PipefishError
+from pipefish.measured_reach import map_text
 from pipefish.measured_texts import Z95, length_text
 from pipefish.page import data_uri
 
 
 @dataclass
 class DensePart:
-    """The section of the page ("" without a map), and what the map found (dense_findings.findings_of)."""
+    """The section of the page ("" without a map), what the map found (dense_findings.findings_of), and what it could
+    find, in words."""
 
     html: str = ""
+    reach: str = ""
     findings: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -41,7 +44,7 @@ def dense_part(folder: Path, dense: Path | None) -> DensePart:
         return DensePart(
             f"<section class='card'><p class='muted'>No dense map: {html.escape(str(error))}.</p></section>"
         )
-    return DensePart(_section(where, document), findings_of(document))
+    return DensePart(_section(where, document), map_text(document), findings_of(document))
 
 
 def _section(where: Path, document: dict[str, Any]) -> str:

@@ -389,7 +389,7 @@ def test_a_profile_without_the_pupil_shift_is_not_accused(monkeypatch):
     profile = fisheye(100)
     known = {"encoder": ENCODER, "sigma": 0.2, "threads": 1}
     assert health.check_profile(drive.tracks, profile, readings, **known).verdict != "drifted, recalibrate"
-    monkeypatch.setattr(health, "PUPIL_SIGMA", 1e-6)
+    monkeypatch.setattr(health, "PUPIL_MOST", 1e-6)
     assert health.check_profile(drive.tracks, profile, readings, **known).probability < 1e-6
 
 

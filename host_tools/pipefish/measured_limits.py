@@ -1,0 +1,100 @@
+"""What `pipefish reconstruct` measured, against limits that must hold all along the pipe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipefish.errors import ArgumentError
+from pipefish.measured_texts import OVALITIES, Z95, column, length_text
+
+#: A bound further off the pipe's diameter than by this factor was meant in another unit: metres, centimetres, inches.
+DIAMETER_OFF = 5.0
+
+
+class LimitError(ArgumentError):
+    """A limit that nobody can have meant."""
+
+
+class Limit(NamedTuple):
+    """What can be limited: column of the stations, what it is in words, whether it must stay at most or at least there,
+    factor to people's unit, unit."""
+
+    column: str
+    words: str
+    side: str
+    factor: float
+    unit: str
+
+
+LIMITS = {
+    **{
+        name: Limit(name, f"{name.split('_', 1)[0]}, {words}", "at most", 100.0, "%")
+        for name, words in OVALITIES.items()
+    },
+    "d_max": Limit("d_max", "widest caliper width", "at most", 1000.0, "mm"),
+    "d_min": Limit("d_min", "narrowest caliper width", "at least", 1000.0, "mm"),
+}
+
+
+def check_limits(limits: Iterable[tuple[str, float]], diameter: float | None = None) -> None:
+    """Raises LimitError for a name that is none and for a bound that cannot be meant. diameter: the pipe's, metres."""
+    for name, bound in limits:
+        if name not in LIMITS:
+            raise LimitError(f"{name}: not one of {', '.join(LIMITS)}")
+        shown, unit = f"{name}={bound:g}", LIMITS[name].unit
+        if unit == "%" and not 0 <= bound < 100:
+            raise LimitError(f"{shown}: is in per cent, from 0 to below 100")
+        if unit == "mm" and not (math.isfinite(bound) and bound > 0):
+            raise LimitError(f"{shown}: is a width in millimetres, above 0")
+        if unit == "mm" and diameter and not 1 / DIAMETER_OFF < bound / (1000 * diameter) < DIAMETER_OFF:
+            raise LimitError(f"{shown}: is in millimetres, and the pipe is {1000 * diameter:.0f} mm wide")
+
+
+def all_hold(verdicts: Iterable[dict[str, Any]]) -> bool:
+    """Whether each limit was shown to hold all along the pipe: what an exit code of 0 says."""
+    return all(v["state"] == "passed" for v in verdicts)
+
+
+def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
+    """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
+    together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""
+    limit = LIMITS[name]
+    quantity, factor, unit = limit.column, limit.factor, limit.unit
+    scale = document["summary"]
+    if unit == "mm" and scale["unit"] != "metre":
+        return _verdict(name, bound, unit, "not measured", "there is no scale")
+    value = factor * column(document, quantity)
+    sigma = factor * column(document, f"{quantity}_sigma")
+    camera = column(document, "ovality_systematic")  # of (max - min) / mean
+    if quantity.startswith("ovality"):
+        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
+        share = {"ovality": 1.0, "ovality_nominal": over_nominal}.get(quantity, 0.5)
+        sigma = np.hypot(sigma, factor * share * camera)
+    elif quantity in ("d_max", "d_min"):
+        sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
+    elif quantity == "reduction_nominal":
+        sigma = np.sqrt(sigma**2 + (factor * scale["systematic"]["relative"]) ** 2 + (0.5 * factor * camera) ** 2)
+    if not np.isfinite(value).any():
+        return _verdict(name, bound, unit, "not measured", "no station has it")
+    excess = (value - bound) * (1 if limit.side == "at most" else -1)
+    worst = int(np.nanargmax(excess))
+    at = length_text(column(document, "chainage")[worst], scale["unit"], metres=True)
+    shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
+    outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
+    known = np.isfinite(value)
+    missing = len(value) - int(known.sum())
+    state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
+    if state == "passed" and missing:
+        state = "passed where measured"
+    more = f"; {missing} of {len(value)} stations have no value" if missing else ""
+    return _verdict(name, bound, unit, state, shown + more)
+
+
+def _verdict(name: str, bound: float, unit: str, state: str, shown: str) -> dict[str, Any]:
+    what = f"{LIMITS[name].side} {bound:g} {unit}"
+    text = f"{state}: {what}; worst {shown}" if state != "not measured" else f"not measured: {shown}"
+    return {"name": name, "bound": bound, "unit": unit, "state": state, "worst": shown, "text": text}
