@@ -12,6 +12,7 @@ from pipefish.cli import Result, UsageError, add_command, table
 
 APART = 0.1  # share of points that scattered gross ones do not reach
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+UNIT_OFF = 2.0  # measured over nominal diameter, from which on the unit is doubted
 
 
 def add_tube(commands: Any) -> None:
@@ -44,6 +45,8 @@ def run_tube(args: argparse.Namespace) -> Result:
     from pipefish.tube import fit_tube
 
     unit = UNITS[args.unit]
+    if args.sigma is not None and not (math.isfinite(args.sigma) and args.sigma > 0):
+        raise UsageError(f"tube: --sigma {args.sigma:g}: is not a length above zero")
     points, sigma = read_points(args.cloud)
     path = read_points(args.path)[0] * unit if args.path else None
     sigma = args.sigma if args.sigma is not None else sigma
@@ -118,10 +121,10 @@ def _text(tube: Any, files: list[str]) -> str:
     import numpy as np
 
     s, t = tube.summary, tube.stations
+    known = "ovality_rms" in s
     oval = (
-        f"{100 * s['ovality_rms']:.2f} % (rms along the pipe), most {100 * np.nanmax(t['ovality']):.2f} % "
-        "((max - min) / mean)"
-        if "ovality_rms" in s
+        f"{100 * s['ovality_rms']:.2f} % (rms along the pipe, (max - min) / mean)"
+        if known
         else "not measured: one side only"
     )
     spread = f", {1000 * np.nanmin(t['d_mean']):.1f} to {1000 * np.nanmax(t['d_mean']):.1f} along the pipe"
@@ -129,6 +132,7 @@ def _text(tube: Any, files: list[str]) -> str:
         ("length", f"{s['length']:.2f} m, {s['measured']} of {s['stations']} stations measured"),
         ("mean diameter", f"{1000 * s['d_mean']:.2f} +- {1960 * s['d_mean_sigma']:.2f} mm (95 %){spread}"),
         ("ovality", oval),
+        ("  most", _most_oval(t) if known else ""),
         ("roughness", f"{1000 * s['roughness']:.2f} mm"),
         ("clock", f"zero {tube.clock_zero}"),
     ]
@@ -136,7 +140,31 @@ def _text(tube: Any, files: list[str]) -> str:
         text = f"{100 * s['points_apart']:.0f} % of the points are far from this pipe or beyond its ends: not measured"
         rows.append(("left out", text))
     rows += [(e["kind"], event_text(e)) for e in tube.events]
+    rows.append(("note", unit_note(s["d_mean"], tube.nominal)))
     return table([*rows, *(("written", f) for f in files)])
+
+
+def _most_oval(stations: dict[str, Any]) -> str:
+    import numpy as np
+
+    k = int(np.nanargmax(stations["ovality"]))
+    return f"{ovality_text({n: v[k] for n, v in stations.items()})}, at {stations['s'][k]:.2f} m"
+
+
+def unit_note(diameter: float, nominal: float | None) -> str:
+    """Of a diameter that is so far off the nominal one that the cloud must be in another unit than was said."""
+    if not nominal or 1 / UNIT_OFF < diameter / nominal < UNIT_OFF:
+        return ""
+    return (
+        f"measured is {diameter / nominal:.3g} times the nominal diameter: is the cloud in another unit? "
+        f"--unit {', '.join(sorted(UNITS))}"
+    )
+
+
+def ovality_text(station: dict[str, Any]) -> str:
+    """The ovality at one station with its 95 % interval."""
+    low, high = (100 * max(0.0, float(station[k])) for k in ("ovality_lo", "ovality_hi"))
+    return f"{100 * float(station['ovality']):.2f} %, 95 % from {low:.2f} to {high:.2f} %"
 
 
 def event_text(e: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import pytest
 
 import pipefish as pf
 from pipe_cloud import Pipe
+from pipefish import cli_tube
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_points
 
@@ -396,3 +397,21 @@ def test_the_command_refuses_what_is_no_pipe(tmp_path: Path, capsys: pytest.Capt
     assert "looks like the wall of a pipe" in capsys.readouterr().err
     assert main(["tube", str(tmp_path / "nothing.ply")]) == 1
     assert "nothing.ply" in capsys.readouterr().err
+
+
+def test_a_cloud_in_another_unit_is_doubted_in_words():
+    assert cli_tube.unit_note(300.2, 0.3).endswith("--unit cm, m, mm") and "1e+03 times" in cli_tube.unit_note(
+        300.2, 0.3
+    )
+    assert cli_tube.unit_note(0.31, 0.3) == "" == cli_tube.unit_note(300.2, None)
+
+
+@pytest.mark.parametrize("sigma", ["nan", "0", "-1"])
+def test_a_sigma_that_is_none_is_named_before_the_cloud(tmp_path, capsys, sigma):
+    assert main(["tube", str(tmp_path / "none.ply"), f"--sigma={sigma}"]) == 2
+    assert "--sigma" in capsys.readouterr().err
+
+
+def test_ovality_is_told_with_its_interval():
+    station = {"ovality": 0.0402, "ovality_lo": -0.001, "ovality_hi": 0.045}
+    assert cli_tube.ovality_text(station) == "4.02 %, 95 % from 0.00 to 4.50 %"

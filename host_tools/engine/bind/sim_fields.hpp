@@ -36,7 +36,7 @@ public:
     Reader(nb::handle source, std::string path) : path_(std::move(path))
     {
         if (!nb::isinstance<nb::dict>(source))
-            fail(path_, "must be an object");
+            fail(path_.substr(0, path_.find_last_not_of('.') + 1), "must be an object {...}");
         source_ = nb::borrow<nb::dict>(source);
     }
 
