@@ -418,8 +418,8 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
         sharper.scale_noise(options.drift_noise);
         BundleCovariance known;
         segment.drift.camera = adjust(segment.drift.map, sharper, central, settings, &known).camera;
-        const Eigen::Index n = segment.drift.camera.size();
-        segment.drift.covariance = known.border().bottomRightCorner(n, n);
+        const Eigen::MatrixXd &root = options.drift_prior->root;
+        segment.drift.covariance = root * known.border().bottomRightCorner(root.cols(), root.cols()) * root.transpose();
     }
     if (options.camera_prior) {
         settings.camera_prior = options.camera_prior;
