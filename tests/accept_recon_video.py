@@ -20,7 +20,7 @@ from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.errors import PipefishError
 from pipefish.measure import Measurement, measure
 from pipefish.measured_remarks import not_measured
-from pipefish.measuretruth import against_truth, bare
+from pipefish.measuretruth import against_truth, bare, true_place
 from pipefish.simcamera import calibrated
 from pipefish.simulate import Scene, simulate
 from pipefish.survey import Survey
@@ -87,6 +87,14 @@ def visible_length(scene: Scene, deposit: dict[str, Any]) -> float:
     return float(high[-1] - high[0])
 
 
+def place_error(measured: Measurement, scene: Scene, deposit: dict[str, Any]) -> float:
+    """Metres along the wall by which the deposit that was found lies beside the true one."""
+    stretch, found = next((s, e) for s in measured.measured for e in s.tube.events if e["kind"] == "deposit")
+    along = true_place(measured, scene, stretch, found["s"]) - deposit["s"]
+    turn = (found["clock"] - deposit["clock"] + math.pi) % (2 * math.pi) - math.pi
+    return math.hypot(along, turn * scene.spec["diameter"] / 2)
+
+
 def findings(measured: Measurement, scene: Scene) -> list[Limits]:
     """What was found where the scene has a bend, a joint, a deposit; what was found beside them."""
     events = [e for stretch in measured.measured for e in stretch.tube.events]
@@ -105,6 +113,8 @@ def findings(measured: Measurement, scene: Scene) -> list[Limits]:
         if truth and len(found) == len(truth):
             worst = max(size_error(f, t) for f, t in zip(found, truth, strict=True))
             rows.append((f"{kind}_{sizes}_off", worst, -math.inf, 1.0))
+    if wanted["deposit"] and rows[2][1] == wanted["deposit"] == 1:
+        rows.append(("deposit_place_m", place_error(measured, scene, scene.spec["deposits"][0]), -math.inf, 0.02))
     return rows
 
 

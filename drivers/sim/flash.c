@@ -22,6 +22,7 @@ struct pf_sim_flash {
     uint32_t broken;  /* sector */
     uint32_t pending; /* operations since the last flush */
     operation log[PF_SIM_FLASH_CACHE];
+    uint64_t touched[4]; /* by them: sectors modulo 256, a bit each */
     uint8_t *bytes, *durable;
     uint32_t *erases;
 };
@@ -46,11 +47,35 @@ static void fill_noise(pf_sim_flash *s, uint8_t *p, uint32_t n)
         p[i] = (uint8_t)draw(s);
 }
 
+static void forget_pending(pf_sim_flash *s)
+{
+    s->pending = 0;
+    memset(s->touched, 0, sizeof s->touched);
+}
+
 static void make_durable(pf_sim_flash *s)
 {
     for (uint32_t i = 0; i < s->pending; i++)
         memcpy(s->durable + s->log[i].at, s->bytes + s->log[i].at, s->log[i].n);
-    s->pending = 0;
+    forget_pending(s);
+}
+
+/* Notes an operation, which reaches the medium with the next flush at the latest. */
+static void keep(pf_sim_flash *s, const operation *o)
+{
+    const uint32_t sector = o->at / s->config.erase_size % 256;
+    s->log[s->pending++] = *o;
+    s->touched[sector / 64] |= UINT64_C(1) << sector % 64;
+}
+
+static bool is_pending(const pf_sim_flash *s, uint32_t sector)
+{
+    if (!(s->touched[sector % 256 / 64] >> sector % 64 & 1))
+        return false;
+    for (uint32_t i = 0; i < s->pending; i++)
+        if (s->log[i].at / s->config.erase_size == sector)
+            return true;
+    return false;
 }
 
 /* What part of an operation does to the first n bytes of its range, and to some bits of the next one. */
@@ -92,7 +117,7 @@ static void reorder(pf_sim_flash *s, const operation *last, const uint8_t *data)
     for (uint32_t i = 0; i < s->pending; i++)
         memcpy(s->bytes + s->log[i].at, s->durable + s->log[i].at, s->log[i].n);
     memcpy(s->bytes + last->at, s->durable + last->at, last->n);
-    s->pending = 0;
+    forget_pending(s);
 }
 
 /* The operation at which power fails; a flush has n = 0. */
@@ -178,7 +203,7 @@ static pf_status sim_program(void *self, uint32_t at, const void *bytes, uint32_
         s->bytes[at + below(s, n)] ^= (uint8_t)(1u << below(s, 8));
         s->spoil_at = UINT64_MAX;
     }
-    s->log[s->pending++] = o;
+    keep(s, &o);
     s->stats.programs++;
     return PF_OK;
 }
@@ -193,15 +218,10 @@ static pf_status sim_erase(void *self, uint32_t sector)
     }
     if (!begin(s, &o, NULL) || is_bad(s, o.at))
         return PF_ERR_IO;
-    for (uint32_t i = 0; i < s->pending; i++)
-        if (s->log[i].at / s->config.erase_size == sector) { /* see the top */
-            make_durable(s);
-            break;
-        }
-    if (s->pending == PF_SIM_FLASH_CACHE)
+    if (s->pending == PF_SIM_FLASH_CACHE || is_pending(s, sector)) /* see the top */
         make_durable(s);
     memset(s->bytes + o.at, 0xFF, o.n);
-    s->log[s->pending++] = o;
+    keep(s, &o);
     s->stats.erases++;
     if (++s->erases[sector] > s->stats.most_erases)
         s->stats.most_erases = s->erases[sector];

@@ -8,8 +8,8 @@
 #include <string.h>
 #include <unistd.h>
 
-#define ASIDE_MAX     99
-#define CHUNK_OBJECTS 64 /* of one transaction: some megabytes, so that neither a kill nor the log costs much */
+#define ASIDE_END     100 /* numbers of files that were set aside: below it */
+#define CHUNK_OBJECTS 64  /* of one transaction: some megabytes, so that neither a kill nor the log costs much */
 #define PATH_BYTES    1024
 
 bool pf_spool_was_one(const char *path, uint32_t application_id)
@@ -44,18 +44,34 @@ static void name_aside(const char *path, int number, char read[PATH_BYTES], char
     (void)snprintf(unread, PATH_BYTES, "%s.damaged-%d.unread", path, number);
 }
 
+/* The highest number below `end` under which a file waits to be read; 0: none. Each start of a healthy spool asks for
+ * all of them, so only the digits are written anew. */
+static int find_unread(const char *path, int end)
+{
+    char name[PATH_BYTES];
+    const int n = snprintf(name, sizeof name, "%s.damaged-", path);
+    if (n < 0 || n + (int)sizeof "99.unread" > (int)sizeof name)
+        return 0;
+    for (int number = end - 1; number > 0; number--) {
+        char *at = name + n;
+        if (number >= 10)
+            *at++ = (char)('0' + number / 10);
+        *at++ = (char)('0' + number % 10);
+        memcpy(at, ".unread", sizeof ".unread");
+        if (access(name, F_OK) == 0)
+            return number;
+    }
+    return 0;
+}
+
 pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
 {
     char read[PATH_BYTES], unread[PATH_BYTES];
-    int number = ASIDE_MAX;
-    for (int i = ASIDE_MAX; i > 0; i--) { /* above every unread one: of those the highest is the newest */
-        name_aside(path, i, read, unread);
-        if (access(unread, F_OK) == 0)
-            break;
-        if (access(read, F_OK) != 0)
-            number = i;
-    }
-    name_aside(path, number, read, unread);
+    int number = find_unread(path, ASIDE_END); /* above every unread one: of those the highest is the newest */
+    do {
+        number += number < ASIDE_END - 1;
+        name_aside(path, number, read, unread);
+    } while (number < ASIDE_END - 1 && access(read, F_OK) == 0);
     if (rename_both(path, unread) != 0)
         return pf_fail(failure, PF_ERR_IO, "%s: damaged, and cannot be set aside: %s", path, strerror(errno));
     return PF_OK;
@@ -64,13 +80,11 @@ pf_status pf_spool_set_aside(const char *path, pf_failure *failure)
 void pf_spool_finish_setting_aside(const char *path)
 {
     char read[PATH_BYTES], unread[PATH_BYTES], log[PATH_BYTES + 8], log_unread[PATH_BYTES + 8];
-    int number = ASIDE_MAX;
     (void)snprintf(log, sizeof log, "%s-wal", path);
     if (access(path, F_OK) == 0 || access(log, F_OK) != 0)
         return;
-    do
-        name_aside(path, number, read, unread);
-    while (access(unread, F_OK) != 0 && --number > 0);
+    const int number = find_unread(path, ASIDE_END);
+    name_aside(path, number, read, unread);
     (void)snprintf(log_unread, sizeof log_unread, "%s-wal", unread);
     if (number > 0 && access(log_unread, F_OK) != 0)
         (void)rename(log, log_unread);
@@ -270,12 +284,10 @@ static uint64_t count(sqlite3 *db)
 uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf_failure *told)
 {
     uint32_t files = 0, left = 0;
-    for (int number = ASIDE_MAX; number > 0; number--) {
+    for (int number = ASIDE_END; (number = find_unread(path, number)) > 0;) {
         char read[PATH_BYTES], unread[PATH_BYTES];
         salvage s = {.to = to, .alive = alive};
         name_aside(path, number, read, unread);
-        if (access(unread, F_OK) != 0)
-            continue;
         files++;
         (void)snprintf(s.key, sizeof s.key, "salvage %d", number);
         const uint64_t before = count(to);

@@ -205,6 +205,7 @@ def run_status(args: argparse.Namespace) -> Result:
     from google.protobuf.json_format import MessageToDict
 
     from pipefish import pipefish_pb2 as pb
+    from pipefish.cli_flash import stored_text
     from pipefish.client import Client, Handlers
     from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
@@ -272,6 +273,8 @@ def run_evaluate(args: argparse.Namespace) -> Result:
         ("survival", "kept of those visible"),
         ("median_px", "median error, px"),
         ("length_median", "median length, frames"),
+        ("length_possible", "if none were lost"),
+        ("whole", "share of whole lives"),
     ):
         values = [side[name] for side in (ours, peer) if side is not None]
         rows.append((what, ", ".join("-" if v is None else f"{v:.4g}" for v in values)))
@@ -287,11 +290,15 @@ def run_simulate(args: argparse.Namespace) -> Result:
         names = {**room.scenarios(), **room.studio_scenarios()}
         return names, table(list(names.items()))
     if args.contact_sheet:
-        room.contact_sheet(Path(args.contact_sheet), quiet=args.json)
+        from pipefish.simulate_pictures import contact_sheet
+
+        contact_sheet(Path(args.contact_sheet), quiet=args.json)
         return {"files": [args.contact_sheet]}, table([("written", args.contact_sheet)])
     if args.picture:
+        from pipefish.simulate_pictures import picture
+
         width = {} if args.width is None else {"width": args.width}
-        room.picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set), **width)
+        picture(args.scene, Path(args.picture), args.frame, changes=dict(args.set), **width)
         return {"files": [args.picture]}, table([("written", args.picture)])
     document = room.simulate(
         args.scene,
@@ -307,59 +314,6 @@ def run_simulate(args: argparse.Namespace) -> Result:
         *([("driven", f"{document['driven_m']:.2f} m")] if what == "frames" else []),
         *(("written", file) for file in document["files"]),
     ]
-    return document, table(rows)
-
-
-def stored_text(profile: Any) -> str:
-    """A pb.Profile for people."""
-    trial = f", on trial, {profile.starts_left} more starts" if profile.trial else ""
-    serial = f", serial {profile.serial}" if profile.serial else ""
-    return f"{profile.name or 'unnamed'}{serial} ({profile.crc32c:08x}){trial}"
-
-
-def run_flash(args: argparse.Namespace) -> Result:
-    from google.protobuf.json_format import MessageToDict
-
-    from pipefish.cli_profile import load_profile
-    from pipefish.flash import Flasher
-    from pipefish.transport import open_transport
-
-    if sum(map(bool, (args.profile, args.confirm, args.revert))) > 1:
-        raise UsageError("flash: a profile, --confirm and --revert exclude each other")
-    data = load_profile(args).camera.to_binary() if args.profile else None
-    with Flasher(open_transport(args.device, args.baud), args.timeout) as device:
-        if args.revert:
-            state = device.revert()
-        elif data:
-            state = device.send(data)
-        elif not args.confirm:
-            state = device.state()
-        else:
-            state = device.state()
-            if not state.HasField("stored"):
-                raise PipefishError("the device has no profile that could be confirmed")
-            state = device.confirm(state.stored.sha256)
-    document = {
-        name: MessageToDict(profile, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
-        | {"sha256": profile.sha256.hex(), "crc32c": f"{profile.crc32c:08x}"}
-        if state.HasField(name)
-        else None
-        for name, profile in (("in_use", state.in_use), ("stored", state.stored))
-    }
-    document["problem"] = state.problem or None
-    document["slot_erases"] = [state.slot_erases_a, state.slot_erases_b]
-    stored = stored_text(state.stored) if state.HasField("stored") else "none"
-    in_use = stored_text(state.in_use) if state.HasField("in_use") else "none"
-    rows = [
-        ("in use", in_use),
-        ("stored", stored + ("" if in_use == stored else "; the next start of the device takes it")),
-        ("problem", state.problem),
-        ("written", f"{state.slot_erases_a + state.slot_erases_b} times"),
-    ]
-    if state.stored.trial and state.in_use.sha256 == state.stored.sha256:
-        rows.append(("then", f"if it is good: pipefish flash {args.device} --confirm"))
-    elif state.stored.trial:
-        rows.append(("then", f"restart the device, then: pipefish flash {args.device} --confirm"))
     return document, table(rows)
 
 
@@ -557,7 +511,7 @@ def build_parser() -> argparse.ArgumentParser:
     from pipefish.cli_calibrate import add_calibrate  # they need what stands above
     from pipefish.cli_homography import add_homography
     from pipefish.cli_pair import add_pair
-    from pipefish.cli_profile import add_profile, add_profile_input
+    from pipefish.cli_profile import add_profile
     from pipefish.cli_record import add_record
     from pipefish.cli_target import add_target
 
@@ -586,23 +540,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     add_reconstruct(commands)
 
-    p = add_command(
-        commands,
-        "flash",
-        run_flash,
-        "Put a camera profile on a device. It is tested, stored on trial and read back; the device's next start takes "
-        "it. Then --confirm it, or the device goes back to the one before. Without a profile: tell what is in use, "
-        "stored and on trial.",
-        "pipefish flash tcp://127.0.0.1:7447 camera.json",
-    )
-    add_device(p)
-    p.add_argument("profile", metavar="PROFILE", nargs="?", help="a profile, or another program's calibration")
-    p.add_argument("--confirm", action="store_true", help="keep the profile on trial, with which the device runs now")
-    p.add_argument("--revert", action="store_true", help="drop the profile on trial, or go back to the one before")
-    add_profile_input(p)
-    p.add_argument(
-        "--timeout", type=not_negative, default=10.0, metavar="S", help="give up after S silent seconds [10]; 0: never"
-    )
+    from pipefish.cli_flash import add_flash
+
+    add_flash(commands)
     return parser
 
 

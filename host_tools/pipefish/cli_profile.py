@@ -59,9 +59,11 @@ def fit_document(fit: Any) -> dict[str, Any] | None:
 def run_profile_show(args: argparse.Namespace) -> Result:
     from pipefish.lensreport import draw, table_text
     from pipefish.lensreport import table as lens_table
+    from pipefish.selfcal import stored_alpha_sigma
 
     loaded = load_profile(args)
     camera = loaded.camera
+    alpha = stored_alpha_sigma(camera)
     if args.out:
         draw(camera, Path(args.out))
     covered = f"{math.degrees(camera.theta_covered):.1f} deg" if camera.theta_covered else "unknown"
@@ -96,12 +98,24 @@ def run_profile_show(args: argparse.Namespace) -> Result:
             "covariance",
             f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
         ),
+        ("model chosen", camera.provenance.model_choice or None),
+        ("sigma(alpha)", _alpha_text(alpha)),
         ("drawn in", args.out),
     ]
     document = json.loads(camera.to_json())
     document["curve"] = lens_table(camera)
+    document["alpha_sigma"] = alpha
     document["conversion"] = {"form": loaded.form, "fit": fit_document(loaded.fit), "notes": loaded.notes}
     return document, f"{table(rows)}\n\n{table_text(camera)}"
+
+
+def _alpha_text(sigma: float | None) -> str | None:
+    """What sigma(alpha) means for who measures: cot theta -> alpha cot theta stretches the pipe along its axis by
+    alpha, against an encoder its diameter by 1 / alpha, and turns a ray by sin theta cos theta of ln alpha."""
+    if sigma is None:
+        return None
+    angle = 0.5 / math.radians(45) * sigma  # sin cos of 45 degrees, of the angle itself
+    return f"{100 * sigma:.2g} % of a diameter beside an encoder, {100 * angle:.2g} % of the angle at 45 deg (1 sigma)"
 
 
 def run_profile_check(args: argparse.Namespace) -> Result:

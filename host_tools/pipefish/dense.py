@@ -304,6 +304,26 @@ def _pairs(unroller: Unroller, poses: Floats) -> list[tuple[int, int]]:
     return out
 
 
+def _checked(poses: Any, scale: float, calibration_px: float) -> Floats:
+    """The poses. Raises ArgumentError."""
+    pose_list = np.asarray(poses, float)
+    if pose_list.ndim != 3 or pose_list.shape[1:] != (3, 4) or not np.isfinite(pose_list).all():
+        raise ArgumentError(f"poses: shape {pose_list.shape} is not (n,3,4), or not finite")
+    if not (math.isfinite(scale) and 0.5 <= scale <= 8):
+        raise ArgumentError(f"scale: {scale} is not within 0.5 to 8")
+    if not 0 <= calibration_px <= 10:
+        raise ArgumentError(f"calibration_px: {calibration_px} is not within 0 to 10")
+    return pose_list
+
+
+def _cell_size(cell: float | None, diameter: float, unroller: Unroller) -> float:
+    """The side of the map's cells. Raises ArgumentError."""
+    size = max(diameter / CELLS, ACROSS * unroller.cell) if cell is None else cell
+    if not (math.isfinite(size) and diameter / 1000 <= size <= diameter / 10):
+        raise ArgumentError(f"cell: {size} is not within a thousandth to a tenth of the diameter")
+    return size
+
+
 def dense_wall(
     images: Callable[[int], Any],
     camera: Camera,
@@ -334,19 +354,11 @@ def dense_wall(
     tell     is called with a fraction done
 
     Raises ArgumentError for what cannot be: shapes, sizes, nothing seen."""
-    pose_list = np.asarray(poses, float)
-    if pose_list.ndim != 3 or pose_list.shape[1:] != (3, 4) or not np.isfinite(pose_list).all():
-        raise ArgumentError(f"poses: shape {pose_list.shape} is not (n,3,4), or not finite")
-    if not (math.isfinite(scale) and 0.5 <= scale <= 8):
-        raise ArgumentError(f"scale: {scale} is not within 0.5 to 8")
+    pose_list = _checked(poses, scale, calibration_px)
     threads = whole("threads", threads, 1)
     diameter = 2 * wall.mean_radius
     unroller = Unroller(camera, wall, scale)
-    if not 0 <= calibration_px <= 10:
-        raise ArgumentError(f"calibration_px: {calibration_px} is not within 0 to 10")
-    size = max(diameter / CELLS, ACROSS * unroller.cell) if cell is None else cell
-    if not (math.isfinite(size) and diameter / 1000 <= size <= diameter / 10):
-        raise ArgumentError(f"cell: {size} is not within a thousandth to a tenth of the diameter")
+    size = _cell_size(cell, diameter, unroller)
     every = max(1, int(size / unroller.cell / ACROSS))
     share = 1 / (2 * RAW_RADIUS + 1) ** 2 if raw else every**2 / WINDOW**2
     rows, columns = max(1, round(wall.length / size)), max(8, round(math.pi * diameter / size))

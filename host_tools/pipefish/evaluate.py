@@ -79,6 +79,15 @@ def lit(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return ok
 
 
+def trackable(truth: Truth, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,3) metres on the wall -> (N,2) pixels in camera frame `frame`, (N,) whether they lie WINDOW_REACH inside the
+    field."""
+    pixels, ok = truth.project(frame, points)
+    for offset in ((WINDOW_REACH, 0), (-WINDOW_REACH, 0), (0, WINDOW_REACH), (0, -WINDOW_REACH)):
+        ok = ok & truth.cast(frame, np.nan_to_num(pixels, nan=-1e9) + offset)[1]
+    return pixels, ok
+
+
 def survival(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] | None = None) -> float | None:
     """Of the tracks seen in a keyframe whose wall point can still be tracked in the next one, the share seen there.
 
@@ -92,14 +101,32 @@ def survival(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] |
         here = tracks.track[tracks.frame == first]
         here = here[np.isfinite(points[here, 0])]
         frame = seen.sequence[second]
-        pixels, visible = truth.project(frame, points[here])
-        for offset in ((WINDOW_REACH, 0), (-WINDOW_REACH, 0), (0, WINDOW_REACH), (0, -WINDOW_REACH)):
-            visible &= truth.cast(frame, np.nan_to_num(pixels, nan=-1e9) + offset)[1]
+        pixels, visible = trackable(truth, frame, points[here])
         if frames is not None:
             visible &= lit(frames(frame), pixels)
         possible += int(visible.sum())
         kept += int(np.isin(here[visible], tracks.track[tracks.frame == second]).sum())
     return kept / possible if possible else None
+
+
+def lives(seen: Observed, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """How long tracks as they were born could be: (K,) camera frames from a track's beginning to the last keyframe in
+    which its wall point can be tracked, (K,) whether that is its whole life: it begins after the first keyframe, and
+    the point leaves before the last. Where the truth has no wall at the anchor: the track's own length."""
+    tracks = seen.tracks
+    anchor = tracks.bounds[:-1]
+    points = anchor_points(seen, truth)
+    known = np.isfinite(points[:, 0])
+    in_sight = known.copy()
+    born = np.array([seen.sequence[int(i)] for i in tracks.frame[anchor]]) - tracks.age[anchor]
+    frames = np.where(known, tracks.age[anchor], tracks.length_frames)
+    keys = sorted(seen.sequence)
+    for index in keys[1:]:
+        here = np.flatnonzero(in_sight & (tracks.frame[anchor] < index))
+        visible = trackable(truth, seen.sequence[index], points[here])[1]
+        frames[here[visible]] = seen.sequence[index] - born[here[visible]]
+        in_sight[here[~visible]] = False
+    return frames, known & ~in_sight & (born > seen.sequence[keys[0]])
 
 
 def track_errors(seen: Observed, truth: Truth) -> dict[str, np.ndarray]:
@@ -140,12 +167,14 @@ def figures(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] | 
     """Figures of `track_errors` as plain values; None if no track was seen twice. `frames`: of `survival`.
 
     within_1px: share of observations; median_px, p95_px, p99_px, max_px; survival: see there; length_median: camera
-    frames that half of the tracks live; by_age: list of age_low, age_high, count, within_1px and median_px.
+    frames that half of the tracks live; length_possible: if none were lost, and whole: share of whole lives (`lives`);
+    by_age: list of age_low, age_high, count, within_1px and median_px.
     """
     result = track_errors(seen, truth)
     error, age = result["error"], result["age"]
     if not len(error):
         return None
+    possible, whole = lives(seen, truth)
     by_age = []
     for low, high in pairwise(AGE_EDGES):
         here = error[(age >= low) & (age < high)]
@@ -168,6 +197,8 @@ def figures(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] | 
         "max_px": percentile(error, 100),
         "survival": survival(seen, truth, frames),
         "length_median": float(np.median(seen.tracks.length_frames)),
+        "length_possible": float(np.median(possible)),
+        "whole": float(np.mean(whole)),
         "by_age": by_age,
     }
 

@@ -267,7 +267,7 @@ def measure(
     remarks: list[str] = []
     chainage, quality = _encoder(survey, remarks)
     attitude, attitude_sigma = _attitude(survey)
-    tracks = survey.tracks()
+    tracks = survey.tracks(as_found=True)
     index = np.array([k.index for k in survey.keyframes], dtype=np.int64)
     tracks = dataclasses.replace(
         tracks,

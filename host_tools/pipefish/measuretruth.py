@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.measure import Measurement
+from pipefish.measure import Measurement, Stretch
 from pipefish.measured_files import stations
 from pipefish.simulate import Scene
 
@@ -92,6 +92,15 @@ def against_truth(m: Measurement, scene: Scene) -> dict[str, Any] | None:
         out["ovality_rms_points"] = 100 * float(np.sqrt(np.mean((oval - true_oval)[with_oval] ** 2)))
         out["ovality_covered"] = float(np.mean(inside[with_oval]))
     return out
+
+
+def true_place(m: Measurement, scene: Scene, stretch: Stretch, s: float) -> float:
+    """True arc length of the place at s along a stretch's tube."""
+    here = np.flatnonzero(m.structure.segment == stretch.segment)
+    frame_of = {k.index: k.message.frame_sequence for k in m.survey.keyframes}
+    frames = [frame_of[int(i)] for i in m.index[stretch.frames]]
+    axis = stretch.tube.frames([s])["centre"]
+    return float(_places(scene, axis, m.structure.poses[here], m.structure.centres[here], frames)[0])
 
 
 def _places(scene: Scene, axis: np.ndarray, poses: np.ndarray, centres: np.ndarray, frames: list[int]) -> np.ndarray:

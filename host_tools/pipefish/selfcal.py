@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +42,7 @@ ASPECT_SIGMA = 1e-3  # pixels are taken to be square; the covariance says how su
 # Pixels. No lens is rounder, no pixel squarer: corners of a bent board have residuals of 0.03 px, and say of alpha
 # what is not so.
 SIGMA_LEAST = 0.2
+ALPHA_TEXT = "sigma(alpha)"  # in a profile's provenance, before the number in per cent
 PARAMETERS = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5")
 
 #: Why there is no camera.
@@ -307,6 +309,12 @@ def _reason(status: str, found: dict[str, Any]) -> str:
     return text
 
 
+def stored_alpha_sigma(camera: Camera) -> float | None:
+    """Sigma of ln alpha that a self-calibrated camera's profile keeps; None of any other."""
+    kept = re.search(rf"{re.escape(ALPHA_TEXT)} ([0-9.e+-]+) %", camera.provenance.model_choice)
+    return float(kept[1]) / 100 if camera.source == "selfcal" and kept else None
+
+
 def _camera(found: dict[str, Any], width: int, height: int, good: int, views: int, rms: float) -> Camera:
     small = found["covariance"]
     spread = np.zeros((8, 7))
@@ -326,7 +334,7 @@ def _camera(found: dict[str, Any], width: int, height: int, good: int, views: in
         provenance=Provenance(
             tool="pipefish selfcal",
             version=_version(),
-            model_choice=f"{good} pairs, sigma(alpha) {100 * found['alpha_sigma']:.2g} %",
+            model_choice=f"{good} pairs, {ALPHA_TEXT} {100 * found['alpha_sigma']:.2g} %",
             views=views,
             points=sum(p["inliers"] for p in found["pairs"] if p["status"] == "ok"),
         ),

@@ -294,6 +294,87 @@ def _merged(segments: Sequence[dict[str, Any]], steps: Floats | None, frames: np
     return moves
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """What the engine is asked, in its terms."""
+
+    tracks: Tracks
+    names: npt.NDArray[Any]  # of the tracks; the engine has numbers
+    camera: Camera
+    sigma: float
+    method: str
+    seed: int
+    threads: int
+    still: float
+    step: Floats | None
+    step_sigma: Floats | None
+    scale_sigma: float
+    down: Floats | None
+    down_sigma: float
+    covariance: Floats | None
+    drift: tuple[Sequence[str], Floats, float] | None
+    sag_sigma: float
+    shutter: RollingShutter | None
+
+    def run(self, numbers: npt.NDArray[Any], end: int) -> dict[str, Any]:
+        """What the engine finds of the frames before one, with these numbers of the observations' tracks."""
+        tracks, drift, shutter = self.tracks, self.drift, self.shutter
+        kept = tracks.frame < end
+        return _engine.reconstruct(
+            self.camera._profile,
+            end,
+            len(self.names),
+            tracks.frame[kept].astype(np.int32),
+            numbers[kept].astype(np.int32),
+            np.ascontiguousarray(tracks.pixels[kept]),
+            None if tracks.covariance is None else np.ascontiguousarray(tracks.covariance[kept]),
+            self.sigma,
+            self.method,
+            self.seed,
+            self.threads,
+            self.still,
+            None if self.step is None else self.step[:end],
+            None if self.step_sigma is None else self.step_sigma[:end],
+            self.scale_sigma,
+            None if self.down is None else self.down[:end],
+            self.down_sigma,
+            [PARAMETERS.index(name) for name in self.camera.covariance_parameters],
+            self.covariance,
+            [PARAMETERS.index(name) for name in drift[0]] if drift else [],
+            np.ascontiguousarray(drift[1]) if drift else None,
+            float(drift[2]) if drift else 1.0,
+            self.sag_sigma,
+            None if shutter is None else np.asarray(shutter.time)[:end],
+            0.0 if shutter is None else shutter.line_time,
+            0.0 if shutter is None else shutter.middle_row,
+        )
+
+    def typical_noise(self) -> float:
+        """Of an observation, pixels."""
+        covariance = self.tracks.covariance
+        if covariance is None or not len(self.tracks.frame):
+            return self.sigma
+        return float(np.sqrt(np.median(np.einsum("nii->n", covariance)) / 2))
+
+
+def _linked(
+    asked: _Asked, found: dict[str, Any], numbers: npt.NDArray[Any], end: int, noise: float
+) -> tuple[dict[str, Any], Tracks, npt.NDArray[np.int64]]:
+    """Once more with tracks joined across breaks, where that leaves fewer segments: what is found then, the tracks so
+    joined, and which names became which."""
+    tracks, names = asked.tracks, asked.names
+    none = np.zeros((0, 2), np.int64)
+    joined = linked(asked.camera, found, tracks.frame, numbers, tracks.pixels, noise, asked.step)
+    if joined is None:
+        return found, tracks, none
+    again = asked.run(joined, end)
+    if len(again["segments"]) >= len(found["segments"]):
+        return found, tracks, none
+    moved = joined != np.searchsorted(names, tracks.track)
+    pairs = np.unique(np.column_stack([tracks.track, names[joined]])[moved], axis=0)
+    return again, dataclasses.replace(tracks, track=names[joined]), pairs
+
+
 def reconstruct(
     tracks: Tracks,
     camera: Camera,
@@ -349,58 +430,31 @@ def reconstruct(
     if shutter is not None:
         shutter = _checked(shutter, frames, camera)
     share = HELD if hold_camera else 1.0
-    uncertain = [PARAMETERS.index(name) for name in camera.covariance_parameters]
-
-    def run(end: int) -> dict[str, Any]:  # of the frames before one
-        kept = tracks.frame < end
-        return _engine.reconstruct(
-            camera._profile,
-            end,
-            len(names),
-            tracks.frame[kept].astype(np.int32),
-            numbers[kept].astype(np.int32),
-            np.ascontiguousarray(tracks.pixels[kept]),
-            None if tracks.covariance is None else np.ascontiguousarray(tracks.covariance[kept]),
-            float(sigma),
-            method,
-            seed,
-            threads or len(os.sched_getaffinity(0)),
-            float(still),
-            None if step is None else step[:end],
-            None if step_sigma is None else step_sigma[:end],
-            float(encoder.scale_sigma),
-            None if down is None else down[:end],
-            float(attitude_sigma),
-            uncertain,
-            None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
-            [PARAMETERS.index(name) for name in drift[0]] if drift else [],
-            np.ascontiguousarray(drift[1]) if drift else None,
-            float(drift[2]) if drift else 1.0,
-            float(sag_sigma),
-            None if shutter is None else np.asarray(shutter.time)[:end],
-            0.0 if shutter is None else shutter.line_time,
-            0.0 if shutter is None else shutter.middle_row,
-        )
-
-    found, end, linked_tracks = run(frames), frames, np.zeros((0, 2), np.int64)
-    noise = (
-        sigma
-        if tracks.covariance is None or not frames
-        else np.sqrt(np.median(np.einsum("nii->n", tracks.covariance)) / 2)
+    asked = _Asked(
+        tracks=tracks,
+        names=names,
+        camera=camera,
+        sigma=float(sigma),
+        method=method,
+        seed=seed,
+        threads=threads or len(os.sched_getaffinity(0)),
+        still=float(still),
+        step=step,
+        step_sigma=step_sigma,
+        scale_sigma=float(encoder.scale_sigma),
+        down=down,
+        down_sigma=float(attitude_sigma),
+        covariance=None if camera.covariance is None else np.ascontiguousarray(camera.covariance * share),
+        drift=drift,
+        sag_sigma=float(sag_sigma),
+        shutter=shutter,
     )
-    zoomed = Zooms(camera, tracks.frame, numbers, tracks.pixels, float(noise)).first(found, run)
+    noise = asked.typical_noise()
+    found, end = asked.run(numbers, frames), frames
+    zoomed = Zooms(camera, tracks.frame, numbers, tracks.pixels, noise).first(found, lambda e: asked.run(numbers, e))
     if zoomed:
         end, found = zoomed
-    joined = linked(camera, found, tracks.frame, numbers, tracks.pixels, float(noise), step)
-    if joined is not None:
-        numbers, before = joined, found
-        found = run(end)
-        if len(found["segments"]) < len(before["segments"]):
-            moved = joined != np.searchsorted(names, tracks.track)
-            linked_tracks = np.unique(np.column_stack([tracks.track, names[joined]])[moved], axis=0)
-            tracks = dataclasses.replace(tracks, track=names[joined])
-        else:
-            found = before
+    found, tracks, linked_tracks = _linked(asked, found, numbers, end, noise)
     out = _result(found, names, end, step, encoder, camera, share)
     if zoomed:
         out.gaps.append(Gap(int(out.frames[-1]) if len(out.frames) else 0, frames - 1, "zoom", 0))

@@ -56,6 +56,7 @@ class Observations:
     age         (N,) int64 frames since detection
     quality     (N,) float64, ZNCC with the previous patch, 0..1
     status      (N,) int64, pipefish.v1.TrackStatus
+    settled     (N,2) float64 pixels by which xy was moved towards where the wall's other tracks say; 0 where not told
     """
 
     id: np.ndarray
@@ -64,6 +65,7 @@ class Observations:
     age: np.ndarray
     quality: np.ndarray
     status: np.ndarray
+    settled: np.ndarray
 
     @staticmethod
     def from_message(message: pb.Observations) -> Observations:
@@ -73,6 +75,9 @@ class Observations:
         for name in fields:
             if len(getattr(message, name)) != n:
                 raise ValueError(f"observations: {n} ids but {len(getattr(message, name))} values of {name}")
+        settled = [np.array(column, dtype=np.int64) for column in (message.settled_x_q8, message.settled_y_q8)]
+        if any(len(column) not in (0, n) for column in settled):
+            raise ValueError(f"observations: {n} ids but {[len(column) for column in settled]} values of settled")
         x, y, xx, xy, yy, age, quality, status = (np.array(getattr(message, name), dtype=np.int64) for name in fields)
         ids = np.cumsum(np.array(message.id_delta, dtype=np.uint64), dtype=np.uint64).astype(np.int64)
         if n > 1 and not np.all(np.diff(ids) > 0):
@@ -84,6 +89,7 @@ class Observations:
             age=age,
             quality=quality / 32768.0,
             status=status,
+            settled=np.stack([c if len(c) else np.zeros(n) for c in settled], axis=1) / 256.0,
         )
 
 
@@ -389,8 +395,12 @@ class Survey:
             reached = chainage[i] = base + (frame.encoder_count - zero) * scale
         return chainage
 
-    def tracks(self) -> Tracks:
-        """All observations of all keyframes."""
+    def tracks(self, as_found: bool = False) -> Tracks:
+        """All observations of all keyframes.
+
+        as_found: where patches were found, not moved towards where the wall's other tracks say. What a place was moved
+        by is then its uncertainty, along that way: places that were moved know their neighbours, and what the wall
+        really does there is half taken back."""
         observations = [k.observations for k in self.keyframes]
         count = [len(o.id) for o in observations]
         boots = np.repeat(np.array([k.boot for k in self.keyframes], dtype=np.uint64), count)
@@ -409,11 +419,15 @@ class Survey:
         ids, boots, boot_number = ids[order], boots[order], boot_number[order]
         first = np.ones(len(ids), dtype=bool)
         first[1:] = (ids[1:] != ids[:-1]) | (boot_number[1:] != boot_number[:-1])
+        pixels, covariance = joined("xy", (2,), np.float64), joined("covariance", (2, 2), np.float64)
+        if as_found:
+            settled = joined("settled", (2,), np.float64)
+            pixels, covariance = pixels - settled, covariance + settled[:, :, None] * settled[:, None, :]
         return Tracks(
             frame=frame[order],
             track=np.cumsum(first, dtype=np.int64) - 1,
-            pixels=joined("xy", (2,), np.float64)[order],
-            covariance=joined("covariance", (2, 2), np.float64)[order],
+            pixels=pixels[order],
+            covariance=covariance[order],
             age=joined("age", (), np.int64)[order],
             quality=joined("quality", (), np.float64)[order],
             boot=boots[first],

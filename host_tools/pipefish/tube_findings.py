@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipefish.tube_heap import fit_heap
+
 if TYPE_CHECKING:
     from pipefish.tube import Tube
     from pipefish.tube_shared import Common
@@ -46,6 +48,11 @@ BEND_UNEVEN = 0.1
 # The flank of a heap that looks away from the camera shows few points: where most of a point's nearest FEW stand out, a
 # patch goes on over REACH times what the nearest k of its median take.
 FEW, REACH = 7, 1.5
+# Kinds that rise and fall off smoothly; the others' walls are steep. Of their length and width, to both sides: what is
+# looked at for it.
+SHAPED = ("deposit", "recess")
+AROUND = 0.75
+ENOUGH = 1000  # points, for a shape
 TENTH = 1.28  # sigmas that a tenth of what is normally distributed exceeds
 SURELY = 1.645  # of its own sigmas by which a patch has to stand out further than that: 95 %, one-sided
 
@@ -393,19 +400,79 @@ def _patches(tube: Tube, rings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for sign in (-1, 1):
         limit = np.maximum(gauss, _limit(sign * z, k, tests) * p["sigma"][rows])
         flagged = rows[sign * (value - centre) > limit]
-        for seed in _clusters(p, flagged, radius, spacing):
-            height = float(np.nanmax([*(sign * median[seed]), *(sign * near[seed])]))
-            cluster = _grown(p, seed, near, sign, radius, spacing, height)
-            if len(cluster) >= 4:
-                event = _describe(tube, cluster, sign, spacing / math.sqrt(k))
-                if _surely(p, cluster, event["height"], event["height_sigma"]) < LEAST_HEIGHT * d:
-                    continue
-                # The highest of n points of a heap is so much lower than its top.
-                event["height_sigma"] = math.hypot(event["height_sigma"], 3 * event["height"] / event["points"])
-                ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
-                if not (sign > 0 and ringed and event["length"] < 0.3 * d):
-                    out.append(event)
+        seeds = _clusters(p, flagged, radius, spacing)
+        highest = [float(np.nanmax([*(sign * median[seed]), *(sign * near[seed])])) for seed in seeds]
+        grown = [_grown(p, seed, near, sign, radius, spacing, h) for seed, h in zip(seeds, highest, strict=True)]
+        told = _told(tube, grown, sign, spacing / math.sqrt(k))
+        for event in told:
+            ringed = any(r["from"] - 0.1 * d < event["s"] < r["to"] + 0.1 * d for r in rings)
+            if not (sign > 0 and ringed and event["length"] < 0.3 * d):
+                out.append(event)
     return out
+
+
+def _told(tube: Tube, clusters: list[np.ndarray], sign: int, spacing: float) -> list[dict[str, Any]]:
+    """The events of clusters. Those that have grown into each other, or of which one lies in the middle of another, are
+    one: a low heap is seen by patches."""
+    out: list[tuple[np.ndarray, dict[str, Any]]] = []
+    waiting = [c for c in clusters if len(c) >= 4]
+    while waiting:
+        cluster = waiting.pop(0)
+        event = _patch(tube, cluster, sign, spacing)
+        if event is None:
+            continue
+        met = [k for k, (c, e) in enumerate(out) if np.intersect1d(c, cluster).size or _are_one(e, event, tube)]
+        if met:
+            waiting.insert(0, np.unique(np.concatenate([cluster, *(out[k][0] for k in met)])))
+            out = [o for k, o in enumerate(out) if k not in met]
+        else:
+            out.append((cluster, event))
+    return [event for _, event in out]
+
+
+def _are_one(a: dict[str, Any], b: dict[str, Any], tube: Tube) -> bool:
+    """Whether the middle of one heap or hollow lies within the ends of another."""
+    turn = abs((a["clock"] - b["clock"] + math.pi) % (2 * math.pi) - math.pi) * 0.5 * tube.summary["d_mean"]
+    within = 2 * abs(a["s"] - b["s"]) < max(a["length"], b["length"]) and 2 * turn < max(a["width"], b["width"])
+    return within and a["kind"] == b["kind"] and a["kind"] in SHAPED
+
+
+def _patch(tube: Tube, cluster: np.ndarray, sign: int, spacing: float) -> dict[str, Any] | None:
+    """The event of a cluster; None where it does not surely stand out."""
+    event = _describe(tube, cluster, sign, spacing)
+    if _surely(tube.points, cluster, event["height"], event["height_sigma"]) < LEAST_HEIGHT * tube.summary["d_mean"]:
+        return None
+    # The highest of n points of a heap is so much lower than its top.
+    event["height_sigma"] = math.hypot(event["height_sigma"], 3 * event["height"] / event["points"])
+    return {**event, **_shaped(tube, event, sign)} if event["kind"] in SHAPED else event
+
+
+def _shaped(tube: Tube, event: dict[str, Any], sign: int) -> dict[str, Any]:
+    """Place and size of a patch by a shape that is fitted to its points and those around it, as far as it is as high as
+    what counts as one; nothing where its points are too few for one."""
+    p, d = tube.points, tube.summary["d_mean"]
+    across = ((p["clock"] - event["clock"] + np.pi) % (2 * np.pi) - np.pi) * 0.5 * d
+    near = p["piece"] >= 0
+    near &= np.abs(p["s"] - event["s"]) < AROUND * event["length"] + 0.1 * d
+    near &= np.abs(across) < AROUND * event["width"] + 0.1 * d
+    near = np.flatnonzero(near)[:: 1 + int(near.sum()) // ENOUGH]
+    box = (event["s"], 0.0, event["length"], event["width"])
+    value, sigma = sign * p["distance"][near], p["sigma"][near]
+    found = fit_heap(p["s"][near], across[near], value, sigma, box, event["height"], LEAST_HEIGHT * d)
+    if found is None:
+        return {}
+    return {
+        "s": found.s,
+        "s_sigma": found.s_sigma,
+        "clock": float((event["clock"] + found.x / (0.5 * d)) % (2 * math.pi)),
+        "clock_sigma": found.x_sigma / (0.5 * d),
+        "length": found.length,
+        "width": found.width,
+        "size_sigma": max(found.length_sigma, found.width_sigma),
+        "height": found.height,
+        "height_sigma": found.height_sigma,
+        "area": found.length * found.width * math.pi / 4,
+    }
 
 
 def _surely(p: dict[str, np.ndarray], cluster: np.ndarray, height: float, sigma: float) -> float:

@@ -97,6 +97,18 @@ static bool write_status(pb_ostream_t *s, const pf_track *t, uint64_t before)
     return pb_encode_varint(s, t->status);
 }
 
+static bool write_settled_x(pb_ostream_t *s, const pf_track *t, uint64_t before)
+{
+    (void)before;
+    return pb_encode_svarint(s, t->settled_x_q8);
+}
+
+static bool write_settled_y(pb_ostream_t *s, const pf_track *t, uint64_t before)
+{
+    (void)before;
+    return pb_encode_svarint(s, t->settled_y_q8);
+}
+
 _Static_assert((int)PF_TRACK_NEW == (int)pipefish_v1_TrackStatus_TRACK_STATUS_NEW &&
                    (int)PF_TRACK_TRACKED == (int)pipefish_v1_TrackStatus_TRACK_STATUS_TRACKED,
                "write_status copies the number");
@@ -132,16 +144,17 @@ static bool write_column(pb_ostream_t *stream, const pb_field_t *field, void *co
            write_column_items(stream, *arg);
 }
 
-#define OBSERVATION_COLUMNS 9
+#define OBSERVATION_COLUMNS 11
 
 static void set_observations(pipefish_v1_Observations *o, observation_column columns[OBSERVATION_COLUMNS],
                              const pf_track *tracks, uint32_t n)
 {
     static bool (*const write[OBSERVATION_COLUMNS])(pb_ostream_t *, const pf_track *, uint64_t) = {
-        write_id, write_x, write_y, write_cov_xx, write_cov_xy, write_cov_yy, write_age, write_quality, write_status};
-    pb_callback_t *const field[OBSERVATION_COLUMNS] = {&o->id_delta,   &o->x_q16,      &o->y_q16,
-                                                       &o->cov_xx_q20, &o->cov_xy_q20, &o->cov_yy_q20,
-                                                       &o->age,        &o->quality,    &o->status};
+        write_id,  write_x,       write_y,      write_cov_xx,    write_cov_xy,   write_cov_yy,
+        write_age, write_quality, write_status, write_settled_x, write_settled_y};
+    pb_callback_t *const field[OBSERVATION_COLUMNS] = {
+        &o->id_delta, &o->x_q16,   &o->y_q16,  &o->cov_xx_q20,   &o->cov_xy_q20,  &o->cov_yy_q20,
+        &o->age,      &o->quality, &o->status, &o->settled_x_q8, &o->settled_y_q8};
     for (int i = 0; i < OBSERVATION_COLUMNS; i++) {
         columns[i] = (observation_column){tracks, n, write[i]};
         field[i]->funcs.encode = write_column;

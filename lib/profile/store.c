@@ -112,8 +112,11 @@ static pf_status scan_log(pf_profile_store *store, uint32_t log)
         pf_status status = read_at(store, at, store->scratch, store->stride);
         if (status != PF_OK)
             return status;
-        if (store->next[log] == 0 && !is_erased(store->scratch, store->stride))
+        if (store->next[log] == 0) {
+            if (is_erased(store->scratch, store->stride))
+                continue;
             store->next[log] = i + 1;
+        }
         status = get_record(store->scratch, &found);
         if (status == PF_ERR_VERSION)
             return status;
@@ -141,7 +144,7 @@ pf_status pf_profile_store_open(pf_profile_store *store, const pf_flash *flash, 
     return status == PF_OK ? scan_log(store, 1) : status;
 }
 
-static pf_status append_to(pf_profile_store *store, uint32_t log, const pf_profile_store_state *state)
+static pf_status append_to(pf_profile_store *store, uint32_t log, const uint8_t record[RECORD_BYTES], uint32_t sequence)
 {
     const pf_flash *flash = store->flash;
     pf_status status;
@@ -154,7 +157,7 @@ static pf_status append_to(pf_profile_store *store, uint32_t log, const pf_profi
     }
     uint32_t at = log * flash->erase_size + store->next[log]++ * store->stride;
     memset(store->scratch, 0xFF, store->stride);
-    put_record(state, store->scratch);
+    memcpy(store->scratch, record, RECORD_BYTES);
     status = flash->ops->program(flash->self, at, store->scratch, store->stride);
     if (status == PF_OK)
         status = flush(store);
@@ -162,11 +165,9 @@ static pf_status append_to(pf_profile_store *store, uint32_t log, const pf_profi
         status = read_at(store, at, store->scratch, store->stride);
     if (status != PF_OK)
         return status;
-    uint8_t expected[RECORD_BYTES];
-    put_record(state, expected);
-    if (memcmp(store->scratch, expected, RECORD_BYTES) != 0)
+    if (memcmp(store->scratch, record, RECORD_BYTES) != 0)
         return PF_ERR_IO;
-    store->newest[log] = state->sequence;
+    store->newest[log] = sequence;
     return PF_OK;
 }
 
@@ -183,9 +184,11 @@ static pf_status append(pf_profile_store *store, pf_profile_store_state *state)
         if (store->next[log] == store->per_sector)
             state->log_erases[log]++;
     }
-    pf_status status = append_to(store, first, state);
+    uint8_t record[RECORD_BYTES];
+    put_record(state, record);
+    pf_status status = append_to(store, first, record, state->sequence);
     if (status == PF_OK)
-        status = append_to(store, 1 - first, state);
+        status = append_to(store, 1 - first, record, state->sequence);
     if (status == PF_OK)
         store->state = *state;
     return status;

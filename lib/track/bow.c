@@ -12,11 +12,6 @@
 #define TURN  512
 #define FAR   8 /* half windows: a place of the patch is never farther from its middle */
 
-static int64_t sine_of(const pf_ray_q30 *v)
-{
-    return pf_isqrt64((uint64_t)((int64_t)v->x * v->x + (int64_t)v->y * v->y));
-}
-
 /* What takes the patch's rays on: `turn` about the axis (cosine and sine, Q30) and a fall of the cotangent, Q24; and
  * what pf_bow.turned_q8 is. */
 typedef struct pf_way {
@@ -25,7 +20,7 @@ typedef struct pf_way {
 
 static bool way_between(const pf_ray_q30 *a, const pf_ray_q30 *b, pf_way *way)
 {
-    const int64_t ra = sine_of(a), rb = sine_of(b);
+    const int64_t ra = pf_ray_sine(a), rb = pf_ray_sine(b);
     if (ra < STEEP || rb < STEEP)
         return false;
     const int64_t cot = a->z * ((int64_t)1 << 24) / ra, size = cot < 0 ? -cot : cot, base = size > BLUNT ? size : BLUNT;
@@ -39,7 +34,7 @@ static bool way_between(const pf_ray_q30 *a, const pf_ray_q30 *b, pf_way *way)
 /* The ray's pixel at the end of the way. The new ray is a sixteenth as long: the length does not matter to the lens. */
 static bool follow_ray(const pf_track_lens *lens, const pf_way *way, const pf_ray_q30 *ray, pf_point_q16 *at)
 {
-    const int64_t rho = sine_of(ray), z = ray->z - ((rho * way->fall) >> 24);
+    const int64_t rho = pf_ray_sine(ray), z = ray->z - ((rho * way->fall) >> 24);
     const pf_ray_q30 moved = {(int32_t)((((ray->x * way->cosine) >> 30) - ((ray->y * way->sine) >> 30)) >> 4),
                               (int32_t)((((ray->x * way->sine) >> 30) + ((ray->y * way->cosine) >> 30)) >> 4),
                               (int32_t)(z >> 4)};

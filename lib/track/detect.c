@@ -16,6 +16,12 @@
  * clipped corners are as good as others. */
 #define GLARE 40u
 
+/* Nor, in a tube whose wall comes out towards the rim, from where it has less than half a radius of way left before it
+ * leaves the picture (60 degrees off the axis where the field ends at 86). Keyframes are a quarter of a radius apart:
+ * what begins there is seen in two of them at most, and a point needs three views. Q24. */
+#define WAY_LEFT ((int64_t)1 << 23)
+#define STEEP    ((int64_t)1 << 26) /* sine of a polar angle, Q30: less says nothing */
+
 static bool weaker(const pf_corner *a, const pf_corner *b)
 {
     if (a->strength != b->strength)
@@ -54,10 +60,33 @@ static void remember(pf_tracker *t, const pf_corner *corner)
     }
 }
 
+int64_t pf_detect_late(const pf_tracker *t)
+{
+    const pf_track_lens *lens = &t->config.lens;
+    const int64_t last = (int64_t)(t->config.width - 1u) << 16, reach = (int64_t)(t->klt.half * 3 / 2 + 1) << 16;
+    pf_point_q16 at = t->config.circle;
+    if (!lens->ray || !t->config.circle_radius_q16)
+        return 0;
+    const int64_t x = at.x + (int64_t)t->config.circle_radius_q16, rim = (x < last ? x : last) - reach;
+    const pf_ray_q30 leaves = lens->ray(lens->rays, (pf_point_q16){(int32_t)rim, at.y});
+    const int64_t sine = pf_ray_sine(&leaves);
+    if (sine < STEEP)
+        return 0;
+    const int64_t cot = ((int64_t)leaves.z * (1 << 24)) / sine + WAY_LEFT;
+    const int64_t norm = pf_isqrt64((uint64_t)(cot * cot + ((int64_t)1 << 48)));
+    const pf_ray_q30 late = {(int32_t)(((int64_t)1 << 54) / norm), 0, (int32_t)(cot * ((int64_t)1 << 30) / norm)};
+    if (!lens->project(lens->camera, &late, &at))
+        return 0;
+    return ((int64_t)at.x - t->config.circle.x) >> 8;
+}
+
 /* Radius within which new tracks begin, Q8 px; 0 = no circle. */
 static int64_t rim_of(const pf_tracker *t)
 {
-    return (int64_t)(t->config.circle_radius_q16 >> 8) * (OUTER - 1) / OUTER;
+    const pf_scene_measures *m = &t->stats.scene;
+    const int64_t rim = (int64_t)(t->config.circle_radius_q16 >> 8) * (OUTER - 1) / OUTER;
+    const bool comes_out = 5u * m->outward > 3u * m->moved; /* as many as must go in for it to be reversing */
+    return comes_out && t->late_q8 > 0 && t->late_q8 < rim ? t->late_q8 : rim;
 }
 
 static bool within_rim(const pf_tracker *t, pf_point_q16 at)

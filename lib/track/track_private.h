@@ -158,6 +158,12 @@ static inline bool pf_ray_valid(const pf_ray_q30 *ray)
     return ray->x != 0 || ray->y != 0 || ray->z != 0;
 }
 
+/* Sine of the polar angle, Q30. */
+static inline int64_t pf_ray_sine(const pf_ray_q30 *ray)
+{
+    return pf_isqrt64((uint64_t)((int64_t)ray->x * ray->x + (int64_t)ray->y * ray->y));
+}
+
 /* Row-major Q30 rotation times a ray, each coordinate within 1 LSB. */
 void pf_ray_rotate(const int32_t r[9], const pf_ray_q30 *v, pf_ray_q30 *out);
 

@@ -46,6 +46,7 @@ struct pf_tracker {
     int32_t *radial;
     uint32_t n;
     pf_slot *slots;
+    int64_t late_q8; /* pf_detect_late */
     uint8_t *pixels; /* templates, patch_bytes each */
     uint32_t patch_bytes;
     uint16_t *spare; /* free slots */
@@ -91,6 +92,10 @@ pf_point_q16 pf_flow_centre(const pf_tracker *t);
 /* --- new tracks (detect.c) */
 
 void pf_tracks_detect(pf_tracker *t);
+
+/* How far from the circle's centre, Q8 px, tracks begin too late, where the wall of a tube comes out: it is gone before
+ * the third keyframe. 0: not known. */
+int64_t pf_detect_late(const pf_tracker *t);
 
 /* The sector of 30 degrees, 0 .. SECTORS - 1 from x to y, that (dx, dy), |.| < 2^40, lies in. */
 uint32_t pf_sector_of(int64_t dx, int64_t dy);

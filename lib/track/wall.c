@@ -62,14 +62,9 @@ static void cross(const int64_t a[3], const int64_t b[3], int64_t out[3])
     out[2] = (a[0] * b[1] - a[1] * b[0]) >> 24;
 }
 
-static int64_t sine_of(const pf_ray_q30 *v)
-{
-    return pf_isqrt64((uint64_t)((int64_t)v->x * v->x + (int64_t)v->y * v->y));
-}
-
 static bool make_pair(const pf_ray_q30 *before, const pf_ray_q30 *after, pf_pair *p)
 {
-    const int64_t a = sine_of(before), b = sine_of(after);
+    const int64_t a = pf_ray_sine(before), b = pf_ray_sine(after);
     if (a < STEEP || b < STEEP)
         return false;
     p->c = before->x * ONE / a;
@@ -438,7 +433,7 @@ static pf_point_q16 way_of(const pf_wall *wall, uint32_t k, const int64_t walked
                            const void *camera)
 {
     const pf_ray_q30 *v = &wall->now.ray[k];
-    const int64_t sine = sine_of(v);
+    const int64_t sine = pf_ray_sine(v);
     pf_point_q16 a, b;
     if (sine < STEEP || !project(camera, v, &a))
         return (pf_point_q16){0, 0};
@@ -491,7 +486,7 @@ static uint32_t part_of_light(pf_wall *wall)
 static int64_t part_of(const pf_wall *wall, uint32_t k)
 {
     const pf_ray_q30 *v = &wall->now.ray[k];
-    const int64_t sine = sine_of(v), z = v->z < 0 ? -(int64_t)v->z : v->z, p = wall->light_q16;
+    const int64_t sine = pf_ray_sine(v), z = v->z < 0 ? -(int64_t)v->z : v->z, p = wall->light_q16;
     const int64_t cot = z < sine / 2 ? z * 65536 / sine : 32768;
     const int64_t odds = 65536 + GLANCE * (65536 - 2 * cot);
     return p * odds / (65536 + ((p * (odds - 65536)) >> 16));
@@ -554,7 +549,9 @@ void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_pr
         walked_alone(wall, k, walked);
         const pf_point_q16 way = way_of(wall, k, walked, project, camera);
         const int64_t part = part_of(wall, k);
-        tracks[j].pos.x = pf_clamp_i64(tracks[j].pos.x - way.x * part / 65536, INT32_MAX);
-        tracks[j].pos.y = pf_clamp_i64(tracks[j].pos.y - way.y * part / 65536, INT32_MAX);
+        tracks[j].settled_x_q8 = (int16_t)pf_clamp_i64(-way.x * part / (65536 * 256), INT16_MAX);
+        tracks[j].settled_y_q8 = (int16_t)pf_clamp_i64(-way.y * part / (65536 * 256), INT16_MAX);
+        tracks[j].pos.x = pf_clamp_i64((int64_t)tracks[j].pos.x + 256 * tracks[j].settled_x_q8, INT32_MAX);
+        tracks[j].pos.y = pf_clamp_i64((int64_t)tracks[j].pos.y + 256 * tracks[j].settled_y_q8, INT32_MAX);
     }
 }

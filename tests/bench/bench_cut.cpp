@@ -41,7 +41,8 @@ struct Function {
 
 std::vector<bool> ours(const Function &f)
 {
-    Cut cut(static_cast<int>(f.zero.size()));
+    Cut cut;
+    cut.start(static_cast<int>(f.zero.size()));
     for (size_t i = 0; i < f.zero.size(); i++)
         cut.add(static_cast<int>(i), f.zero[i], f.one[i]);
     for (const Pair &p : f.pairs)

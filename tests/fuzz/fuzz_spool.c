@@ -1,12 +1,12 @@
 /* The spool's recovery from whatever a power cut or a worn medium has left of its file and its log, and its salvage of
  * what a file that it sets aside still has. The files live in memory (memory_files.h). The input's first byte chooses
  * what lies there: a spool as kill -9 leaves it, with its log, or one that was closed; a valid header before bytes of
- * the input's own; whether the log's checksums are repaired, so that damage behind them is reached; whether it cannot
- * be written at first; and after how many reads the first program that opens it is told of an error that passes. The
- * rest are changes and cuts. Invariants: opening ends, well or with an error in words; an object that is handed out has
- * the bytes of its name, and rows ascend; what is stored in undamaged files without an error is there after opening
- * again, and they lose nothing, also by errors that pass; what cannot be written is read; after any damage the next
- * object is stored; damage to pages that hold no objects, only an index of them, costs none.
+ * the input's own; whether the log's checksums are repaired, so that damage behind them is reached; and whether another
+ * program opens it first: one that can write nothing, or one that is told after so many reads of an error that passes.
+ * The rest are changes and cuts. Invariants: opening ends, well or with an error in words; an object that is handed out
+ * has the bytes of its name, and rows ascend; what is stored in undamaged files without an error is there after opening
+ * again, and they lose nothing, also by errors that pass; what cannot be written is read, and stays as it is; after any
+ * damage the next object is stored; damage to pages that hold no objects, only an index of them, costs none.
  */
 #include "memory_files.h"
 #include "pipefish/drivers/sha256.h"
@@ -19,11 +19,17 @@
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 enum { OBJECTS = 6, OBJECT_MAX = 6000, WALK_MAX = 64 };
+enum { VICTORIOUS = 99, LAST = 100, REMAINDER = 7, MOMENTARY = 200 }; /* ids of what is stored later */
 enum { DATABASE = 0, LOG = 1 };
-enum { CLOSED = 1, REPAIRED = 2, RAW = 4, READ_ONLY = 8, READS_SHIFT = 4 };
+enum { CLOSED = 1, REPAIRED = 2, RAW = 4, ANOTHER_FIRST = 8, READS_SHIFT = 4 };
 
 static memory_file crashed[2], closed;
-static uint8_t names[OBJECTS][32];
+static struct {
+    uint32_t id;
+    size_t n;
+    uint8_t name[32], bytes[OBJECT_MAX];
+} object[OBJECTS + REMAINDER + 2]; /* all that are ever stored */
+enum { KNOWN = sizeof object / sizeof object[0] };
 static uint64_t index_pages; /* of the closed spool: bits, page 1 is bit 0 */
 
 /* ---- spools */
@@ -36,38 +42,61 @@ static bool open_spool(pf_spool *spool)
     require(status == PF_OK || status == PF_ERR_FORMAT || status == PF_ERR_VERSION || status == PF_ERR_IO ||
             status == PF_ERR_SPACE);
     require((status == PF_OK) == (error[0] == '\0'));
+    if (status != PF_OK)
+        memory_reset();
     return status == PF_OK;
 }
 
-static size_t make_object(uint32_t id, uint8_t *bytes, uint8_t name[32])
+static void make_objects(void)
 {
-    size_t n = 200 + 900 * (size_t)(id % OBJECTS);
-    for (size_t i = 0; i < n; i++)
-        bytes[i] = (uint8_t)(id * 31 + i * 7);
-    require(pf_sha256(bytes, n, name) == PF_OK);
-    return n;
+    for (uint32_t i = 0; i < KNOWN; i++) {
+        const uint32_t more = i - OBJECTS;
+        object[i].id = i < OBJECTS ? i : more < REMAINDER ? LAST + more : more == REMAINDER ? VICTORIOUS : MOMENTARY;
+        object[i].n = 200 + 900 * (size_t)(object[i].id % OBJECTS);
+        for (size_t k = 0; k < object[i].n; k++)
+            object[i].bytes[k] = (uint8_t)(object[i].id * 31 + k * 7);
+        require(pf_sha256(object[i].bytes, object[i].n, object[i].name) == PF_OK);
+    }
+}
+
+/* Nothing of it stays. */
+static void close_spool(const pf_spool *spool)
+{
+    spool->ops->close(spool->self);
+    memory_reset();
 }
 
 static pf_status put_over(const pf_spool *spool, uint32_t id, const pf_spool_victim *victims, uint32_t count,
-                          uint8_t name[32])
+                          const uint8_t **name)
 {
-    static uint8_t bytes[OBJECT_MAX];
     const pf_spool_rank rank = {id % 3, id};
-    size_t n = make_object(id, bytes, name);
-    return spool->ops->exchange(spool->self, victims, count, 2, name, bytes, n, id % 2 ? &rank : NULL, "survey", &id,
-                                sizeof id);
+    uint32_t i = 0;
+    while (object[i].id != id)
+        i++;
+    *name = object[i].name;
+    return spool->ops->exchange(spool->self, victims, count, 2, *name, object[i].bytes, object[i].n,
+                                id % 2 ? &rank : NULL, "survey", &id, sizeof id);
 }
 
-static pf_status put(const pf_spool *spool, uint32_t id, uint8_t name[32])
+static pf_status put(const pf_spool *spool, uint32_t id, const uint8_t **name)
 {
     return put_over(spool, id, NULL, 0, name);
 }
 
-/* How many objects come out, each checked; whether `name` is among them. */
+/* Of a known object by its bytes, which is quicker than by their hash, and does not trust the spool's. */
+static bool is_right(const uint8_t name[32], const uint8_t *bytes, size_t n)
+{
+    uint8_t hash[32];
+    for (uint32_t i = 0; i < KNOWN; i++)
+        if (memcmp(object[i].name, name, 32) == 0)
+            return n == object[i].n && memcmp(object[i].bytes, bytes, n) == 0;
+    return pf_sha256(bytes, n, hash) == PF_OK && memcmp(hash, name, 32) == 0;
+}
+
+/* How many objects come out, each checked; whether `name` is among them, if it is not NULL. */
 static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
 {
     static uint8_t bytes[OBJECT_MAX];
-    uint8_t hash[32];
     pf_spool_item item = {.row = 0};
     uint32_t intact = 0;
     uint64_t row = 0;
@@ -78,9 +107,9 @@ static uint32_t walk(const pf_spool *spool, const uint8_t *name, bool *is_there)
         row = item.row;
         if (spool->ops->read(spool->self, &item, bytes, sizeof bytes, &n) != PF_OK)
             continue;
-        require(n <= sizeof bytes && pf_sha256(bytes, n, hash) == PF_OK && memcmp(hash, item.name, 32) == 0);
+        require(n <= sizeof bytes && is_right(item.name, bytes, n));
         intact++;
-        *is_there = *is_there || memcmp(hash, name, 32) == 0;
+        *is_there = *is_there || (name != NULL && memcmp(item.name, name, 32) == 0);
     }
     return intact;
 }
@@ -101,10 +130,12 @@ static void find_indices(void)
 static void begin(void)
 {
     pf_spool spool;
+    const uint8_t *name;
     memory_begin();
+    make_objects();
     require(open_spool(&spool));
     for (uint32_t id = 0; id < OBJECTS; id++)
-        require(put(&spool, id, names[id]) == PF_OK);
+        require(put(&spool, id, &name) == PF_OK);
     require(spool.ops->remove(spool.self, 1) == PF_OK);
     require(strcmp(medium.file[DATABASE].name, SPOOL_PATH) == 0 &&
             strcmp(medium.file[LOG].name, SPOOL_PATH "-wal") == 0);
@@ -192,60 +223,70 @@ static bool damage(const uint8_t *data, size_t size, uint64_t *pages)
     return has_changed;
 }
 
+static void copy_file(memory_file *to, const memory_file *from)
+{
+    memcpy(to->bytes, from->bytes, from->n);
+    to->n = from->n;
+    to->is_there = from->is_there;
+}
+
 static void lay(const memory_file *from, const char *name)
 {
     memory_file *i = memory_make(name);
     require(i != NULL);
-    memcpy(i->bytes, from->bytes, from->n);
-    i->n = from->n;
+    copy_file(i, from);
 }
 
-/* A program that can write nothing: it hands out what is there, and takes nothing. */
+/* A program that can write nothing: it hands out what is there, takes nothing, and leaves everything as it is. */
 static void read_only(bool is_whole)
 {
+    static memory_file before[2];
     pf_spool spool;
-    uint8_t name[32] = {0};
+    const uint8_t *name = NULL;
     bool is_there;
+    for (int i = 0; i < 2; i++)
+        copy_file(&before[i], &medium.file[i]);
     medium.is_read_only = true;
     if (open_spool(&spool)) {
         uint32_t intact = walk(&spool, name, &is_there);
         require(!is_whole || intact == OBJECTS - 1);
-        require(put(&spool, 100, name) != PF_OK && spool.ops->remove(spool.self, 2) != PF_OK);
+        require(put(&spool, LAST, &name) != PF_OK && spool.ops->remove(spool.self, 2) != PF_OK);
         require(spool.ops->keep_all(spool.self) != PF_OK && spool.ops->error(spool.self)[0] != '\0');
-        spool.ops->close(spool.self);
+        close_spool(&spool);
     } else {
         require(!is_whole);
     }
     medium.is_read_only = false;
+    for (int i = 0; i < MEMORY_FILES; i++)
+        require(medium.file[i].is_there == (i < 2 && before[i].is_there));
+    for (int i = 0; i < 2; i++)
+        require(before[i].n == medium.file[i].n && memcmp(before[i].bytes, medium.file[i].bytes, before[i].n) == 0);
 }
 
 /* A program whose reads fail after so many, for a moment. */
 static void fail_for_a_moment(int reads)
 {
     pf_spool spool;
-    uint8_t name[32] = {0};
+    const uint8_t *name = NULL;
     bool is_there;
     medium.reads_left = reads;
     if (open_spool(&spool)) {
         (void)walk(&spool, name, &is_there);
-        (void)put(&spool, 200, name);
-        spool.ops->close(spool.self);
+        (void)put(&spool, MOMENTARY, &name);
+        close_spool(&spool);
     }
     medium.reads_left = INT_MAX;
 }
 
-static void try_files(const uint8_t *data, size_t size)
+/* What the input says lies there. Returns whether that is undamaged; *is_spared: nothing is damaged that holds objects.
+ */
+static bool lay_all(const uint8_t *data, size_t size, bool *is_spared)
 {
-    pf_spool spool;
-    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
-    uint8_t name[32] = {0}, value[64];
-    uint32_t count;
-    size_t n;
-    bool is_there, is_spared, is_whole = true;
+    const uint8_t how = data[0];
     uint64_t pages = 0;
+    bool is_whole;
     for (uint32_t i = 0; i < MEMORY_FILES; i++)
         memory_forget(&medium.file[i]);
-    const uint8_t how = data[0];
     lay(how & CLOSED ? &closed : &crashed[DATABASE], SPOOL_PATH);
     if (!(how & CLOSED))
         lay(&crashed[LOG], SPOOL_PATH "-wal");
@@ -258,11 +299,20 @@ static void try_files(const uint8_t *data, size_t size)
     }
     if (how & REPAIRED && medium.file[LOG].is_there)
         repair_log(&medium.file[LOG]);
-    is_spared = is_whole || (how & CLOSED && pages != 0 && (pages & ~index_pages) == 0);
-    if (how & READ_ONLY)
-        read_only(is_whole);
-    if (how >> READS_SHIFT)
-        fail_for_a_moment(4 * (how >> READS_SHIFT));
+    *is_spared = is_whole || (how & CLOSED && pages != 0 && (pages & ~index_pages) == 0);
+    return is_whole;
+}
+
+/* A program that does everything, and what another one finds then. */
+static void use(const uint8_t *data, size_t size, bool is_whole, bool is_spared)
+{
+    pf_spool spool;
+    pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX];
+    const uint8_t how = data[0], *name = NULL;
+    uint8_t value[64];
+    uint32_t count, left = OBJECTS - 2; /* at least: row 1 was removed, and row 2 will be */
+    size_t n;
+    bool is_there;
     if (!open_spool(&spool)) {
         require(!is_whole);
         return;
@@ -271,26 +321,38 @@ static void try_files(const uint8_t *data, size_t size)
     require(!is_whole || intact >= OBJECTS - 1);
     (void)spool.ops->get(spool.self, "survey", value, sizeof value, &n);
     (void)spool.ops->set(spool.self, "other", data, size < 40 ? size : 40);
-    uint32_t left = OBJECTS - 2; /* at least: row 1 was removed, and row 2 will be */
     if (spool.ops->victims(spool.self, 0, 9, 1000, victims, &count) == PF_OK && how & CLOSED)
-        left += (put_over(&spool, 99, victims, count, name) == PF_OK) - count;
+        left += (put_over(&spool, VICTORIOUS, victims, count, &name) == PF_OK) - count;
     else
         (void)spool.ops->keep_all(spool.self);
     (void)spool.ops->remove(spool.self, 2);
-    pf_status status = put(&spool, 100 + how % 7u, name);
+    pf_status status = put(&spool, LAST + how % REMAINDER, &name);
     require(!is_whole || status == PF_OK);
     if (status != PF_OK) /* damage that was found in storing; the next survey is stored */
-        status = put(&spool, 100 + how % 7u, name);
+        status = put(&spool, LAST + how % REMAINDER, &name);
     require(status == PF_OK || status == PF_ERR_SPACE);
-    spool.ops->close(spool.self);
+    close_spool(&spool);
     left += status == PF_OK;
     if (open_spool(&spool)) {
         intact = walk(&spool, name, &is_there);
         require(!is_spared || (is_there && intact >= left));
-        spool.ops->close(spool.self);
+        close_spool(&spool);
     } else {
         require(!is_spared);
     }
+}
+
+static void try_files(const uint8_t *data, size_t size)
+{
+    const int reads = data[0] >> READS_SHIFT;
+    bool is_spared, is_whole = lay_all(data, size, &is_spared);
+    if (data[0] & ANOTHER_FIRST && reads == 0) {
+        read_only(is_whole); /* and nothing has changed: to go on from there is another input */
+        return;
+    }
+    if (data[0] & ANOTHER_FIRST)
+        fail_for_a_moment(4 * reads);
+    use(data, size, is_whole, is_spared);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
@@ -299,6 +361,5 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         begin();
     if (size >= 1)
         try_files(data, size);
-    memory_reset();
     return 0;
 }

@@ -21,7 +21,7 @@ void require(bool holds)
 }
 
 /* ---- SQLite's memory, guarded as the sanitizer's own is, and quicker, which makes twice as many inputs of it: each
- * piece lies between poisoned ones, and is poisoned when it is freed until the input has ended */
+ * piece lies between poisoned ones, and is poisoned when it is freed until memory_reset() */
 
 enum { HEAP = 1 << 25, GUARD = 16 };
 
@@ -109,8 +109,8 @@ static int read_file(sqlite3_file *f, void *to, int n, sqlite3_int64 at)
     if (medium.reads_left != INT_MAX && medium.reads_left-- <= 0)
         return SQLITE_IOERR_NOMEM;
     size_t have = (size_t)at < i->n ? i->n - (size_t)at : 0, take = have < (size_t)n ? have : (size_t)n;
-    memset(to, 0, (size_t)n);
     memcpy(to, i->bytes + (take ? at : 0), take);
+    memset((uint8_t *)to + take, 0, (size_t)n - take);
     return take == (size_t)n ? SQLITE_OK : SQLITE_IOERR_SHORT_READ;
 }
 

@@ -1,6 +1,6 @@
 /* The spool's files in memory: a file system and a heap of SQLite's own kind, and what the spool asks of the system's
  * files by name (the linker gives those calls to this: --wrap, see CMakeLists.txt). An input costs no disk, and what
- * was allocated for it is looked for when it has ended. */
+ * was allocated for a spool is looked for when it has been closed. */
 #ifndef PIPEFISH_FUZZ_MEMORY_FILES_H
 #define PIPEFISH_FUZZ_MEMORY_FILES_H
 

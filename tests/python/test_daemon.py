@@ -211,7 +211,8 @@ def test_a_whole_survey_arrives_and_its_counters_agree(tmp_path: Path, crawler: 
         o = k.observations
         n = len(o.id_delta)
         assert n > 20
-        for column in (o.x_q16, o.y_q16, o.cov_xx_q20, o.cov_xy_q20, o.cov_yy_q20, o.age, o.quality, o.status):
+        columns = (o.x_q16, o.y_q16, o.cov_xx_q20, o.cov_xy_q20, o.cov_yy_q20, o.age, o.quality, o.status)
+        for column in (*columns, o.settled_x_q8, o.settled_y_q8):
             assert len(column) == n
         assert all(delta > 0 for delta in o.id_delta)
         assert max(o.x_q16) < WIDTH << 16

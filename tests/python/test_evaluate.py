@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipefish.evaluate import evaluate, lit, observed, opencv_tracks, survival, track_errors, verdict
+from pipefish.evaluate import evaluate, lit, lives, observed, opencv_tracks, survival, track_errors, verdict
 from pipefish.survey import Survey
 from synthetic import write_survey
 
@@ -93,6 +93,22 @@ def test_a_window_clipped_by_more_than_a_quarter_is_not_lit():
     image[:4] = 2
     at = np.array([[30.0, 30.0], [29.0, 30.0], [30.0, 12.0], [np.nan, 0.0]])
     np.testing.assert_array_equal(lit(image, at), [True, False, False, False])
+
+
+def test_a_life_ends_where_the_point_leaves_or_the_survey_ends(tmp_path):
+    seen = observed(opened(tmp_path))
+    tracks, last = seen.tracks, max(seen.sequence.values())
+    anchor = tracks.bounds[:-1]
+    born = np.array([seen.sequence[int(i)] for i in tracks.frame[anchor]]) - tracks.age[anchor]
+    frames, whole = lives(seen, Flat())
+    assert (frames == last - born).all() and not whole.any()  # nothing ever leaves: only the survey's end does
+    frames, whole = lives(seen, Rim(40 + 16))  # the points go on, the field ends
+    reached = np.linalg.norm(tracks.pixels - [80, 60], axis=1) > 40
+    ends = np.array([reached[a:b].any() for a, b in zip(anchor, tracks.bounds[1:], strict=True)])
+    assert ends.any() and (frames[ends] <= tracks.length_frames[ends]).all()
+    assert (frames[whole] < last - born[whole]).all() and (born[whole] > min(seen.sequence.values())).all()
+    frames, whole = lives(seen, Rim(1))
+    assert (frames == tracks.length_frames).all() and not whole.any()  # no wall at the anchors: nothing is known
 
 
 FIGURES = {"within_1px": 0.98, "survival": 0.95, "median_px": 0.1, "length_median": 30.0}

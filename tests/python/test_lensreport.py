@@ -61,6 +61,19 @@ def test_show_tells_and_draws(camera, tmp_path, capsys):
     assert document["f_u"] == 250 and document["curve"][0]["radial_px_per_deg"] == pytest.approx(4.3633, abs=1e-4)
 
 
+def test_show_tells_how_well_alpha_is_known_of_a_self_calibrated_camera(camera, tmp_path, capsys):
+    """As the diameter and the angles feel it; of a camera calibrated otherwise nothing."""
+    chosen = pf.Provenance(model_choice="5 pairs, sigma(alpha) 0.31 %")
+    dataclasses.replace(camera, source="selfcal", provenance=chosen).save(tmp_path / "c.json")
+    assert run("show", tmp_path / "c.json") == 0
+    assert "0.31 % of a diameter" in (text := capsys.readouterr().out)
+    assert "0.2 % of the angle at 45 deg" in text  # sin 45 cos 45 / (pi / 4) x 0.31 = 0.197
+    assert run("show", tmp_path / "c.json", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["alpha_sigma"] == pytest.approx(0.0031)
+    dataclasses.replace(camera, provenance=chosen).save(tmp_path / "c.json")
+    assert run("show", tmp_path / "c.json") == 0 and "of a diameter" not in capsys.readouterr().out
+
+
 def test_check_passes_a_good_camera_and_tells_its_limits(tmp_path, capsys):
     assert run("check", FORMATS / "stella.yaml", "--json") == 0
     document = json.loads(capsys.readouterr().out)

@@ -20,6 +20,8 @@ import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import read_columns, read_points
+from pipefish.measure import measure
+from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
 from synthetic import BOOT, SURVEY, Object, as_object, picture, write_survey
 from test_page import Outline, data_of
@@ -40,9 +42,10 @@ def objects_of(
     frames: np.ndarray | None = None,
     nominal: float = 0.3,
     seed: int = 3,
+    settled: float = 0.0,
 ) -> list[Object]:
     """The objects of a drive as a device sends them. keep: (observations,) bool; gain: of the encoder; frames: which,
-    in the order given; seed: of the encoder's noise."""
+    in the order given; seed: of the encoder's noise; settled: pixels by which places were moved, and told to be."""
     order = np.arange(len(drive.poses)) if frames is None else frames
     camera, jpeg = drive.camera, picture(16, 16, 0)
     begin = pb.SurveyStart(survey_id=SURVEY, name="made-up pipe", software="test", width=camera.width)
@@ -69,7 +72,11 @@ def objects_of(
         here = here[np.argsort(tracks.track[here])]
         ids, obs = tracks.track[here] + 1, message.observations
         obs.id_delta.extend(np.diff(ids, prepend=0).tolist())
-        xy = np.round(tracks.pixels[here] * 65536).astype(int)
+        shift = np.round(settled * 256 * random.normal(0, 1, (len(here), 2))).astype(int) if settled else None
+        xy = np.round(tracks.pixels[here] * 65536).astype(int) + (256 * shift if settled else 0)
+        if settled:
+            obs.settled_x_q8.extend(shift[:, 0].tolist())
+            obs.settled_y_q8.extend(shift[:, 1].tolist())
         obs.x_q16.extend(xy[:, 0].tolist())
         obs.y_q16.extend(xy[:, 1].tolist())
         for name, value in (("cov_xx_q20", 94372), ("cov_xy_q20", 0), ("cov_yy_q20", 94372)):  # 0.3 px
@@ -105,6 +112,15 @@ def out(drive: Drive, tmp_path_factory) -> Path:
 
 def document_of(out: Path) -> dict:
     return json.loads((out / "reconstruction.json").read_text())
+
+
+def test_places_are_taken_where_they_were_found(drive: Drive, tmp_path: Path) -> None:
+    """And not where the device moved them to, here 0.5 px in all directions: it knows the wall less well than the tube
+    that is fitted to all of it."""
+    path = survey_of(drive, tmp_path / "survey.mcap", settled=0.5)
+    tracks = measure(Survey.open(path)).tracks
+    np.testing.assert_allclose(tracks.pixels, drive.tracks.pixels, atol=1e-5)
+    assert np.median(tracks.covariance[:, 0, 0]) > 0.09 + 0.05  # 0.3 px, and half of those 0.5 px at the median
 
 
 def failure(capsys, *arguments: object) -> str:

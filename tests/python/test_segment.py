@@ -31,6 +31,7 @@ from segment_scenes import (
 )
 
 SIZE = {"width": 240, "height": 180}
+STEPS = ((1, 0), (0, 1), (1, 1), (-1, 1))  # to the neighbours that a pixel's weights are of
 
 
 def labelling(rng: np.random.Generator) -> tuple:
@@ -38,29 +39,26 @@ def labelling(rng: np.random.Generator) -> tuple:
     n = 16
     cost = rng.integers(0, 60, (3, n)).astype(np.int32)
     cost[1:][rng.random((2, n)) < 0.15] = 1_000_000
-    edges = []
-    for image in (0, 8):
-        for y in range(2):
-            for x in range(4):
-                p = image + 4 * y + x
-                edges += [(p, p + 1)] if x < 3 else []
-                edges += [(p, p + 4)] if y < 1 else []
-                edges += [(p, p + 5)] if x < 3 and y < 1 else []
-    ends = np.array(edges, np.int32)
-    weight = rng.integers(0, 40, len(ends)).astype(np.int32)
+    weight = rng.integers(0, 40, (2, 2, 4, 4)).astype(np.int32)  # image, y, x, the neighbour
+    for k, (dx, dy) in enumerate(STEPS):
+        weight[:, :, 3 if dx > 0 else 0, k] *= dx == 0
+        weight[:, 1, :, k] *= dy == 0
     partner = np.full((3, n), -1, np.int32)
     partner[1:, :8], partner[1:, 8:] = rng.integers(8, 16, (2, 8)), rng.integers(0, 8, (2, 8))
     partner[1:][rng.random((2, n)) < 0.2] = -1
     labels = rng.integers(0, 3, n)
     labels[cost[labels, np.arange(n)] >= 1_000_000] = 0
-    return cost, ends, weight, partner, int(rng.integers(0, 30)), labels.astype(np.uint8)
+    return cost, 4, weight.reshape(2, 8, 4), partner, int(rng.integers(0, 30)), labels.astype(np.uint8)
 
 
-def energies(cost, ends, weight, partner, lonely, labels) -> np.ndarray:
+def energies(cost, width, weight, partner, lonely, labels) -> np.ndarray:
     """(M,) of labels (M,N), by the definition."""
     n = np.arange(labels.shape[1])
     out = cost[labels, n].sum(axis=1, dtype=np.int64)
-    out += ((labels[:, ends[:, 0]] != labels[:, ends[:, 1]]) * weight).sum(axis=1)
+    pixels = weight.shape[1]
+    for image, p, k in np.argwhere(weight > 0):
+        one = image * pixels + p
+        out += (labels[:, one] != labels[:, one + STEPS[k][0] + width * STEPS[k][1]]) * int(weight[image, p, k])
     to = partner[labels, n]
     alone = (labels > 0) & (to >= 0) & (np.take_along_axis(labels, np.maximum(to, 0), axis=1) != labels)
     return out + lonely * alone.sum(axis=1)

@@ -18,7 +18,7 @@ import pipefish as pf
 from pipefish import _engine, health, selfcal_input
 from pipefish.cli import main
 from pipefish.health import _chi2_tail
-from pipefish.selfcal import _reason, _status, self_calibrate
+from pipefish.selfcal import _reason, _status, self_calibrate, stored_alpha_sigma
 from pipefish.structure import reconstruct
 from selfcal_drives import ENCODER, health_of, survey
 from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup, random_lens
@@ -39,6 +39,7 @@ def test_two_pairs_find_the_lens(kind):
     assert math.degrees(error) < 0.5
     assert found.sigma == pytest.approx(0.5, rel=0.15)
     assert found.camera.provenance.views == 3
+    assert stored_alpha_sigma(found.camera) == pytest.approx(found.alpha_sigma, rel=0.05)  # of two digits
     assert found.camera.rms_px == found.rms == pytest.approx(0.5, rel=0.2)
     for pair, right in zip(found.pairs, setup.right, strict=True):
         assert (pair.inlier & right).sum() > 0.95 * right.sum()

@@ -13,7 +13,8 @@ from PIL import Image
 
 from pipefish.cli import main
 from pipefish.errors import FormatError
-from pipefish.simulate import Scene, contact_sheet, picture, scenarios, simulate, studio_scenarios
+from pipefish.simulate import Scene, scenarios, simulate, studio_scenarios
+from pipefish.simulate_pictures import contact_sheet, picture
 
 STEADY = {"wobble_m": 0, "wobble_rad": 0}
 

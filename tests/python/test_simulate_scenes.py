@@ -13,7 +13,8 @@ from PIL import Image
 
 from pipefish.cli import main
 from pipefish.errors import ArgumentError, FormatError, PipefishError
-from pipefish.simulate import picture, read_scene, simulate, studio_scenarios
+from pipefish.simulate import read_scene, simulate, studio_scenarios
+from pipefish.simulate_pictures import picture
 from pipefish.studio import Picture, Studio, Texture, facing, listed, pattern, pose, raster, rotation
 from pipefish.studio_files import SCENARIOS, checked
 from pipefish.studio_objects import simulate_objects

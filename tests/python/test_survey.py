@@ -84,6 +84,31 @@ def test_tracks_are_sorted_and_distinct_over_boots(tmp_path):
     assert survey.info["boots"] == 2
 
 
+def test_tracks_can_be_had_where_they_were_found(tmp_path):
+    """A tracker that moves places towards what their neighbours say tells by how much; older ones say nothing of it."""
+    path, moved = tmp_path / "a.mcap", []
+    for index in range(3):
+        message = pb.Keyframe.FromString(keyframe(index)[2])
+        if index:
+            message.observations.settled_x_q8.extend(range(-20, 20))
+            message.observations.settled_y_q8.extend([64] * 40)
+        moved.append(as_object(OBJECT_KEYFRAME, message))
+    write_survey(path, objects=[start(), *moved, end(3)])
+    survey = Survey.open(path)
+    told, found = survey.tracks(), survey.tracks(as_found=True)
+    shift = told.pixels - found.pixels
+    for index, frame in enumerate(survey.keyframes):
+        here = told.frame == index
+        assert np.array_equal(told.id[told.track[here]], frame.observations.id)
+        wanted = np.column_stack([np.arange(-20, 20) / 256, np.full(40, 0.25)]) * (index > 0)
+        np.testing.assert_array_equal(shift[here], wanted)
+    # By what a place was moved its place is uncertain, along that way and no other.
+    np.testing.assert_allclose(found.covariance - told.covariance, shift[:, :, None] * shift[:, None, :], atol=1e-12)
+    message.observations.settled_x_q8.pop()
+    with pytest.raises(ValueError, match="settled"):
+        Observations.from_message(message.observations)
+
+
 def test_chainage_goes_on_over_a_restart_with_the_scale_of_each_boot(tmp_path):
     """The second boot counts from zero, twice as finely; its first keyframe has no count yet."""
 

@@ -174,6 +174,74 @@ def test_a_heap_whose_far_flank_shows_few_points_is_told_at_its_middle() -> None
     assert abs(found["height"] - 0.012) < 0.002
 
 
+class Heap(Pipe):
+    """A pipe with a heap of any form: height by (x, y) from -1 to 1 along and around, lumpy by 4 % of it."""
+
+    heap: tuple[float, float, float, float, float] = (0.0, 0.0, 1.0, 1.0, 0.0)  # chainage, clock, length, angle, height
+
+    @staticmethod
+    def form(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def radius(self, s: np.ndarray, clock: np.ndarray) -> np.ndarray:
+        at, where, length, angle, height = self.heap
+        x, y = (s - at) * 2 / length, ((clock - where + np.pi) % (2 * np.pi) - np.pi) * 2 / angle
+        lumps = 1 + 0.04 * np.random.default_rng(self.seed + 5).normal(0, 1, len(s))
+        return super().radius(s, clock) - height * self.form(x, y) * lumps
+
+
+def cone(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.clip(1 - np.hypot(x, y), 0, 1)
+
+
+def swept(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Steep before, drawn out behind its top at x = -0.4."""
+    along = np.where(x < -0.4, (x + 0.4) / 0.6, (x + 0.4) / 1.4)
+    return (np.clip(1 - along**2, 0, 1) * np.clip(1 - y**2, 0, 1)) ** 1.5
+
+
+def bank(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """With a flat top."""
+    return np.clip(1 - x**6, 0, 1) * np.clip(1 - y**4, 0, 1)
+
+
+def fades(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return (np.clip(1 - x**2, 0, 1) * np.clip(1 - y**2, 0, 1)) ** 3
+
+
+@pytest.mark.parametrize(
+    ("form", "diameter", "length", "angle", "height", "clock"),
+    [
+        (fades, 0.4, 1.3, 1.4, 0.06, 3.1),
+        (cone, 0.3, 1.2, 1.0, 0.07, 4.4),
+        (swept, 0.15, 1.8, 1.2, 0.08, 0.02),
+        (bank, 0.6, 1.9, 1.0, 0.03, 3.1),
+    ],
+)
+def test_few_points_tell_where_a_heap_of_any_form_lies_and_how_large_it_is(
+    form, diameter: float, length: float, angle: float, height: float, clock: float
+) -> None:
+    """As many points as tracks leave of a drive, a third of them on the far side. Lengths and heights in diameters. By
+    its outermost points the first of these was told 40 mm off."""
+    pipe = Heap(diameter=diameter, length=8 * diameter, noise=0.0009 * diameter, outliers=0.03, seed=11)
+    pipe.form, pipe.heap = form, (4.3 * diameter, clock, length * diameter, angle, height * diameter)
+    points = pipe.points(3500)
+    rng, s = np.random.default_rng(7), points[:, 2]
+    away = (np.arctan2(points[:, 0], -points[:, 1]) - clock + np.pi) % (2 * np.pi) - np.pi
+    behind = (s > pipe.heap[0]) & (s < pipe.heap[0] + 0.5 * pipe.heap[2]) & (np.abs(away) < angle / 2)
+    tube = pf.fit_tube(points[~behind | (rng.random(len(s)) < 0.33)], pipe.noise, pipe.cameras(diameter / 8))
+    found = of_kind(tube, "deposit")
+    x = np.linspace(-1, 1, 2001)
+    high = x[height * form(x[:, None], np.linspace(-1, 1, 101)).max(axis=1) > tube_findings.LEAST_HEIGHT]
+    middle = pipe.heap[0] + 0.25 * (high[0] + high[-1]) * pipe.heap[2]
+    place = float(tube.project(np.array([[0, 0, middle]]))["s"][0])  # the wall begins where its first points lie
+    turn = (found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi
+    assert math.hypot(found["s"] - place, turn * diameter / 2) < 0.02
+    visible = 0.5 * (high[-1] - high[0]) * pipe.heap[2]
+    for value, true in ((found["length"], visible), (found["height"], pipe.heap[4])):
+        assert abs(value - true) < max(0.2 * true, 0.002)
+
+
 @pytest.mark.parametrize("link", [0.01, 0.08, 0.5, 3.0])
 def test_points_beside_a_rim_are_those_of_all_pairs(link: float) -> None:
     """Over the seam at twelve o'clock, and where few or one of the cells go round the pipe."""

@@ -1,4 +1,4 @@
-/* Patches of a tube's wall bend as the lens says, and tracks that know it do not drift. */
+/* Patches of a tube's wall bend as the lens says, and tracks that know it do not drift; none begins too late. */
 #include "../../lib/track/track_private.h"
 #include "tube_scene.h"
 #include "unity.h"
@@ -153,6 +153,43 @@ static void test_tracks_that_know_the_lens_do_not_drift(void)
     TEST_ASSERT_TRUE(drift(false) < -0.035);
 }
 
+/* How far from the circle's centre, px, new tracks begin at most, once the flow is known: by `way` texels a frame. */
+static double farthest_new(bool with_lens, double way)
+{
+    pf_tracker_config config = tube_config;
+    pf_tracker *tracker;
+    tube_view view = tube_usual;
+    double most = 0;
+    if (with_lens)
+        config.lens = pf_track_lens_of(table, camera);
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_init(&tracker, &config, workspace, sizeof workspace));
+    for (uint32_t k = 0; k < FRAMES; k++, view.z += way) {
+        uint32_t n;
+        tube_render(frame[k % 2u], &view);
+        TEST_ASSERT_EQUAL_INT(
+            PF_OK, pf_tracker_frame(tracker, &(pf_image){frame[k % 2u], TUBE_W, TUBE_H, TUBE_W}, NULL, NULL));
+        const pf_track *track = pf_tracker_tracks(tracker, &n);
+        for (uint32_t i = 0; i < n && k > 1; i++)
+            if (track[i].status == PF_TRACK_NEW)
+                most = fmax(most, hypot(track[i].pos.x / 65536.0 - TUBE_W / 2, track[i].pos.y / 65536.0 - TUBE_H / 2));
+    }
+    return most;
+}
+
+/* Proves: in a tube whose wall comes out, tracks begin up to where half a radius of way is left before a window reaches
+ * the rim (two steps of keyframes), and not beyond; where the wall goes in, or no lens is known, up to the outer
+ * eighth.
+ */
+static void test_nothing_begins_that_is_gone_before_the_third_keyframe(void)
+{
+    const double rim = (TUBE_CIRCLE - 11) / TUBE_FOCAL; /* where a window of 15 fits in */
+    const double late = TUBE_FOCAL * atan2(1, 1 / tan(rim) + 0.5), outer = TUBE_CIRCLE * 7 / 8;
+    const double out = farthest_new(true, 2.5), in = farthest_new(true, -2.5), plain = farthest_new(false, 2.5);
+    TEST_ASSERT_TRUE(out > late - 3 && out < late + 0.1);
+    TEST_ASSERT_TRUE(in > outer - 3 && in < outer + 0.1);
+    TEST_ASSERT_TRUE(plain > outer - 3 && plain < outer + 0.1);
+}
+
 int main(void)
 {
     tube_make();
@@ -161,5 +198,6 @@ int main(void)
     RUN_TEST(test_the_light_turns_as_the_cotangent_falls);
     RUN_TEST(test_there_is_no_bow_where_the_lens_tells_nothing);
     RUN_TEST(test_tracks_that_know_the_lens_do_not_drift);
+    RUN_TEST(test_nothing_begins_that_is_gone_before_the_third_keyframe);
     return UNITY_END();
 }

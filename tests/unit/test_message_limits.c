@@ -104,6 +104,7 @@ static void test_keyframe_bound_holds_for_the_largest_numbers(void)
         tracks[i].pos = (pf_point_q16){INT32_MIN, INT32_MIN};
         tracks[i].cov_xy_q20 = INT32_MIN;
         tracks[i].status = PF_TRACK_TRACKED;
+        tracks[i].settled_x_q8 = tracks[i].settled_y_q8 = INT16_MIN;
     }
     tracks[0].id = 1;
     memset(reason, 'x', sizeof reason);

@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xD58CC961u
+#define GOLDEN 0xACF17C51u
 
 void setUp(void) {}
 void tearDown(void) {}

@@ -125,6 +125,13 @@ static void test_a_slow_camera_finds_it_too(void)
     memcpy(settled, track, sizeof settled);
     pf_wall_settle(&wall, settled, TRACKS, pf_track_project, camera);
     TEST_ASSERT_EQUAL_UINT32(32768, wall.light_q16);
+    uint32_t moved = 0;
+    for (uint32_t i = 0; i < TRACKS; i++) { /* and it is told by how much, so that the place can be had as it was */
+        TEST_ASSERT_EQUAL_INT32(track[i].pos.x, settled[i].pos.x - 256 * settled[i].settled_x_q8);
+        TEST_ASSERT_EQUAL_INT32(track[i].pos.y, settled[i].pos.y - 256 * settled[i].settled_y_q8);
+        moved += settled[i].settled_x_q8 != 0 || settled[i].settled_y_q8 != 0;
+    }
+    TEST_ASSERT_GREATER_THAN_UINT32(TRACKS / 2, moved);
     for (uint32_t i = 0; i < TRACKS; i++)
         TEST_ASSERT_TRUE(i == 30 ||
                          hypot(settled[i].pos.x - track[i].pos.x, settled[i].pos.y - track[i].pos.y) < 19661);

@@ -20,7 +20,7 @@ namespace
 {
 
 using Table = nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Line = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Weights = nb::ndarray<const int32_t, nb::shape<-1, -1, 4>, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 std::vector<std::vector<int32_t>> rows_of(const Table &table)
@@ -31,17 +31,23 @@ std::vector<std::vector<int32_t>> rows_of(const Table &table)
     return out;
 }
 
-nb::tuple expand_one(const Table &cost, const Table &ends, const Line &weight, const Table &partner, int lonely,
-                     int alpha, const Bytes &start)
+nb::tuple expand_one(const Table &cost, int width, const Weights &weight, const Table &partner, int lonely, int alpha,
+                     const Bytes &start)
 {
-    Problem problem{rows_of(cost), {}, rows_of(partner), lonely};
-    for (size_t e = 0; e < ends.shape(0); e++)
-        problem.edges.push_back({ends(e, 0), ends(e, 1), weight(e)});
+    std::vector<Grid> grids(weight.shape(0), {width, {}});
+    Problem problem{{}, rows_of(cost), rows_of(partner), lonely};
+    for (size_t k = 0; k < grids.size(); k++) {
+        for (size_t p = 0; p < weight.shape(1); p++)
+            grids[k].cost.push_back({weight(k, p, 0), weight(k, p, 1), weight(k, p, 2), weight(k, p, 3)});
+        problem.grids.push_back(&grids[k]);
+    }
     Labels labels(start.data(), start.data() + start.shape(0));
     if (alpha >= 0)
         expand_once(problem, alpha, labels);
-    else
-        expand(problem, 100, labels);
+    else {
+        std::vector<Flows> flows;
+        expand(problem, 100, labels, flows);
+    }
     return nb::make_tuple(to_numpy<uint8_t>(labels.data(), {labels.size()}), problem.energy(labels));
 }
 
@@ -190,10 +196,12 @@ void bind_segment(nb::module_ &m)
           nb::arg("affine"), nb::arg("zncc"), nb::arg("label"), nb::arg("triangles"), nb::arg("triangle_group"),
           nb::arg("options"), nb::arg("progress"),
           "Planes (C,H,W) of both pictures, matches, their groups -> dict of labels1, labels2, layers, trace.");
-    m.def("segment_expand", &expand_one, nb::arg("cost"), nb::arg("edges"), nb::arg("weight"), nb::arg("partner"),
-          nb::arg("lonely"), nb::arg("alpha"), nb::arg("labels"),
-          "Costs (labels,N), edges (E,2) with weights (E,), partners (labels,N), cost of being alone, label to expand "
-          "(-1: all, until none gains), labels (N,) -> labels (N,), their energy. For tests.");
+    m.def(
+        "segment_expand", &expand_one, nb::arg("cost"), nb::arg("width"), nb::arg("weight"), nb::arg("partner"),
+        nb::arg("lonely"), nb::arg("alpha"), nb::arg("labels"),
+        "Costs (labels,N), width of the images, weights (images,N/images,4) of each pixel's differing from that right "
+        "of it, below, below to the right and to the left, partners (labels,N), cost of being alone, label to expand "
+        "(-1: all, until none gains), labels (N,) -> labels (N,), their energy. For tests.");
     m.def(
         "segment_halved", &halved, nb::arg("box"), nb::arg("spacing"), nb::arg("d"), nb::arg("at"),
         "Box (x, y, width, height), pixels between the points of its grid, displacements (M,2) of these (of which as "

@@ -1,9 +1,10 @@
 // Rigid motions as calibration uses them: X' = R X + t, perturbed from the left: R <- exp(w) R, t <- t + d.
 #pragma once
 
+#include "linalg/linalg.hpp"
+
 #include <Eigen/Core>
 #include <Eigen/Geometry>
-#include <Eigen/SVD>
 
 namespace pipefish::calib
 {
@@ -18,12 +19,12 @@ inline Eigen::Matrix3d cross(const Eigen::Vector3d &v)
 // The rotation next to a matrix that is nearly one.
 inline Eigen::Matrix3d nearest_rotation(const Eigen::Matrix3d &m)
 {
-    const Eigen::JacobiSVD<Eigen::Matrix3d> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
-    Eigen::Matrix3d u = svd.matrixU();
-    if ((u * svd.matrixV().transpose()).determinant() < 0.0) {
+    const linalg::Svd svd = linalg::svd(m);
+    Eigen::Matrix3d u = svd.u;
+    if ((u * svd.v.transpose()).determinant() < 0.0) {
         u.col(2) *= -1.0;
     }
-    return u * svd.matrixV().transpose();
+    return u * svd.v.transpose();
 }
 
 struct Pose {

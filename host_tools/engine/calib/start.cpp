@@ -1,6 +1,9 @@
 #include "calib/start.hpp"
 
-#include <Eigen/Eigenvalues>
+#include "linalg/linalg.hpp"
+
+#include <Eigen/Cholesky>
+#include <Eigen/LU>
 
 #include <algorithm>
 #include <array>
@@ -30,12 +33,12 @@ std::optional<Eigen::Matrix<double, 3, D>> direct_linear(const std::vector<Eigen
             }
         }
     }
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, n, n>> solver(normal);
-    const auto &values = solver.eigenvalues();
-    if (solver.info() != Eigen::Success || !(values[1] > 1e-12 * values[n - 1])) {
+    const linalg::SymmetricEigen<n> eigen = linalg::symmetric_eigen<n>(normal);
+    const auto &values = eigen.values;
+    if (!eigen.converged || !(values[1] > 1e-12 * values[n - 1])) {
         return std::nullopt; // more than one null vector
     }
-    const Eigen::Matrix<double, n, 1> vector = solver.eigenvectors().col(0);
+    const Eigen::Matrix<double, n, 1> vector = eigen.vectors.col(0);
     Eigen::Matrix<double, 3, D> h;
     for (int a = 0; a < D; a++) {
         h.col(a) = vector.template segment<3>(3 * a);

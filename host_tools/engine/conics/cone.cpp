@@ -1,5 +1,7 @@
 #include "conics.hpp"
 
+#include "linalg/linalg.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
@@ -16,7 +18,7 @@ using Eigen::Vector3d;
 // A rotation that turns a direction to +z.
 Matrix3d turned_to_z(const Vector3d &direction)
 {
-    return Eigen::Quaterniond::FromTwoVectors(direction, Vector3d::UnitZ()).toRotationMatrix();
+    return linalg::turn_between(direction, Vector3d::UnitZ()).toRotationMatrix();
 }
 
 } // namespace
@@ -43,13 +45,14 @@ Matrix3d fit_cone(const std::vector<Vector3d> &rays)
 
 std::vector<DiscPose> disc_poses(const Matrix3d &cone, const Vector3d &inside, double radius)
 {
-    const Eigen::SelfAdjointEigenSolver<Matrix3d> eigen(inside.dot(cone * inside) > 0 ? Matrix3d(-cone) : cone);
+    const linalg::SymmetricEigen<3> eigen =
+        linalg::symmetric_eigen<3>(inside.dot(cone * inside) > 0 ? Matrix3d(-cone) : cone);
     // Ascending: the negative one along the cone's axis, then two positive ones.
-    const Vector3d l(eigen.eigenvalues()[2], eigen.eigenvalues()[1], eigen.eigenvalues()[0]);
+    const Vector3d l(eigen.values[2], eigen.values[1], eigen.values[0]);
     if (!(l[2] < 0 && l[1] > 0) || !(radius > 0))
         throw std::invalid_argument("not a cone around a disc");
     Matrix3d axes;
-    axes << eigen.eigenvectors().col(2), eigen.eigenvectors().col(1), eigen.eigenvectors().col(0);
+    axes << eigen.vectors.col(2), eigen.vectors.col(1), eigen.vectors.col(0);
     // Planes that cut the cone in circles contain its middle axis (of l[1]); two of them, mirror images.
     const double across = std::sqrt(std::max((l[0] - l[1]) / (l[0] - l[2]), 0.0));
     const double along = std::sqrt(std::max((l[1] - l[2]) / (l[0] - l[2]), 0.0));
@@ -151,8 +154,8 @@ Pose pose_of_discs(const Discs &discs)
     h *= (ahead < 0 ? -2.0 : 2.0) / (h.col(0).norm() + h.col(1).norm());
     Matrix3d r;
     r << h.col(0), h.col(1), h.col(0).cross(h.col(1));
-    const Eigen::JacobiSVD<Matrix3d> svd(r, Eigen::ComputeFullU | Eigen::ComputeFullV);
-    Motion m{svd.matrixU() * svd.matrixV().transpose(), h.col(2)};
+    const linalg::Svd svd = linalg::svd(r);
+    Motion m{svd.u * svd.v.transpose(), h.col(2)};
     if (m.r.determinant() < 0)
         throw std::invalid_argument("the discs' outlines determine no pose");
     Eigen::VectorXd e = angles(m, discs);

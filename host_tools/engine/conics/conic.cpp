@@ -1,5 +1,7 @@
 #include "conics.hpp"
 
+#include "linalg/linalg.hpp"
+
 #include <cmath>
 #include <stdexcept>
 
@@ -32,9 +34,9 @@ Eigen::Matrix3d fit_ellipse(const std::vector<Eigen::Vector2d> &points)
     const Eigen::Matrix3d m = s1 + s2 * t;
     Eigen::Matrix3d reduced;
     reduced << m.row(2) / 2, -m.row(1), m.row(0) / 2;
-    const Eigen::EigenSolver<Eigen::Matrix3d> eigen(reduced);
+    const linalg::GeneralEigen eigen = linalg::general_eigen(reduced);
     for (int k = 0; k < 3; k++) {
-        const Eigen::Vector3d a = eigen.eigenvectors().col(k).real();
+        const Eigen::Vector3d a = eigen.vectors.col(k).real();
         if (4 * a[0] * a[2] - a[1] * a[1] <= 0)
             continue;
         const Eigen::Vector3d b = t * a;
@@ -68,12 +70,12 @@ std::vector<Eigen::Vector2d> ellipse_points(const Eigen::Matrix3d &conic, int co
         throw std::invalid_argument("not a real ellipse");
     const double level = -(conic(2, 2) + conic.topRightCorner<2, 1>().dot(middle));
     const Eigen::Matrix2d shape = conic.topLeftCorner<2, 2>() / level;
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(shape);
+    const linalg::SymmetricEigen<2> eigen = linalg::symmetric_eigen<2>(shape);
     std::vector<Eigen::Vector2d> points;
     for (int k = 0; k < count; k++) {
         const double angle = 2 * M_PI * k / count;
         const Eigen::Vector2d unit(std::cos(angle), std::sin(angle));
-        points.emplace_back(middle + eigen.eigenvectors() * unit.cwiseQuotient(eigen.eigenvalues().cwiseSqrt()));
+        points.emplace_back(middle + eigen.vectors * unit.cwiseQuotient(eigen.values.cwiseSqrt()));
     }
     return points;
 }

@@ -1,5 +1,7 @@
 #include "conics.hpp"
 
+#include "linalg/linalg.hpp"
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -81,11 +83,11 @@ Matrix3d linear(const Conics &from, const Conics &to)
                     }
             normal += weight * rows.transpose() * rows;
         }
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 9, 9>> eigen(normal);
+    const linalg::SymmetricEigen<9> eigen = linalg::symmetric_eigen<9>(normal);
     // A second vanishing direction: all conics in one pencil, or alike under a family of maps.
-    if (eigen.eigenvalues()[1] < 1e-12 * eigen.eigenvalues()[8])
+    if (eigen.values[1] < 1e-12 * eigen.values[8])
         throw std::invalid_argument("the conics leave a family of homographies (such as concentric circles do)");
-    const Eigen::Matrix<double, 9, 1> h = eigen.eigenvectors().col(0);
+    const Eigen::Matrix<double, 9, 1> h = eigen.vectors.col(0);
     Matrix3d out;
     out << h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], h[8];
     return with_unit_determinant(out);
@@ -163,9 +165,9 @@ struct Pencil { // eigenvalues of C1^-1 C2, the real one first if only one is, e
 
 Pencil pencil(const Conics &c)
 {
-    const Eigen::EigenSolver<Matrix3d> eigen(Matrix3d(c[0].inverse() * c[1]));
+    const linalg::GeneralEigen eigen = linalg::general_eigen(c[0].inverse() * c[1]);
     std::array<int, 3> order = {0, 1, 2};
-    const auto value = [&](int k) { return eigen.eigenvalues()[k]; };
+    const auto value = [&](int k) { return eigen.values[k]; };
     Pencil p;
     for (int k = 0; k < 3; k++)
         p.real = p.real && value(k).imag() == 0.0;
@@ -177,7 +179,7 @@ Pencil pencil(const Conics &c)
     double size = 0.0, gap = INFINITY;
     for (int k = 0; k < 3; k++) {
         p.values[size_t(k)] = value(order[size_t(k)]);
-        p.vectors.col(k) = eigen.eigenvectors().col(order[size_t(k)]);
+        p.vectors.col(k) = eigen.vectors.col(order[size_t(k)]);
         size = std::max(size, std::abs(p.values[size_t(k)]));
     }
     for (size_t k = 0; k < 3; k++)

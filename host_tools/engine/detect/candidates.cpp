@@ -1,6 +1,7 @@
 #include "candidates.hpp"
 
 #include "disc.hpp"
+#include "linalg/linalg.hpp"
 
 #include <opencv2/imgproc.hpp>
 
@@ -134,8 +135,8 @@ bool blob_of(const std::vector<cv::Point> &outline, const cv::Mat &image, Blob &
     Eigen::Matrix2d second;
     second << m.mu20, m.mu11, m.mu11, m.mu02;
     second /= m.m00;
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> eigen(second);
-    const Eigen::Vector2d half = 2.0 * eigen.eigenvalues().cwiseMax(0.0).cwiseSqrt();
+    const linalg::SymmetricEigen<2> eigen = linalg::symmetric_eigen<2>(second);
+    const Eigen::Vector2d half = 2.0 * eigen.values.cwiseMax(0.0).cwiseSqrt();
     if (half[0] < 0.9 || half[1] > 12 * half[0])
         return false;
     const double fill = m.m00 / (M_PI * half[0] * half[1]);
@@ -143,7 +144,7 @@ bool blob_of(const std::vector<cv::Point> &outline, const cv::Mat &image, Blob &
     const Eigen::Vector2d whole = half.array() + 0.5;
     if (std::abs(fill - 1.0) > (half[0] < 3 ? 0.2 : 0.08))
         return false;
-    blob.half_axes = eigen.eigenvectors() * whole.asDiagonal();
+    blob.half_axes = eigen.vectors * whole.asDiagonal();
     double outside = 0.0, inside = 0.0, least = 255.0;
     for (int k = 0; k < 16; k++) {
         const double angle = 2 * M_PI * k / 16;

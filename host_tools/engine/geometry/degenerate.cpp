@@ -3,9 +3,10 @@
 #include "counter_random.hpp"
 #include "geometry/minimal.hpp"
 #include "geometry/two_view.hpp"
+#include "linalg/linalg.hpp"
 
 #include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
+#include <Eigen/LU>
 
 #include <algorithm>
 #include <cmath>
@@ -127,8 +128,7 @@ Matrix3d find_homography(std::span<const Sight> a, std::span<const Sight> b, std
             }
         }
     }
-    const Eigen::SelfAdjointEigenSolver<Matrix9> eigen(normal);
-    const Eigen::Matrix<double, 9, 1> flat = eigen.eigenvectors().col(0);
+    const Eigen::Matrix<double, 9, 1> flat = linalg::symmetric_eigen<9>(normal).vectors.col(0);
     Matrix3d h = Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(flat.data());
     int forward = 0;
     for (const int i : pairs) {

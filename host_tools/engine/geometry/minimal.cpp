@@ -1,6 +1,8 @@
 #include "geometry/minimal.hpp"
 
-#include <Eigen/Eigenvalues>
+#include "linalg/linalg.hpp"
+
+#include <Eigen/LU>
 #include <Eigen/QR>
 
 #include <cmath>
@@ -322,14 +324,14 @@ Few<Pose, 4> three_point(const std::array<Vector3d, 3> &f, const std::array<Vect
         }
         form = roots.item[0] * d1 - d2;
     }
-    const Eigen::SelfAdjointEigenSolver<Matrix3d> eigen(form);
-    const Vector3d values = eigen.eigenvalues();
+    const linalg::SymmetricEigen<3> eigen = linalg::symmetric_eigen<3>(form);
+    const Vector3d &values = eigen.values;
     if (!(values[0] < 0.0 && values[2] > 0.0)) {
         return solutions;
     }
     for (const double sign : {1.0, -1.0}) {
-        const Vector3d plane = std::sqrt(values[2]) * eigen.eigenvectors().col(2) +
-                               sign * std::sqrt(-values[0]) * eigen.eigenvectors().col(0);
+        const Vector3d plane =
+            std::sqrt(values[2]) * eigen.vectors.col(2) + sign * std::sqrt(-values[0]) * eigen.vectors.col(0);
         if (std::abs(plane[0]) < 1e-12) {
             continue;
         }

@@ -1,6 +1,8 @@
 #include "geometry/sight.hpp"
 
-#include <Eigen/SVD>
+#include "linalg/linalg.hpp"
+
+#include <Eigen/LU>
 
 #include <cmath>
 
@@ -48,9 +50,9 @@ Vector3d rotation_log(const Matrix3d &r)
 
 Matrix3d nearest_rotation(const Matrix3d &m)
 {
-    const Eigen::JacobiSVD<Matrix3d> svd(m, Eigen::ComputeFullU | Eigen::ComputeFullV);
-    const double sign = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0.0 ? -1.0 : 1.0;
-    return svd.matrixU() * Vector3d(1.0, 1.0, sign).asDiagonal() * svd.matrixV().transpose();
+    const linalg::Svd svd = linalg::svd(m);
+    const double sign = (svd.u * svd.v.transpose()).determinant() < 0.0 ? -1.0 : 1.0;
+    return svd.u * Vector3d(1.0, 1.0, sign).asDiagonal() * svd.v.transpose();
 }
 
 Matrix32 tangent_basis(const Vector3d &f)

@@ -157,4 +157,14 @@ private:
     ArrowFactor<E, F> factor_;
 };
 
+// The shapes in use are compiled once, in shapes.cpp.
+extern template class NormalMatrix<1, 1>;
+extern template class ArrowFactor<1, 1>;
+extern template class NormalMatrix<3, 6>;
+extern template class ArrowFactor<3, 6>;
+extern template class NormalMatrix<5, 1>;
+extern template class ArrowFactor<5, 1>;
+extern template class NormalMatrix<6, 1>;
+extern template class ArrowFactor<6, 1>;
+
 } // namespace pipefish::optim

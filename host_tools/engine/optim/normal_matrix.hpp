@@ -9,6 +9,7 @@
 // Sums are made in a fixed number of pieces, added in order: the same bits for any number of threads.
 #pragma once
 
+#include "optim/blocks.hpp"
 #include "optim/robust.hpp"
 #include "parallel.hpp"
 
@@ -57,52 +58,9 @@ public:
         // `rows` whitened residuals r that share one robust loss. j_e: rows x E or null; f[k] with j_f[k], rows x F;
         // j_g: rows x border() or null. All row-major.
         void add(int rows, const double *r, const RobustLoss &loss, const double *j_e, std::span<const int> f,
-                 std::span<const double *const> j_f, const double *j_g)
-        {
-            double s = 0.0;
-            for (int i = 0; i < rows; i++) {
-                s += r[i] * r[i];
-            }
-            const double weight = loss(s).weight;
-            const RowsMap<1> residual(r, rows, 1);
-            const RowsMap<E> je(j_e, j_e ? rows : 0, E);
-            const int g = static_cast<int>(owner_->border);
-            const RowsMap<Eigen::Dynamic> jg(j_g, j_g ? rows : 0, g);
-            if (j_e) {
-                owner_->h_ee[e_].noalias() += weight * (je.transpose() * je);
-                owner_->b_e[e_].noalias() += weight * (je.transpose() * residual);
-                if (j_g) {
-                    owner_->h_eg[e_].noalias() += weight * (je.transpose() * jg);
-                }
-            }
-            for (size_t k = 0; k < f.size(); k++) {
-                const RowsMap<F> jf(j_f[k], rows, F);
-                const size_t i = static_cast<size_t>(f[k]) - piece_->first;
-                piece_->b_f[i].noalias() += weight * (jf.transpose() * residual);
-                if (j_e) {
-                    owner_->coupling(e_, f[k]).noalias() += weight * (je.transpose() * jf);
-                }
-                if (j_g) {
-                    piece_->h_fg[i].noalias() += weight * (jf.transpose() * jg);
-                }
-                for (size_t l = 0; l < f.size(); l++) {
-                    if (f[l] <= f[k]) {
-                        const RowsMap<F> other(j_f[l], rows, F);
-                        piece_->h_ff[owner_->banded_at(i, static_cast<size_t>(f[k] - f[l]))].noalias() +=
-                            weight * (jf.transpose() * other);
-                    }
-                }
-            }
-            if (j_g) {
-                piece_->b_g.noalias() += weight * (jg.transpose() * residual);
-                piece_->h_gg.template selfadjointView<Eigen::Lower>().rankUpdate(jg.transpose(), weight);
-            }
-        }
+                 std::span<const double *const> j_f, const double *j_g);
 
     private:
-        template <int Columns>
-        using RowsMap = Eigen::Map<
-            const Eigen::Matrix<double, Eigen::Dynamic, Columns, Columns == 1 ? Eigen::ColMajor : Eigen::RowMajor>>;
         friend class NormalMatrix;
         NormalMatrix *owner_ = nullptr;
         Piece *piece_ = nullptr;
@@ -168,13 +126,7 @@ public:
         std::vector<Piece> pieces(PIECES + 1);
         parallel_for(PIECES + 1, threads, [&](int number) {
             Piece &piece = pieces[static_cast<size_t>(number)];
-            const auto [first, last] = touched(number);
-            piece.first = first;
-            piece.h_ff.assign((last - first) * (band + 1), MatrixF::Zero());
-            piece.h_fg.assign(last - first, MatrixFG::Zero(F, border));
-            piece.b_f.assign(last - first, VectorF::Zero());
-            piece.h_gg = Eigen::MatrixXd::Zero(border, border);
-            piece.b_g = Eigen::VectorXd::Zero(border);
+            clear(number, piece);
             Sink sink;
             sink.owner_ = this;
             sink.piece_ = &piece;
@@ -183,78 +135,26 @@ public:
                 return;
             }
             for (size_t e = first_of(number); e < first_of(number + 1); e++) {
-                h_ee[e].setZero();
-                b_e[e].setZero();
-                h_eg[e].setZero();
-                for (size_t k = w_offset[e]; k < w_offset[e + 1]; k++) {
-                    w[k].setZero();
-                }
                 sink.e_ = e;
                 problem.linearize(static_cast<int>(e), sink);
             }
         });
-        common = std::move(pieces[PIECES]);
-        for (size_t p = 0; p < PIECES; p++) {
-            const size_t first = pieces[p].first;
-            for (size_t i = 0; i < pieces[p].h_ff.size(); i++) {
-                common.h_ff[banded_at(first, 0) + i] += pieces[p].h_ff[i];
-            }
-            for (size_t i = 0; i < pieces[p].b_f.size(); i++) {
-                common.h_fg[first + i] += pieces[p].h_fg[i];
-                common.b_f[first + i] += pieces[p].b_f[i];
-            }
-            common.h_gg += pieces[p].h_gg;
-            common.b_g += pieces[p].b_g;
-        }
+        sum_up(pieces);
     }
 
     // Largest |gradient| over the square root of the Hessian's diagonal.
-    double scaled_gradient() const
-    {
-        double worst = 0.0;
-        for (size_t e = 0; e < count_e; e++) {
-            for (int i = 0; i < E; i++) {
-                worst = std::max(worst, scaled(b_e[e][i], h_ee[e](i, i)));
-            }
-        }
-        for (size_t f = 0; f < count_f; f++) {
-            for (int i = 0; i < F; i++) {
-                worst = std::max(worst, scaled(common.b_f[f][i], common.h_ff[banded_at(f, 0)](i, i)));
-            }
-        }
-        for (Eigen::Index i = 0; i < border; i++) {
-            worst = std::max(worst, scaled(common.b_g[i], common.h_gg(i, i)));
-        }
-        return worst;
-    }
+    double scaled_gradient() const;
 
     // Of the quadratic model: (step . (lambda diag step) - b . step) / 2.
-    double predicted_decrease(const Step<E, F> &step, double lambda) const
-    {
-        double sum = 0.0;
-        for (size_t e = 0; e < count_e; e++) {
-            sum -= b_e[e].dot(step.e[e]);
-            sum += lambda * step.e[e].dot(h_ee[e].diagonal().cwiseMax(1e-12).asDiagonal() * step.e[e]);
-        }
-        for (size_t f = 0; f < count_f; f++) {
-            sum -= common.b_f[f].dot(step.f[f]);
-            const VectorF diagonal = common.h_ff[banded_at(f, 0)].diagonal().cwiseMax(1e-12);
-            sum += lambda * step.f[f].dot(diagonal.asDiagonal() * step.f[f]);
-        }
-        sum -= common.b_g.dot(step.g);
-        const Eigen::VectorXd diagonal = common.h_gg.diagonal().cwiseMax(1e-12);
-        sum += lambda * step.g.dot(diagonal.asDiagonal() * step.g);
-        return 0.5 * sum;
-    }
+    double predicted_decrease(const Step<E, F> &step, double lambda) const;
 
-    Step<E, F> zero_step() const
-    {
-        return {std::vector<VectorE>(count_e, VectorE::Zero()), std::vector<VectorF>(count_f, VectorF::Zero()),
-                Eigen::VectorXd::Zero(border)};
-    }
+    Step<E, F> zero_step() const;
 
 private:
     static constexpr int PIECES = 16; // fixed: the sums' order must not depend on the number of threads
+
+    void clear(int number, Piece &piece);
+    void sum_up(std::vector<Piece> &pieces);
 
     MatrixEF &coupling(size_t e, int f)
     {
@@ -284,5 +184,131 @@ private:
         return diagonal > 0.0 ? std::abs(gradient) / std::sqrt(diagonal) : std::abs(gradient);
     }
 };
+
+// Not inside the class, where they would be inline: shapes.cpp compiles them once for all.
+
+template <int E, int F>
+void NormalMatrix<E, F>::Sink::add(int rows, const double *r, const RobustLoss &loss, const double *j_e,
+                                   std::span<const int> f, std::span<const double *const> j_f, const double *j_g)
+{
+    double s = 0.0;
+    for (int i = 0; i < rows; i++) {
+        s += r[i] * r[i];
+    }
+    const double weight = loss(s).weight;
+    const Eigen::Index g = owner_->border;
+    if (j_e) {
+        add_rows(owner_->h_ee[e_], weight, rows, j_e, j_e, E);
+        add_rows(owner_->b_e[e_], weight, rows, j_e, r, 1);
+        if (j_g) {
+            add_rows(owner_->h_eg[e_], weight, rows, j_e, j_g, g);
+        }
+    }
+    for (size_t k = 0; k < f.size(); k++) {
+        const size_t i = static_cast<size_t>(f[k]) - piece_->first;
+        add_rows(piece_->b_f[i], weight, rows, j_f[k], r, 1);
+        if (j_e) {
+            add_rows(owner_->coupling(e_, f[k]), weight, rows, j_e, j_f[k], F);
+        }
+        if (j_g) {
+            add_rows(piece_->h_fg[i], weight, rows, j_f[k], j_g, g);
+        }
+        for (size_t l = 0; l < f.size(); l++) {
+            if (f[l] <= f[k]) {
+                add_rows(piece_->h_ff[owner_->banded_at(i, static_cast<size_t>(f[k] - f[l]))], weight, rows, j_f[k],
+                         j_f[l], F);
+            }
+        }
+    }
+    if (j_g) {
+        for (int k = 0; k < rows; k++) {
+            for (Eigen::Index i = 0; i < g; i++) {
+                piece_->b_g[i] += weight * r[k] * j_g[k * g + i];
+            }
+        }
+        using Rows = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+        const Eigen::Map<const Rows> jg(j_g, rows, g);
+        piece_->h_gg.template selfadjointView<Eigen::Lower>().rankUpdate(jg.transpose(), weight);
+    }
+}
+
+template <int E, int F> void NormalMatrix<E, F>::clear(int number, Piece &piece)
+{
+    const auto [first, last] = touched(number);
+    piece.first = first;
+    piece.h_ff.assign((last - first) * (band + 1), MatrixF::Zero());
+    piece.h_fg.assign(last - first, MatrixFG::Zero(F, border));
+    piece.b_f.assign(last - first, VectorF::Zero());
+    piece.h_gg = Eigen::MatrixXd::Zero(border, border);
+    piece.b_g = Eigen::VectorXd::Zero(border);
+    for (size_t e = first_of(number); number < PIECES && e < first_of(number + 1); e++) {
+        h_ee[e].setZero();
+        b_e[e].setZero();
+        h_eg[e].setZero();
+        for (size_t k = w_offset[e]; k < w_offset[e + 1]; k++) {
+            w[k].setZero();
+        }
+    }
+}
+
+template <int E, int F> void NormalMatrix<E, F>::sum_up(std::vector<Piece> &pieces)
+{
+    common = std::move(pieces[PIECES]);
+    for (size_t p = 0; p < PIECES; p++) {
+        const size_t first = pieces[p].first;
+        for (size_t i = 0; i < pieces[p].h_ff.size(); i++) {
+            common.h_ff[banded_at(first, 0) + i] += pieces[p].h_ff[i];
+        }
+        for (size_t i = 0; i < pieces[p].b_f.size(); i++) {
+            common.h_fg[first + i] += pieces[p].h_fg[i];
+            common.b_f[first + i] += pieces[p].b_f[i];
+        }
+        common.h_gg += pieces[p].h_gg;
+        common.b_g += pieces[p].b_g;
+    }
+}
+
+template <int E, int F> double NormalMatrix<E, F>::scaled_gradient() const
+{
+    double worst = 0.0;
+    for (size_t e = 0; e < count_e; e++) {
+        for (int i = 0; i < E; i++) {
+            worst = std::max(worst, scaled(b_e[e][i], h_ee[e](i, i)));
+        }
+    }
+    for (size_t f = 0; f < count_f; f++) {
+        for (int i = 0; i < F; i++) {
+            worst = std::max(worst, scaled(common.b_f[f][i], common.h_ff[banded_at(f, 0)](i, i)));
+        }
+    }
+    for (Eigen::Index i = 0; i < border; i++) {
+        worst = std::max(worst, scaled(common.b_g[i], common.h_gg(i, i)));
+    }
+    return worst;
+}
+
+template <int E, int F> double NormalMatrix<E, F>::predicted_decrease(const Step<E, F> &step, double lambda) const
+{
+    double sum = 0.0;
+    const auto add = [&](const auto &b, const auto &h, const auto &by) {
+        for (Eigen::Index i = 0; i < b.size(); i++) {
+            sum += by[i] * (lambda * std::max(h(i, i), 1e-12) * by[i] - b[i]);
+        }
+    };
+    for (size_t e = 0; e < count_e; e++) {
+        add(b_e[e], h_ee[e], step.e[e]);
+    }
+    for (size_t f = 0; f < count_f; f++) {
+        add(common.b_f[f], common.h_ff[banded_at(f, 0)], step.f[f]);
+    }
+    add(common.b_g, common.h_gg, step.g);
+    return 0.5 * sum;
+}
+
+template <int E, int F> Step<E, F> NormalMatrix<E, F>::zero_step() const
+{
+    return {std::vector<VectorE>(count_e, VectorE::Zero()), std::vector<VectorF>(count_f, VectorF::Zero()),
+            Eigen::VectorXd::Zero(border)};
+}
 
 } // namespace pipefish::optim

@@ -1,9 +1,8 @@
 #include "segment/lattice.hpp"
 
-#include <Eigen/SparseCholesky>
-
 #include <algorithm>
 #include <cmath>
+#include <span>
 #include <stdexcept>
 
 namespace pipefish::segment
@@ -32,13 +31,14 @@ bool Lattice::holds(double x, double y) const
 Lattice::Spot Lattice::at(double x, double y) const
 {
     Spot out;
+    const double scale = 1 / spacing;
     const auto along = [&](double place, int from, int length, std::array<double, 4> &w, std::array<double, 4> &slope) {
-        const double u = std::clamp(place - from, 0.0, length - 1.0) / spacing;
+        const double u = std::clamp(place - from, 0.0, length - 1.0) * scale;
         const double cell = std::floor(u), t = u - cell, s = 1 - t;
         w = {s * s * s / 6, 2.0 / 3 - t * t * (1 - t / 2), 2.0 / 3 - s * s * (1 - s / 2), t * t * t / 6};
         slope = {-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2};
         for (double &v : slope)
-            v /= spacing;
+            v *= scale;
         return static_cast<size_t>(cell);
     };
     const size_t i = along(x, box.x, box.width, out.wx, out.dx), j = along(y, box.y, box.height, out.wy, out.dy);
@@ -98,97 +98,115 @@ Warp finer(const Warp &warp)
     return out;
 }
 
-Normal::Normal(const Lattice &lattice)
-    : lattice_(lattice), block_(lattice.points()),
-      right_(Eigen::VectorXd::Zero(static_cast<Eigen::Index>(2 * lattice.points())))
+namespace
 {
-    for (auto &b : block_)
-        b.fill(0);
+
+// Calls body(weight, first, {{dx, dy, factor}, ...}) for each second difference: of points that far from the first.
+struct Term {
+    int dx, dy;
+    double factor;
+};
+
+template <typename Body> void second_differences(const Lattice &lattice, const Body &body)
+{
+    constexpr Term across[] = {{0, 0, 1}, {1, 0, -2}, {2, 0, 1}}, down[] = {{0, 0, 1}, {0, 1, -2}, {0, 2, 1}};
+    constexpr Term twist[] = {{0, 0, 1}, {1, 0, -1}, {0, 1, -1}, {1, 1, 1}};
+    for (int j = 0; j < lattice.ny; j++)
+        for (int i = 0; i < lattice.nx; i++) {
+            const size_t p = static_cast<size_t>(j) * static_cast<size_t>(lattice.nx) + static_cast<size_t>(i);
+            if (i + 2 < lattice.nx)
+                body(1, p, std::span<const Term>(across));
+            if (j + 2 < lattice.ny)
+                body(1, p, std::span<const Term>(down));
+            if (i + 1 < lattice.nx && j + 1 < lattice.ny)
+                body(2, p, std::span<const Term>(twist));
+        }
+}
+
+size_t point_of(const Lattice &lattice, size_t first, const Term &term)
+{
+    return first + static_cast<size_t>(term.dy * lattice.nx + term.dx);
+}
+
+Vector2d difference(const Warp &warp, size_t first, std::span<const Term> terms)
+{
+    Vector2d sum = Vector2d::Zero();
+    for (const Term &t : terms)
+        sum += t.factor * warp.d.segment<2>(static_cast<Eigen::Index>(2 * point_of(warp.lattice, first, t)));
+    return sum;
+}
+
+} // namespace
+
+Normal::Normal(const Lattice &lattice, const std::shared_ptr<const Factor> &similar)
+    : lattice_(lattice),
+      system_(similar ? similar->pattern() : std::make_shared<const Pattern>(lattice.nx, lattice.ny, 3))
+{
+    for (size_t p = 0; p < lattice.points(); p++)
+        system_.add(p, 0, 0, 1e-6, 0, 1e-6); // where nothing holds a point
 }
 
 void Normal::add(const Lattice::Spot &at, const Matrix2d &q, const Vector2d &b)
 {
-    std::array<double, 16> w;
-    for (size_t k = 0; k < 16; k++)
-        w[k] = at.wx[k % 4] * at.wy[k / 4];
-    const double xx = q(0, 0), xy = q(0, 1), yy = q(1, 1);
+    if (!any_ || at.first != first_ || at.wy != wy_) {
+        flush();
+        first_ = at.first, wy_ = at.wy, any_ = true;
+        sum_.fill(Eigen::Array3d::Zero());
+        pull_.fill(Vector2d::Zero());
+    }
+    const Eigen::Array3d entries(q(0, 0), q(0, 1), q(1, 1));
+    for (size_t k = 0, pair = 0; k < 4; k++) {
+        pull_[k] += at.wx[k] * b;
+        for (size_t m = k; m < 4; m++, pair++)
+            sum_[pair] += at.wx[k] * at.wx[m] * entries;
+    }
+}
+
+void Normal::flush()
+{
+    if (!any_)
+        return;
+    constexpr size_t pair_of[4][4] = {{0, 1, 2, 3}, {1, 4, 5, 6}, {2, 5, 7, 8}, {3, 6, 8, 9}};
     for (size_t k = 0; k < 16; k++) {
-        const size_t point = at.first + (k / 4) * static_cast<size_t>(lattice_.nx) + k % 4;
-        right_[static_cast<Eigen::Index>(2 * point)] += w[k] * b.x();
-        right_[static_cast<Eigen::Index>(2 * point) + 1] += w[k] * b.y();
-        auto &block = block_[point];
+        const size_t i = k % 4, j = k / 4, point = first_ + j * static_cast<size_t>(lattice_.nx) + i;
+        system_.right().segment<2>(static_cast<Eigen::Index>(2 * point)) += wy_[j] * pull_[i];
         for (size_t m = k; m < 16; m++) {
-            const size_t rows = m / 4 - k / 4;
-            const size_t slot = rows == 0 ? m - k : 7 * rows + m % 4 - k % 4;
-            const double v = w[k] * w[m];
-            block[3 * slot] += v * xx;
-            block[3 * slot + 1] += v * xy;
-            block[3 * slot + 2] += v * yy;
+            const Eigen::Array3d v = wy_[j] * wy_[m / 4] * sum_[pair_of[i][m % 4]];
+            system_.add(point, static_cast<int>(m % 4) - static_cast<int>(i), static_cast<int>(m / 4 - j), v[0], v[1],
+                        v[2]);
         }
     }
+    any_ = false;
 }
 
-void Normal::bend(const Eigen::SparseMatrix<double> &k, double weight, const Eigen::VectorXd &d)
+Eigen::VectorXd Normal::solve(std::shared_ptr<const Factor> &similar)
 {
-    for (Eigen::Index column = 0; column < k.outerSize(); column++)
-        for (Eigen::SparseMatrix<double>::InnerIterator e(k, column); e; ++e)
-            for (Eigen::Index c = 0; c < 2; c++) {
-                right_[2 * e.row() + c] -= weight * e.value() * d[2 * e.col() + c];
-                if (e.row() >= e.col())
-                    extra_.emplace_back(2 * e.row() + c, 2 * e.col() + c, weight * e.value());
+    flush();
+    return system_.solve(similar);
+}
+
+void Normal::bend(const Warp &warp, double weight)
+{
+    second_differences(lattice_, [&](double share, size_t first, std::span<const Term> terms) {
+        const Vector2d pull = -weight * share * difference(warp, first, terms);
+        for (size_t k = 0; k < terms.size(); k++) {
+            const size_t p = point_of(lattice_, first, terms[k]);
+            system_.right().segment<2>(static_cast<Eigen::Index>(2 * p)) += terms[k].factor * pull;
+            for (size_t m = k; m < terms.size(); m++) {
+                const double v = weight * share * terms[k].factor * terms[m].factor;
+                system_.add(p, terms[m].dx - terms[k].dx, terms[m].dy - terms[k].dy, v, 0, v);
             }
+        }
+    });
 }
 
-Eigen::VectorXd Normal::solve() const
+double bending(const Warp &warp)
 {
-    std::vector<Eigen::Triplet<double>> entries = extra_;
-    const auto columns = static_cast<size_t>(lattice_.nx);
-    for (size_t p = 0; p < block_.size(); p++) {
-        entries.emplace_back(2 * p, 2 * p, 1e-6); // where nothing holds a point
-        entries.emplace_back(2 * p + 1, 2 * p + 1, 1e-6);
-        for (size_t slot = 0; slot < kSlots; slot++) {
-            const double *v = &block_[p][3 * slot];
-            if (v[0] == 0 && v[2] == 0)
-                continue;
-            const size_t rows = slot < 4 ? 0 : (slot + 3) / 7;
-            const size_t q = p + rows * columns + slot - 7 * rows;
-            entries.emplace_back(2 * q, 2 * p, v[0]);
-            entries.emplace_back(2 * q + 1, 2 * p, v[1]);
-            entries.emplace_back(2 * q + 1, 2 * p + 1, v[2]);
-            if (q != p)
-                entries.emplace_back(2 * q, 2 * p + 1, v[1]);
-        }
-    }
-    Eigen::SparseMatrix<double> matrix(right_.size(), right_.size());
-    matrix.setFromTriplets(entries.begin(), entries.end());
-    const Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>> factor(matrix);
-    if (factor.info() != Eigen::Success)
-        throw std::runtime_error("the normal equations of a layer's field are not positive");
-    return factor.solve(right_);
-}
-
-Eigen::SparseMatrix<double> bending(const Lattice &lattice)
-{
-    std::vector<Eigen::Triplet<double>> entries;
-    const auto add = [&](std::initializer_list<std::pair<int, double>> difference, double weight) {
-        for (const auto &[p, a] : difference)
-            for (const auto &[q, b] : difference)
-                entries.emplace_back(p, q, weight * a * b);
-    };
-    for (int j = 0; j < lattice.ny; j++)
-        for (int i = 0; i < lattice.nx; i++) {
-            const int p = j * lattice.nx + i, down = lattice.nx;
-            if (i + 2 < lattice.nx)
-                add({{p, 1}, {p + 1, -2}, {p + 2, 1}}, 1);
-            if (j + 2 < lattice.ny)
-                add({{p, 1}, {p + down, -2}, {p + 2 * down, 1}}, 1);
-            if (i + 1 < lattice.nx && j + 1 < lattice.ny)
-                add({{p, 1}, {p + 1, -1}, {p + down, -1}, {p + down + 1, 1}}, 2);
-        }
-    const auto n = static_cast<Eigen::Index>(lattice.points());
-    Eigen::SparseMatrix<double> out(n, n);
-    out.setFromTriplets(entries.begin(), entries.end());
-    return out;
+    double sum = 0;
+    second_differences(warp.lattice, [&](double share, size_t first, std::span<const Term> terms) {
+        sum += share / 2 * difference(warp, first, terms).squaredNorm();
+    });
+    return sum;
 }
 
 } // namespace pipefish::segment

@@ -1,8 +1,9 @@
 // Smooth fields over a rectangle of an image: values at the points of a regular grid, cubic B-splines between them.
 #pragma once
 
+#include "segment/system.hpp"
+
 #include <Eigen/Core>
-#include <Eigen/SparseCore>
 #include <opencv2/core.hpp>
 
 #include <array>
@@ -50,24 +51,30 @@ Warp finer(const Warp &warp);
 class Normal
 {
 public:
-    explicit Normal(const Lattice &lattice);
+    // `similar`: a factor of such equations over the lattice, or none.
+    Normal(const Lattice &lattice, const std::shared_ptr<const Factor> &similar);
 
     // Adds 1/2 v'Qv - b'v, with v the change of the displacement at a place; Q is symmetric.
     void add(const Lattice::Spot &at, const Matrix2d &q, const Vector2d &b);
-    // Adds weight/2 (d + change)' K (d + change) for both components.
-    void bend(const Eigen::SparseMatrix<double> &k, double weight, const Eigen::VectorXd &d);
-    // The change of least cost.
-    Eigen::VectorXd solve() const;
+    // Adds weight times the bending of the warp with its change.
+    void bend(const Warp &warp, double weight);
+    // The change of least cost, to a thousandth of it. `similar` is brought up to date where it does not serve.
+    Eigen::VectorXd solve(std::shared_ptr<const Factor> &similar);
 
 private:
-    static constexpr size_t kSlots = 25; // offsets (0..3, 0) and (-3..3, 1..3)
+    void flush();
+
     const Lattice &lattice_;
-    std::vector<std::array<double, 3 * kSlots>> block_; // [point][slot]: xx, xy, yy
-    Eigen::VectorXd right_;
-    std::vector<Eigen::Triplet<double>> extra_;
+    System system_;
+    // Sums over places along a row of a cell: of Q times the product of two weights along x, of b times each.
+    size_t first_ = 0;
+    std::array<double, 4> wy_ = {0, 0, 0, 0};
+    std::array<Eigen::Array3d, 10> sum_;
+    std::array<Vector2d, 4> pull_;
+    bool any_ = false;
 };
 
-// The matrix K of sum of squared second differences: d'Kd, for one component.
-Eigen::SparseMatrix<double> bending(const Lattice &lattice);
+// Half the sum of squared second differences, of both components.
+double bending(const Warp &warp);
 
 } // namespace pipefish::segment

@@ -1,7 +1,7 @@
 #include "segment/layer.hpp"
 
-#include <opencv2/imgproc.hpp>
-
+#include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -67,31 +67,117 @@ cv::Mat_<uint8_t> carry(const Side &side, Evidence &out)
     return valid;
 }
 
-// Sums over windows around each pixel.
-Image summed(const Image &image)
+// Planes of the other picture, where valid.
+void bring(const Side &side, const cv::Mat_<uint8_t> &valid, Evidence &out)
 {
-    Image out;
-    cv::boxFilter(image, out, CV_32F, {kWindow, kWindow}, {-1, -1}, false, cv::BORDER_CONSTANT);
-    return out;
+    const cv::Size size = side.box().size();
+    for (size_t c = 0; c < side.here->channels(); c++) {
+        Image warped(size, 0.0F);
+        const Image &there = side.plane_there(c);
+        for (int y = 0; y < size.height; y++)
+            for (int x = 0; x < size.width; x += 4) {
+                const int count = std::min(4, size.width - x);
+                match::Float4 u = match::counted(0) * 0 + 1, v = u;
+                bool any = false;
+                for (int k = 0; k < count; k++)
+                    if (valid(y, x + k)) {
+                        u[k] = out.flow(y, x + k)[0], v[k] = out.flow(y, x + k)[1];
+                        any = true;
+                    }
+                if (!any)
+                    continue;
+                const match::Float4 w = match::spline(there, u, v);
+                for (int k = 0; k < count; k++)
+                    if (valid(y, x + k))
+                        warped(y, x + k) = w[k];
+            }
+        out.warped.push_back(warped);
+    }
 }
 
-// Correlation of the grey pictures, and how much texture either has, from sums over the valid part of windows.
-void correlate(const Image &mask, const Image &one, const Image &two, Evidence &out)
+// Gain and offset of a channel along a row of the box.
+void light_along(const Side &side, size_t channel, int y, float *gain, float *offset)
 {
-    const Image count = summed(mask), a = summed(one), b = summed(two), aa = summed(Image(one.mul(one))),
-                bb = summed(Image(two.mul(two))), ab = summed(Image(one.mul(two)));
-    out.zncc.create(mask.size());
-    out.informed.create(mask.size());
-    const double level = square(square(kTexture));
-    for (int y = 0; y < mask.rows; y++)
-        for (int x = 0; x < mask.cols; x++) {
-            const double n = std::max(1.0F, count(y, x)), ma = a(y, x) / n, mb = b(y, x) / n;
-            const double va = std::max(0.0, aa(y, x) / n - ma * ma), vb = std::max(0.0, bb(y, x) / n - mb * mb);
-            const double cov = ab(y, x) / n - ma * mb, most = square(std::max(va, vb));
-            out.informed(y, x) = static_cast<float>(most / (most + level));
-            out.zncc(y, x) = static_cast<float>(std::clamp(cov / std::sqrt(va * vb + 1e-10), -1.0, 1.0));
+    const Lattice &l = side.light;
+    const auto h = static_cast<int>(l.spacing);
+    const double b = static_cast<double>(y % h) / h;
+    const Eigen::Index row = static_cast<Eigen::Index>(y / h) * l.nx;
+    const auto along = [&](const Eigen::VectorXd &f, float *to) {
+        for (int i = 0; i * h < l.box.width; i++) {
+            const Eigen::Index p = row + i, q = p + l.nx;
+            const auto left = static_cast<float>((1 - b) * f[p] + b * f[q]);
+            const auto right = static_cast<float>((1 - b) * f[p + 1] + b * f[q + 1]);
+            const float step = (right - left) / static_cast<float>(h);
+            for (int x = i * h, k = 0; k < h && x < l.box.width; k++, x++)
+                to[x] = left + static_cast<float>(k) * step;
         }
+    };
+    along(side.gain[channel], gain);
+    along(side.offset[channel], offset);
 }
+
+// Sums over windows around the pixels of a picture, row by row: of its weight, of two greys, of their squares and of
+// their product.
+class Windows
+{
+public:
+    explicit Windows(int width) : width_(width), line_(static_cast<size_t>(width + kWindow - 1), 0.0F)
+    {
+        for (auto &row : ring_)
+            for (auto &sums : row)
+                sums.assign(static_cast<size_t>(width), 0.0F);
+        for (auto &sums : total_)
+            sums.assign(static_cast<size_t>(width), 0.0F);
+    }
+
+    // The next row; nothing for one below the last. The rows' sums are then of the windows around kWindow / 2 rows up.
+    void push(const float *weight, const float *one, const float *two)
+    {
+        auto &row = ring_[next_++ % kWindow];
+        const auto put = [&](std::vector<float> &sums, const auto &value) {
+            for (int x = 0; x < width_; x++)
+                line_[static_cast<size_t>(x + kWindow / 2)] = value(x);
+            const float *from = line_.data();
+            for (int x = 0; x < width_; x++)
+                sums[static_cast<size_t>(x)] = ((from[x] + from[x + 1]) + (from[x + 2] + from[x + 3])) +
+                                               ((from[x + 4] + from[x + 5]) + from[x + 6]);
+        };
+        put(row[0], [&](int x) { return weight[x]; });
+        put(row[1], [&](int x) { return one[x]; });
+        put(row[2], [&](int x) { return two[x]; });
+        put(row[3], [&](int x) { return one[x] * one[x]; });
+        put(row[4], [&](int x) { return two[x] * two[x]; });
+        put(row[5], [&](int x) { return one[x] * two[x]; });
+        for (size_t k = 0; k < total_.size(); k++)
+            for (size_t x = 0; x < total_[k].size(); x++) {
+                const auto at = [&](size_t r) { return ring_[(next_ + r) % kWindow][k][x]; }; // the oldest first
+                total_[k][x] = ((at(0) + at(1)) + (at(2) + at(3))) + ((at(4) + at(5)) + at(6));
+            }
+    }
+
+    // Of the windows' valid parts: how much texture either grey has, and their correlation.
+    void correlate(float *informed, float *zncc) const
+    {
+        static_assert(kWindow == 7);
+        const auto level = static_cast<float>(square(square(kTexture)));
+        const auto &[count, a, b, aa, bb, ab] = total_;
+        for (size_t x = 0; x < count.size(); x++) {
+            const float n = 1 / std::max(1.0F, count[x]), ma = n * a[x], mb = n * b[x];
+            const float va = std::max(0.0F, n * aa[x] - ma * ma), vb = std::max(0.0F, n * bb[x] - mb * mb);
+            const float cov = n * ab[x] - ma * mb, more = std::max(va, vb), most = more * more;
+            informed[x] = most / (most + level);
+            zncc[x] = std::min(1.0F, std::max(-1.0F, cov / std::sqrt(va * vb + 1e-10F)));
+        }
+    }
+
+private:
+    using Row = std::array<std::vector<float>, 6>;
+    int width_;
+    size_t next_ = 0;
+    std::array<Row, kWindow> ring_; // of the last rows, sums along them
+    Row total_;
+    std::vector<float> line_; // zeros on either side
+};
 
 } // namespace
 
@@ -111,45 +197,82 @@ Light light_at(const Side &side, size_t channel, int x, int y)
 Evidence look(const Side &side)
 {
     Evidence out;
-    const cv::Rect &box = side.box();
     const cv::Mat_<uint8_t> valid = carry(side, out);
-    const size_t channels = side.here->channels();
-    Image mask(box.size(), 0.0F), one(box.size(), 0.0F), two(box.size(), 0.0F), log_ratio(box.size(), 0.0F);
-    const Image rarity = side.here->rarity()(box);
-    double constant = std::log(1 - kHidden);
-    for (size_t c = 0; c < channels; c++) {
-        constant -= std::log(side.sigma[c]) + kHalfLog2Pi;
-        out.warped.emplace_back(box.size(), std::numeric_limits<float>::quiet_NaN());
-        const Image here = side.plane_here(c)(box), &there = side.plane_there(c);
-        const double grey = side.here->grey(c), scale = 1 / (2 * square(side.sigma[c]));
-        for (int y = 0; y < box.height; y++)
-            for (int x = 0; x < box.width; x++) {
-                if (!valid(y, x))
-                    continue;
-                const float w = match::spline(there, out.flow(y, x)[0], out.flow(y, x)[1]);
-                out.warped[c](y, x) = w;
-                const Light light = light_at(side, c, box.x + x, box.y + y);
-                const double lit = light.gain * w + light.offset;
-                mask(y, x) = 1;
-                one(y, x) += static_cast<float>(grey * here(y, x));
-                two(y, x) += static_cast<float>(grey * lit);
-                log_ratio(y, x) -= static_cast<float>(scale * square(here(y, x) - lit));
-            }
-    }
-    correlate(mask, one, two, out);
-    out.fits.create(box.size());
-    out.cost = cv::Mat_<int32_t>(box.size(), Problem::kNever);
-    for (int y = 0; y < box.height; y++)
-        for (int x = 0; x < box.width; x++) {
-            if (!valid(y, x))
-                continue;
-            const double ratio = std::exp(std::min(50.0, log_ratio(y, x) + constant + rarity(y, x)));
-            out.fits(y, x) = static_cast<float>(ratio / (ratio + kHidden));
-            const double t = out.informed(y, x);
-            const double nats = t * (-std::log(ratio + kHidden) + kDissimilar * (1 - out.zncc(y, x)) / 2) + kGround;
-            out.cost(y, x) = static_cast<int32_t>(std::lround(kUnit * nats));
-        }
+    bring(side, valid, out);
+    out.cost = cv::Mat_<int32_t>(side.box().size(), Problem::kNever);
+    out.cost.setTo(0, valid);
+    look_relit(side, out);
     return out;
+}
+
+void look_relit(const Side &side, Evidence &seen)
+{
+    const cv::Size size = side.box().size();
+    const size_t channels = side.here->channels(), width = static_cast<size_t>(size.width);
+    seen.off.assign(channels, Image());
+    for (Image &off : seen.off)
+        off = Image(size);
+    seen.informed = Image(size);
+    seen.zncc = Image(size);
+    std::vector<Image> here;
+    for (size_t c = 0; c < channels; c++)
+        here.push_back(side.plane_here(c)(side.box()));
+    std::vector<float> gain(width), offset(width), valid(width), one(width), two(width);
+    Windows windows(size.width);
+    for (int y = 0; y < size.height + kWindow / 2; y++) {
+        for (std::vector<float> *row : {&valid, &one, &two})
+            std::fill(row->begin(), row->end(), 0.0F);
+        if (y < size.height) {
+            for (int x = 0; x < size.width; x++)
+                valid[static_cast<size_t>(x)] = seen.possible(y, x) ? 1.0F : 0.0F;
+            for (size_t c = 0; c < channels; c++) {
+                light_along(side, c, y, gain.data(), offset.data());
+                const float *from = here[c][y], *warped = seen.warped[c][y];
+                float *off = seen.off[c][y];
+                const auto grey = static_cast<float>(side.here->grey(c));
+                for (size_t x = 0; x < width; x++) {
+                    const float lit = gain[x] * warped[x] + offset[x];
+                    off[x] = valid[x] * (from[x] - lit);
+                    one[x] += grey * valid[x] * from[x];
+                    two[x] += grey * valid[x] * lit;
+                }
+            }
+        }
+        windows.push(valid.data(), one.data(), two.data());
+        if (const int row = y - kWindow / 2; row >= 0)
+            windows.correlate(seen.informed[row], seen.zncc[row]);
+    }
+    look_likely(side, seen);
+}
+
+void look_likely(const Side &side, Evidence &seen)
+{
+    const cv::Size size = side.box().size();
+    const Image rarity = side.here->rarity()(side.box());
+    double constant = std::log(1 - kHidden);
+    std::vector<float> scale;
+    for (const double sigma : side.sigma) {
+        constant -= std::log(sigma) + kHalfLog2Pi;
+        scale.push_back(static_cast<float>(1 / (2 * square(sigma))));
+    }
+    Image fits(size, 0.0F);
+    cv::Mat_<int32_t> cost(size, Problem::kNever);
+    constexpr auto hidden = static_cast<float>(kHidden);
+    for (int y = 0; y < size.height; y++)
+        for (int x = 0; x < size.width; x++) {
+            if (!seen.possible(y, x))
+                continue;
+            float sum = static_cast<float>(constant) + rarity(y, x);
+            for (size_t c = 0; c < scale.size(); c++)
+                sum -= scale[c] * seen.off[c](y, x) * seen.off[c](y, x);
+            const float ratio = std::exp(std::min(50.0F, sum));
+            fits(y, x) = ratio / (ratio + hidden);
+            const float unlike = static_cast<float>(kDissimilar) * (1 - seen.zncc(y, x)) / 2;
+            const float nats = seen.informed(y, x) * (unlike - std::log(ratio + hidden)) + static_cast<float>(kGround);
+            cost(y, x) = static_cast<int32_t>(std::lround(static_cast<float>(kUnit) * nats));
+        }
+    seen.fits = fits;
+    seen.cost = cost;
 }
 
 double data_energy(const Evidence &seen, const cv::Rect &box, int k, const LabelImage &here, const LabelImage &there,
@@ -181,13 +304,7 @@ double huber_weight(double distance)
 
 double shape_energy(const Side &side, const Options &options, double ties)
 {
-    const Eigen::SparseMatrix<double> k = bending(side.warp.lattice);
-    const Eigen::Map<const Eigen::Matrix<double, 2, Eigen::Dynamic>> d(side.warp.d.data(), 2, side.warp.d.size() / 2);
-    double sum = 0;
-    for (Eigen::Index c = 0; c < 2; c++) {
-        const Eigen::VectorXd v = d.row(c).transpose();
-        sum += options.bend / 2 * v.dot(k * v);
-    }
+    double sum = options.bend * bending(side.warp);
     for (const Tie &t : side.ties)
         sum += ties * t.weight * huber((side.warp.to(t.at.x(), t.at.y()) - t.to).norm() / unit_there(side));
     return sum;

@@ -34,10 +34,11 @@ struct Tie {
 struct Side {
     const Picture *here = nullptr, *there = nullptr;
     std::vector<Tie> ties;
-    double scale = 1;        // pixels of the other picture for one of this, along a line
-    cv::Mat_<uint8_t> reach; // of the box: within reach of a tie
-    Warp warp;               // to the other picture
-    Lattice light;           // gain and offset, bilinear: the grid point (i, j) is at box + spacing (i, j)
+    double scale = 1;                      // pixels of the other picture for one of this, along a line
+    cv::Mat_<uint8_t> reach;               // of the box: within reach of a tie
+    Warp warp;                             // to the other picture
+    std::shared_ptr<const Factor> similar; // of its normal equations, at some time
+    Lattice light; // gain and offset, bilinear: the grid point (i, j) is at box + spacing (i, j)
     std::vector<Eigen::VectorXd> gain, offset; // a channel; colour here = gain * colour there + offset
     std::vector<double> sigma;                 // of a channel's residual
 
@@ -51,14 +52,20 @@ struct Side {
 struct Evidence {
     cv::Mat_<cv::Vec2f> flow;  // place in the other picture
     cv::Mat_<int32_t> cost;    // of the layer here less that of the background, thousandths of a nat, or kNever
-    std::vector<Image> warped; // planes of the other picture, brought here, as they are there
+    std::vector<Image> warped; // planes of the other picture, brought here, as they are there; 0 where that is no place
+    std::vector<Image> off;    // what a plane here is above them, relit
     Image informed;            // 0..1: how much texture there is to tell motions apart
     Image fits;                // 0..1: probability of being seen in both, given the layer
     Image zncc;
     int folds = 0; // pixels in reach where the field folds
+
+    bool possible(int y, int x) const { return cost(y, x) < Problem::kNever; }
 };
 
 Evidence look(const Side &side);
+// The same where only light, or only sigma, is not what it was. What others share is left to them.
+void look_relit(const Side &side, Evidence &seen);
+void look_likely(const Side &side, Evidence &seen);
 
 // Gain and offset at a pixel.
 struct Light {

@@ -63,38 +63,42 @@ double Picture::grey(size_t channel) const
     return channels() == 1 ? 1 : weights[channel];
 }
 
-void Picture::edges(int first, double cost, std::vector<Problem::Edge> &out) const
+Grid Picture::grid(double cost) const
 {
     std::vector<Image> planes;
     for (const match::ScaleStack &p : planes_)
         planes.push_back(p.image());
-    neighbour_edges(planes, first, cost, out);
+    return grid_of(planes, cost);
 }
 
-void neighbour_edges(const std::vector<Image> &planes, int first, double cost, std::vector<Problem::Edge> &out)
+Grid grid_of(const std::vector<Image> &planes, double cost)
 {
     const int width = planes.at(0).cols, height = planes[0].rows;
+    Grid out{width, std::vector<std::array<int32_t, 4>>(planes[0].total(), {0, 0, 0, 0})};
+    constexpr int steps[4][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
     const auto visit = [&](const auto &body) {
         for (int y = 0; y < height; y++)
             for (int x = 0; x < width; x++)
-                for (const auto &[dx, dy] : {std::pair(1, 0), std::pair(0, 1), std::pair(1, 1), std::pair(-1, 1)}) {
-                    if (x + dx < 0 || x + dx >= width || y + dy >= height)
+                for (size_t k = 0; k < 4; k++) {
+                    const int i = x + steps[k][0], j = y + steps[k][1];
+                    if (i < 0 || i >= width || j >= height)
                         continue;
                     double difference = 0;
                     for (const Image &p : planes) {
-                        const double d = p(y, x) - p(y + dy, x + dx);
+                        const double d = p(y, x) - p(j, i);
                         difference += d * d;
                     }
-                    body(first + y * width + x, dy * width + dx, difference, dx != 0 && dy != 0);
+                    body(static_cast<size_t>(y) * static_cast<size_t>(width) + static_cast<size_t>(x), k, difference);
                 }
     };
     double sum = 0, count = 0;
-    visit([&](int, int, double difference, bool) { sum += difference, count++; });
+    visit([&](size_t, size_t, double difference) { sum += difference, count++; });
     const double twice = std::max(2 * sum / count, 1e-9);
-    visit([&](int p, int step, double difference, bool diagonal) {
-        const double c = cost * (0.1 + 0.9 * std::exp(-difference / twice)) / (diagonal ? std::sqrt(2.0) : 1);
-        out.push_back({p, p + step, static_cast<int32_t>(std::lround(c))});
+    visit([&](size_t p, size_t k, double difference) {
+        const double c = cost * (0.1 + 0.9 * std::exp(-difference / twice)) / (k > 1 ? std::sqrt(2.0) : 1);
+        out.cost[p][k] = static_cast<int32_t>(std::lround(c));
     });
+    return out;
 }
 
 } // namespace pipefish::segment

@@ -13,9 +13,8 @@ namespace pipefish::segment
 // than a camera's noise.
 inline constexpr double kLeastNoise = 0.02;
 
-// Appends the edges between neighbouring pixels, eight of them; nodes are numbered from `first`. An edge costs `cost`
-// where colours are alike and down to a tenth where they differ.
-void neighbour_edges(const std::vector<Image> &planes, int first, double cost, std::vector<Problem::Edge> &out);
+// Neighbouring pixels of different labels cost `cost` where colours are alike and down to a tenth where they differ.
+Grid grid_of(const std::vector<Image> &planes, double cost);
 
 class Picture
 {
@@ -31,8 +30,7 @@ public:
     // explains it by.
     const Image &rarity() const { return rarity_; }
 
-    // As neighbour_edges.
-    void edges(int first, double cost, std::vector<Problem::Edge> &out) const;
+    Grid grid(double cost) const; // as grid_of
 
 private:
     std::deque<match::ScaleStack> planes_;

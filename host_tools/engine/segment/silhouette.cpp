@@ -98,7 +98,7 @@ Image by_colour(const Place &p, const Image &place, const Image &share, double e
 }
 
 // 1 where the object is, by the cut of least cost.
-Labels cut_of(const Image &odds, std::vector<Problem::Edge> &edges)
+Labels cut_of(const Image &odds, const Grid &grid)
 {
     Problem problem;
     const size_t n = odds.total();
@@ -108,10 +108,9 @@ Labels cut_of(const Image &odds, std::vector<Problem::Edge> &edges)
     for (const float value : odds) {
         problem.cost[value > 0 ? 0 : 1][k++] = static_cast<int32_t>(std::lround(kUnit * std::abs(value)));
     }
-    problem.edges.swap(edges);
+    problem.grids = {&grid};
     Labels out(n, 0);
     expand_once(problem, 1, out);
-    problem.edges.swap(edges);
     return out;
 }
 
@@ -147,8 +146,7 @@ Mask silhouette(const std::vector<Image> &planes, const Mask &expected, const Ma
         return out;
     const Place p(planes, expected, seen, others, options.most);
     const Image place = by_place(p, options);
-    std::vector<Problem::Edge> edges;
-    neighbour_edges(p.planes, 0, kUnit * options.smoothness, edges);
+    const Grid grid = grid_of(p.planes, kUnit * options.smoothness);
     Image first(p.size);
     for (int y = 0; y < first.rows; y++)
         for (int x = 0; x < first.cols; x++)
@@ -161,7 +159,7 @@ Mask silhouette(const std::vector<Image> &planes, const Mask &expected, const Ma
         return picture;
     };
     for (int round = 0; round < options.rounds; round++) {
-        Labels next = cut_of(by_colour(p, place, share, options.evidence), edges);
+        Labels next = cut_of(by_colour(p, place, share, options.evidence), grid);
         const bool same = next == labels;
         labels = std::move(next);
         if (same)

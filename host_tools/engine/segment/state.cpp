@@ -3,6 +3,8 @@
 #include "group/support.hpp"
 #include "parallel.hpp"
 
+#include <opencv2/imgproc.hpp>
+
 #include <algorithm>
 #include <cmath>
 
@@ -32,6 +34,10 @@ std::vector<Tie> ties_of(const std::vector<match::Match> &matches, const group::
     return out;
 }
 
+// A merger is given up when its first refinement, which wins most, leaves it dearer by more than this share of what
+// it won: of those that succeeded the dearest left 0.27.
+constexpr double kHopeless = 0.35;
+
 void replace(LabelImage &labels, int from, int to)
 {
     labels.setTo(to, labels == from);
@@ -43,9 +49,8 @@ State::State(const std::vector<Image> (&planes)[2], const std::vector<match::Mat
              const group::Groups &groups, const Options &options)
     : options_(options), pictures_{Picture(planes[0]), Picture(planes[1])}
 {
-    const int first = static_cast<int>(pictures_[0].size().area());
-    pictures_[0].edges(0, kUnit * options.edge, edges_);
-    pictures_[1].edges(first, kUnit * options.edge, edges_);
+    for (size_t s = 0; s < 2; s++)
+        grids_[s] = pictures_[s].grid(kUnit * options.edge);
     const int count = std::min(groups.count, options.layers);
     layers_.resize(static_cast<size_t>(count));
     pipefish::parallel_for(count, options.threads, [&](int k) {
@@ -69,14 +74,27 @@ State::State(const std::vector<Image> (&planes)[2], const std::vector<match::Mat
     }
 }
 
-double State::cut(const LabelImage (&labels)[2]) const
+double State::cut(const LabelImage (&labels)[2], const std::array<cv::Range, 2> &rows) const
 {
-    const auto first = static_cast<int>(labels[0].total());
-    const auto at = [&](int node) { return node < first ? labels[0].data[node] : labels[1].data[node - first]; };
     int64_t sum = 0;
-    for (const Problem::Edge &e : edges_)
-        sum += at(e.i) != at(e.j) ? e.cost : 0;
+    for (size_t s = 0; s < 2; s++)
+        sum += grids_[s].boundary(labels[s].data, rows[s].start, rows[s].end);
     return static_cast<double>(sum) / kUnit;
+}
+
+std::array<cv::Range, 2> State::all_rows() const
+{
+    return {cv::Range(0, labels_[0].rows), cv::Range(0, labels_[1].rows)};
+}
+
+std::array<cv::Range, 2> State::rows_of(int label) const
+{
+    std::array<cv::Range, 2> out;
+    for (size_t s = 0; s < 2; s++) {
+        const cv::Rect box = cv::boundingRect(labels_[s] == label);
+        out[s] = cv::Range(std::max(0, box.y - 1), box.br().y);
+    }
+    return out;
 }
 
 double State::unclaimed(const std::vector<Tie> &ties) const
@@ -89,7 +107,7 @@ double State::unclaimed(const std::vector<Tie> &ties) const
 
 double State::energy() const
 {
-    double sum = cut(labels_);
+    double sum = cut(labels_, all_rows());
     sum += unclaimed(free_);
     for (size_t k = 0; k < layers_.size(); k++)
         sum += layer_energy(layers_[k], given(static_cast<int>(k) + 1), options_) + options_.layer;
@@ -115,7 +133,7 @@ void State::finer()
     options_.spacing /= 2;
     for (Layer &layer : layers_)
         for (Side &side : layer.side)
-            side.warp = segment::finer(side.warp);
+            side.warp = segment::finer(side.warp), side.similar.reset();
 }
 
 void State::claim()
@@ -138,7 +156,7 @@ Problem State::problem() const
 {
     const size_t first = labels_[0].total(), nodes = first + labels_[1].total();
     Problem out;
-    out.edges = edges_;
+    out.grids = {&grids_[0], &grids_[1]};
     out.lonely = units(options_.lonely);
     out.cost.assign(layers_.size() + 1, std::vector<int32_t>(nodes, Problem::kNever));
     out.partner.assign(layers_.size() + 1, std::vector<int32_t>(nodes, -1));
@@ -169,7 +187,7 @@ void State::relabel(int cycles)
     const size_t first = labels_[0].total();
     Labels labels(labels_[0].begin(), labels_[0].end());
     labels.insert(labels.end(), labels_[1].begin(), labels_[1].end());
-    expand(problem(), cycles, labels);
+    expand(problem(), cycles, labels, flows_);
     const auto middle = labels.begin() + static_cast<std::ptrdiff_t>(first);
     std::copy(labels.begin(), middle, labels_[0].begin());
     std::copy(middle, labels.end(), labels_[1].begin());
@@ -196,7 +214,8 @@ std::optional<Layer> State::merged(size_t a, size_t b) const
     LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
     for (LabelImage &l : labels)
         replace(l, of_b.k, of_a.k);
-    const double saved = options_.layer + cut(labels_) - cut(labels);
+    const std::array<cv::Range, 2> rows = rows_of(of_b.k);
+    const double saved = options_.layer + cut(labels_, rows) - cut(labels, rows);
     std::vector<Tie> ties = layers_[a].side[0].ties;
     ties.insert(ties.end(), layers_[b].side[0].ties.begin(), layers_[b].side[0].ties.end());
     Layer both = layer_of(pictures_, ties, options_);
@@ -208,7 +227,11 @@ std::optional<Layer> State::merged(size_t a, size_t b) const
         return {};
     const double before = layer_energy(layers_[a], of_a, options_) + layer_energy(layers_[b], of_b, options_) + saved;
     const Given by{labels, of_a.k, ties_};
+    const double fitted = layer_energy(both, by, options_);
     refine_one(both, by, 1);
+    const double refined = layer_energy(both, by, options_);
+    if (refined - before > kHopeless * (fitted - refined))
+        return {};
     refine_one(both, by, 4);
     if (layer_energy(both, by, options_) > before)
         return {};
@@ -246,6 +269,8 @@ bool State::try_merge(size_t a)
 void State::erase(size_t layer)
 {
     layers_.erase(layers_.begin() + static_cast<std::ptrdiff_t>(layer));
+    if (layer + 1 < flows_.size())
+        flows_.erase(flows_.begin() + static_cast<std::ptrdiff_t>(layer) + 1);
     for (LabelImage &labels : labels_)
         for (uint8_t &l : labels)
             l = static_cast<uint8_t>(l - (l > layer + 1));
@@ -263,16 +288,22 @@ bool State::try_remove(int label, int heir)
 {
     const size_t own = static_cast<size_t>(label) - 1, other = static_cast<size_t>(heir) - 1;
     LabelImage labels[2] = {labels_[0].clone(), labels_[1].clone()};
+    bool inherits = heir == 0;
     for (size_t s = 0; s < 2; s++) {
         if (heir > 0) {
             const cv::Rect &box = layers_[other].side[s].box();
             const cv::Mat_<uint8_t> mine(labels_[s](box) == label);
-            labels[s](box).setTo(heir, mine & (layers_[other].seen[s].cost < Problem::kNever));
+            const cv::Mat_<uint8_t> taken(mine & (layers_[other].seen[s].cost < Problem::kNever));
+            labels[s](box).setTo(heir, taken);
+            inherits = inherits || cv::countNonZero(taken) > 0;
         }
         replace(labels[s], label, 0);
     }
-    double gain = layer_energy(layers_[own], given(label), options_) + options_.layer + cut(labels_) - cut(labels) -
-                  unclaimed(layers_[own].side[0].ties);
+    if (!inherits)
+        return false; // no more than the background does
+    const std::array<cv::Range, 2> rows = rows_of(label);
+    double gain = layer_energy(layers_[own], given(label), options_) + options_.layer + cut(labels_, rows) -
+                  cut(labels, rows) - unclaimed(layers_[own].side[0].ties);
     if (heir > 0)
         gain += layer_energy(layers_[other], given(heir), options_) -
                 layer_energy(layers_[other], {labels, heir, ties_}, options_);

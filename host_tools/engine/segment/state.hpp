@@ -4,6 +4,7 @@
 #include "segment/fit.hpp"
 #include "segment/segment.hpp"
 
+#include <array>
 #include <optional>
 
 namespace pipefish::segment
@@ -30,9 +31,11 @@ private:
     Given given(int k) const { return {labels_, k, ties_}; }
     void refine_one(Layer &layer, const Given &by, int steps) const;
     Problem problem() const;
-    int64_t boundary(int a, int b) const; // what edges between labels a and b cost
     bool within_reach(const Layer &a, const Layer &b) const;
-    double cut(const LabelImage (&labels)[2]) const;      // what all boundaries cost, nats
+    // What boundaries cost, nats: of rows of either picture with the neighbours in and below them.
+    double cut(const LabelImage (&labels)[2], const std::array<cv::Range, 2> &rows) const;
+    std::array<cv::Range, 2> all_rows() const;
+    std::array<cv::Range, 2> rows_of(int label) const;    // whose boundaries change where its pixels get another label
     double unclaimed(const std::vector<Tie> &ties) const; // what those that are free cost where no layer has them
     bool try_remove(int label, int heir);
     std::optional<Layer> merged(size_t a, size_t b) const;  // refined, if that is cheaper than both
@@ -43,10 +46,11 @@ private:
 
     Options options_;
     Picture pictures_[2];
-    std::vector<Problem::Edge> edges_;
+    Grid grids_[2];             // of the pictures
     std::vector<Layer> layers_; // layer k - 1 has label k
     std::vector<Tie> free_;     // matches of no layer
     LabelImage labels_[2];
+    std::vector<Flows> flows_; // of labels, in their last expansions
     double ties_ = 1;
 };
 

@@ -1,10 +1,10 @@
 #include "selfcal/observe.hpp"
 
 #include "geometry/triangulate.hpp"
+#include "linalg/linalg.hpp"
 #include "selfcal/residual.hpp"
 
 #include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
 #include <Eigen/LU>
 
 #include <algorithm>
@@ -226,7 +226,7 @@ double bearing_sigma(const Adjustment &at, const LensMatrix &covariance, double 
     for (size_t i = 0; i < rows.size(); i++) {
         const Rows j = rows[i] - geometry::cross_matrix(rays[i]) * turn;
         const Eigen::Matrix3d spread = j * covariance * j.transpose();
-        worst = std::max(worst, Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(spread).eigenvalues()[2]);
+        worst = std::max(worst, linalg::symmetric_eigen<3>(spread).values[2]);
     }
     return std::sqrt(worst);
 }

@@ -1,8 +1,10 @@
 #include "selfcal/plane.hpp"
 
+#include "linalg/linalg.hpp"
 #include "selfcal/residual.hpp"
 
-#include <Eigen/Eigenvalues>
+#include <Eigen/Cholesky>
+#include <Eigen/LU>
 
 #include <algorithm>
 #include <cmath>
@@ -221,7 +223,7 @@ private:
                 }
                 rays.push_back({f, g});
             }
-            h_ = Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 9, 9>>(normal).eigenvectors().col(0);
+            h_ = linalg::symmetric_eigen<9>(normal).vectors.col(0);
             const Matrix3 m = homography();
             for (const auto &[f, g] : rays) {
                 sign += g.dot(m * f) > 0.0 ? 1.0 : -1.0;
@@ -311,8 +313,8 @@ bool is_turn(const Matrix3 &h)
     for (double log_alpha = -1.5; log_alpha < 1.5; log_alpha += 0.005) {
         const Eigen::Vector3d scale(1.0, 1.0, std::exp(log_alpha));
         const Matrix3 m = scale.asDiagonal() * h * scale.cwiseInverse().asDiagonal();
-        const Eigen::SelfAdjointEigenSolver<Matrix3> squares(m.transpose() * m, Eigen::EigenvaluesOnly);
-        const double spread = std::sqrt(squares.eigenvalues()[2] / std::max(squares.eigenvalues()[0], 1e-12)) - 1.0;
+        const Eigen::Vector3d squares = linalg::symmetric_eigen<3>(m.transpose() * m).values;
+        const double spread = std::sqrt(squares[2] / std::max(squares[0], 1e-12)) - 1.0;
         if (spread < least) {
             least = spread;
             angle = std::acos(std::clamp((m.trace() / std::cbrt(m.determinant()) - 1.0) / 2.0, -1.0, 1.0));

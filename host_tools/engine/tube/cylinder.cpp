@@ -1,6 +1,7 @@
 #include "tube/cylinder.hpp"
 
 #include "counter_random.hpp"
+#include "linalg/linalg.hpp"
 #include "optim/least_squares.hpp"
 #include "tube/section.hpp"
 
@@ -77,7 +78,7 @@ public:
         const Eigen::VectorXd &g = step.g;
         now_.centre += now_.basis * g.head<2>();
         const Vector3d turned = (saved_.axis + saved_.basis * g.segment<2>(2)).normalized();
-        now_.basis = Eigen::Quaterniond::FromTwoVectors(saved_.axis, turned).toRotationMatrix() * saved_.basis;
+        now_.basis = linalg::turn_between(saved_.axis, turned).toRotationMatrix() * saved_.basis;
         now_.axis = turned;
         now_.rho += g[4];
         if (parameters_ == 7) {

@@ -1,5 +1,6 @@
 #include "tube/surface.hpp"
 
+#include "linalg/linalg.hpp"
 #include "tube/bspline.hpp"
 #include "tube/cylinder.hpp"
 #include "tube/nearest.hpp"
@@ -131,7 +132,7 @@ void Surface::lay_out(const Reference &reference, double knot)
         for (int c = piece.first; c < piece.first + piece.intervals + 3; c++) {
             const int a = std::max(piece.first, c - 1), b = std::min(piece.first + piece.intervals + 2, c + 1);
             const Vector3d t = (control_[static_cast<size_t>(b)] - control_[static_cast<size_t>(a)]).normalized();
-            first = c == 0 ? t.unitOrthogonal() : Vector3d(Eigen::Quaterniond::FromTwoVectors(tangent, t) * first);
+            first = c == 0 ? t.unitOrthogonal() : Vector3d(linalg::turn_between(tangent, t) * first);
             first = (first - first.dot(t) * t).normalized();
             tangent = t;
             first_.push_back(first);

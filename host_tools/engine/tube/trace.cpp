@@ -1,10 +1,10 @@
 #include "tube/trace.hpp"
 
 #include "counter_random.hpp"
+#include "linalg/linalg.hpp"
 #include "parallel.hpp"
 #include "tube/nearest.hpp"
 
-#include <Eigen/Eigenvalues>
 #include <Eigen/Geometry>
 
 #include <algorithm>
@@ -59,7 +59,7 @@ std::vector<Vector3d> normals_of(const Eigen::Matrix3Xd &points)
         for (const int k : near) {
             spread += (points.col(k) - mean) * (points.col(k) - mean).transpose();
         }
-        out.push_back(Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(spread).eigenvectors().col(0));
+        out.push_back(linalg::symmetric_eigen<3>(spread).vectors.col(0));
     }
     return out;
 }

@@ -2,6 +2,7 @@
 #include "real.h"
 
 #include <float.h>
+#include <stdlib.h>
 
 double *pf_camera_param_at(pf_camera *camera, uint32_t param)
 {
@@ -223,24 +224,68 @@ static bool family_increases(const pf_camera *camera)
 
 /* --- The proof for the whole map ------------------------------------------------------------------------------- */
 
-/* Bounds over 0 <= theta <= t, all phi, of what the asymmetric terms add to each of the four entries of the Jacobian
- * [r_t r_p; t_t t_p], and of the derivatives of that by theta and by phi. A term c theta^p e^(i h phi) adds at most
- * |c| max(p, |h| + 1) theta^(p-1). */
+/* Of what the asymmetric terms add to a quantity: bounds of its derivatives by theta and by phi over 0 <= theta <= t,
+ * all phi, as polynomials in t, here of degree i. */
+enum { POWER_MAX = 5 };
 typedef struct bounds {
-    double by_theta, by_phi;
-    double symmetric; /* |r''|, which also bounds twice the derivative of r / theta */
+    double by_theta[POWER_MAX], by_phi[POWER_MAX];
 } bounds;
 
-static void add_bound(bounds *b, double size, int power, int harmonic_number, double t)
+/* Of the quantities that decide: r_t, t_p and off = r_p + t_t. */
+typedef struct proof {
+    const pf_camera *camera;
+    camera_kind kind;
+    bounds r_t, t_p, off;
+} proof;
+
+/* Of size theta^(power-1) cos(harmonic phi + anything). */
+static void add_bound(bounds *b, double size, int power, int harmonic_number)
 {
-    int h = harmonic_number < 0 ? -harmonic_number : harmonic_number;
-    double entry = size * (power > h + 1 ? power : h + 1);
-    for (int i = 2; i < power; i++)
-        entry *= t;
-    b->by_theta += entry * (power - 1);
-    b->by_phi += entry * h * (power > 1 ? t : 1);
+    if (power > 1)
+        b->by_theta[power - 2] += size * (power - 1);
+    b->by_phi[power - 1] += size * abs(harmonic_number);
 }
 
+static double length(double a, double b)
+{
+    return sqrt(a * a + b * b);
+}
+
+/* R = a theta^p g(phi) has r_t = p a theta^(p-1) g, r_p = a theta^(p-1) g' and t_p = a theta^(p-1) g; T = m theta^p g
+ * has t_t = p m theta^(p-1) g, t_p = m theta^(p-1) g' and r_p = -m theta^(p-1) g. R + i T = c theta^p e^(i h phi) has
+ * r_t + i t_t = p, r_p = -(h + 1) times its T / theta and t_p = (h + 1) times its R / theta. */
+static proof make_proof(const pf_camera *camera, camera_kind kind)
+{
+    proof q = {.camera = camera, .kind = kind};
+    for (int i = 0; i < 3; i++)
+        for (int h = 1; h <= 2; h++) {
+            const double *b = camera->asym_radial_phi + 2 * h - 2, *j = camera->asym_tangential_phi + 2 * h - 2;
+            double radial = fabs(camera->asym_radial_theta[i]) * length(b[0], b[1]);
+            double tangential = fabs(camera->asym_tangential_theta[i]) * length(j[0], j[1]);
+            int p = 2 * i + 1;
+            add_bound(&q.r_t, p * radial, p, h);
+            add_bound(&q.t_p, radial + h * tangential, p, h);
+            add_bound(&q.off, h * radial + (p - 1) * tangential, p, h);
+        }
+    for (int i = 0; i < CPOLY_TERMS; i++) {
+        double size = length(camera->cpoly[2 * i], camera->cpoly[2 * i + 1]);
+        int p = pf_cpoly_power[i], h = pf_cpoly_harmonic[i];
+        add_bound(&q.r_t, p * size, p, h);
+        add_bound(&q.t_p, abs(h + 1) * size, p, h);
+        add_bound(&q.off, abs(p - h - 1) * size, p, h);
+    }
+    return q;
+}
+
+static double polynomial(const double a[POWER_MAX], double t)
+{
+    double sum = 0;
+    for (int i = POWER_MAX; i-- > 0;)
+        sum = sum * t + a[i];
+    return sum;
+}
+
+/* Of |r''| up to t, which also bounds twice the derivative of r / theta. */
 static double symmetric_bound(const pf_camera *camera, double t)
 {
     double s = t * t, sine, cosine, slope, m = camera->mirror;
@@ -260,64 +305,106 @@ static double symmetric_bound(const pf_camera *camera, double t)
     }
 }
 
-static bounds bounds_up_to(const pf_camera *camera, double t)
-{
-    bounds b = {0, 0, symmetric_bound(camera, t)};
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 4; j++) {
-            double size = fabs(camera->asym_radial_theta[i] * camera->asym_radial_phi[j]) +
-                          fabs(camera->asym_tangential_theta[i] * camera->asym_tangential_phi[j]);
-            add_bound(&b, size, 2 * i + 1, j < 2 ? 1 : 2, t);
-        }
-    for (int i = 0; i < CPOLY_TERMS; i++)
-        add_bound(&b, fabs(camera->cpoly[2 * i]) + fabs(camera->cpoly[2 * i + 1]), pf_cpoly_power[i],
-                  pf_cpoly_harmonic[i], t);
-    return b;
-}
+typedef struct slopes {
+    double by_theta, by_phi;
+} slopes;
 
 typedef struct cell {
     double theta, phi, half_theta, half_phi; /* centre and half sizes */
 } cell;
+
+/* What is known of a cell. Neighbours share a half of it, which is kept from one to the next. */
+typedef struct view {
+    double theta, half_theta, phi; /* for which it holds */
+    double c, s;                   /* of phi */
+    double over_theta, slope;      /* r / theta and r' at theta */
+    double symmetric;              /* the bounds up to the cell's end */
+    slopes r_t, t_p, off;
+} view;
+
+static slopes slopes_up_to(const bounds *b, double t)
+{
+    return (slopes){polynomial(b->by_theta, t), polynomial(b->by_phi, t)};
+}
+
+static void look(const proof *p, const cell *at, view *v)
+{
+    if (v->phi != at->phi) { /* in [-pi, pi], of which the functions know half */
+        v->phi = at->phi;
+        sine_cosine(fabs(at->phi), &v->s, &v->c);
+        v->s = at->phi < 0 ? -v->s : v->s;
+    }
+    if (v->theta != at->theta || v->half_theta != at->half_theta) {
+        const double end = at->theta + at->half_theta;
+        v->theta = at->theta;
+        v->half_theta = at->half_theta;
+        v->over_theta = pf_camera_radial(p->camera, at->theta, &v->slope);
+        v->symmetric = symmetric_bound(p->camera, end);
+        v->r_t = slopes_up_to(&p->r_t, end);
+        v->t_p = slopes_up_to(&p->t_p, end);
+        v->off = slopes_up_to(&p->off, end);
+    }
+}
 
 typedef enum verdict { PROVED, DISPROVED, UNDECIDED } verdict;
 
 /* Whether the symmetric part of the Jacobian is positive definite in the whole cell: r_t > 0 and
  * 4 r_t t_p > (r_p + t_t)^2. Values at the centre, less what the derivatives' bounds allow. Sets *split_theta to the
  * better half for UNDECIDED. */
-static verdict judge(const pf_camera *camera, camera_kind kind, const cell *at, bool *split_theta)
+static verdict judge(const proof *p, const cell *at, view *v, bool *split_theta)
 {
-    /* cos and sin phi by the half-plane functions: phi in [-pi, pi]. */
-    double c, s;
-    sine_cosine(fabs(at->phi), &s, &c);
-    s = at->phi < 0 ? -s : s;
-    lens_point lens = pf_camera_lens(camera, kind, at->theta, c, s);
+    look(p, at, v);
+    lens_point lens = pf_camera_lens_at(p->camera, p->kind, v->theta, v->c, v->s, v->over_theta, v->slope);
     double off = fabs(lens.r_p + lens.t_t), room = 4 * lens.r_t * lens.t_p - off * off;
     if (!(lens.r_t > 0 && lens.t_p > 0 && room > 0))
         return DISPROVED;
-    bounds b = bounds_up_to(camera, at->theta + at->half_theta);
-    double by_theta = at->half_theta * b.by_theta, by_phi = at->half_phi * b.by_phi;
-    double radial = at->half_theta * b.symmetric;
-    double d_r = radial + by_theta + by_phi, d_t = 0.5 * radial + by_theta + by_phi, d_off = 2 * (by_theta + by_phi);
-    double change = 4 * (lens.r_t * d_t + lens.t_p * d_r + d_r * d_t) + 2 * off * d_off + d_off * d_off;
+    /* by how much the three change at most, on the way by theta and by phi */
+    double theta = at->half_theta, phi = at->half_phi;
+    double r_by_theta = theta * (v->symmetric + v->r_t.by_theta), r_by_phi = phi * v->r_t.by_phi;
+    double t_by_theta = theta * (0.5 * v->symmetric + v->t_p.by_theta), t_by_phi = phi * v->t_p.by_phi;
+    double off_by_theta = theta * v->off.by_theta, off_by_phi = phi * v->off.by_phi;
+    double d_r = r_by_theta + r_by_phi, d_t = t_by_theta + t_by_phi, d_off = off_by_theta + off_by_phi;
+    double change = 4 * (lens.r_t * d_t + lens.t_p * d_r - d_r * d_t) + 2 * off * d_off + d_off * d_off;
     double rounding = 1e-12 * (1 + lens.r_t * lens.t_p + off * off);
     if (lens.r_t - d_r > 0 && lens.t_p - d_t > 0 && room - change > rounding)
         return PROVED;
-    *split_theta = (radial + by_theta) * (lens.r_t + lens.t_p + off) >= by_phi * (lens.r_t + lens.t_p + off);
+    *split_theta = 4 * (lens.r_t * t_by_theta + lens.t_p * r_by_theta) + (2 * off + off_by_theta) * off_by_theta >=
+                   4 * (lens.r_t * t_by_phi + lens.t_p * r_by_phi) + (2 * off + off_by_phi) * off_by_phi;
     return UNDECIDED;
+}
+
+/* A map that folds mostly does so at the rim, and in a wide part of it: a few points tell that before thousands of
+ * cells beside it are proved. */
+static bool folds_visibly(const proof *p)
+{
+    enum { RINGS = 4, SPOKES = 16 };
+    view v = {.theta = NAN, .phi = NAN};
+    bool ignored;
+    for (int i = RINGS; i > 0; i--)
+        for (int j = 0; j < SPOKES; j++) {
+            cell at = {p->camera->theta_max * i / RINGS, PI_ALL * (2 * j - SPOKES) / SPOKES, 0, 0};
+            if (judge(p, &at, &v, &ignored) == DISPROVED)
+                return true;
+        }
+    return false;
 }
 
 /* Depth first over halved cells: the stack holds at most one pending right half a level. */
 static bool map_is_one_to_one(const pf_camera *camera, camera_kind kind)
 {
     enum { MAX_DEPTH = 60, MAX_CELLS = 100000 };
+    const proof p = make_proof(camera, kind);
+    view known = {.theta = NAN, .phi = NAN};
     cell stack[MAX_DEPTH + 2];
     int top = 0;
     double half = 0.5 * camera->theta_max;
     stack[0] = (cell){half, 0, half * (1 + 4 * DBL_EPSILON), PI_ALL * (1 + 4 * DBL_EPSILON)};
+    if (folds_visibly(&p))
+        return false;
     for (int cells = 0; top >= 0; cells++) {
         cell at = stack[top];
         bool split_theta = true;
-        verdict v = judge(camera, kind, &at, &split_theta);
+        verdict v = judge(&p, &at, &known, &split_theta);
         if (v == DISPROVED || cells == MAX_CELLS || (v == UNDECIDED && top == MAX_DEPTH))
             return false;
         if (v == PROVED) {

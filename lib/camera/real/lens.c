@@ -131,11 +131,17 @@ static void add_asymmetry_slopes(const pf_camera *camera, double theta, double c
 
 static void add_cpoly_slopes(const pf_camera *camera, double theta, double c, double s, lens_point *lens)
 {
+    enum { HARMONICS = 5 };
     const double power[3] = {1, theta, theta * theta};
+    double cosine[HARMONICS] = {1}, sine[HARMONICS] = {0};
+    for (int h = 1; h < HARMONICS; h++) {
+        cosine[h] = cosine[h - 1] * c - sine[h - 1] * s;
+        sine[h] = sine[h - 1] * c + cosine[h - 1] * s;
+    }
     for (int i = 0; i < CPOLY_TERMS; i++) {
         int p = pf_cpoly_power[i], h = pf_cpoly_harmonic[i];
-        double ch, sh, re = camera->cpoly[2 * i], im = camera->cpoly[2 * i + 1];
-        harmonic(h, c, s, &ch, &sh);
+        double re = camera->cpoly[2 * i], im = camera->cpoly[2 * i + 1];
+        double ch = cosine[h < 0 ? -h : h], sh = h < 0 ? -sine[-h] : sine[h];
         double r = power[p - 1] * (re * ch - im * sh), t = power[p - 1] * (re * sh + im * ch);
         lens->r_t += p * r;
         lens->t_t += p * t;
@@ -144,11 +150,11 @@ static void add_cpoly_slopes(const pf_camera *camera, double theta, double c, do
     }
 }
 
-lens_point pf_camera_lens(const pf_camera *camera, camera_kind kind, double theta, double c, double s)
+lens_point pf_camera_lens_at(const pf_camera *camera, camera_kind kind, double theta, double c, double s, double radial,
+                             double slope)
 {
-    lens_point lens = {0, 0, 0, 0, 0, 0};
-    lens_value(camera, kind, theta, c, s, &lens.r, &lens.t);
-    (void)pf_camera_radial(camera, theta, &lens.r_t);
+    lens_point lens = {radial, 0, slope, 0, 0, 0};
+    add_terms(camera, kind, theta, c, s, &lens.r, &lens.t);
     if (kind.asymmetric)
         add_asymmetry_slopes(camera, theta, c, s, &lens);
     if (kind.cpoly)
@@ -156,4 +162,10 @@ lens_point pf_camera_lens(const pf_camera *camera, camera_kind kind, double thet
     lens.r_p -= lens.t; /* the frame turns with phi */
     lens.t_p += lens.r;
     return lens;
+}
+
+lens_point pf_camera_lens(const pf_camera *camera, camera_kind kind, double theta, double c, double s)
+{
+    double slope, radial = pf_camera_radial(camera, theta, &slope);
+    return pf_camera_lens_at(camera, kind, theta, c, s, radial, slope);
 }

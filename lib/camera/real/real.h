@@ -109,6 +109,19 @@ sensor_tilt pf_camera_sensor_tilt(const pf_camera *camera);
 /* The lens at (theta, phi), with derivatives. */
 lens_point pf_camera_lens(const pf_camera *camera, camera_kind kind, double theta, double c, double s);
 
+/* The same where r / theta and r' are known. */
+lens_point pf_camera_lens_at(const pf_camera *camera, camera_kind kind, double theta, double c, double s, double radial,
+                             double slope);
+
+static inline void add_terms(const pf_camera *camera, camera_kind kind, double theta, double c, double s, double *r,
+                             double *t)
+{
+    if (kind.asymmetric)
+        add_asymmetry(camera, theta, c, s, r, t);
+    if (kind.cpoly)
+        add_cpoly(camera, theta, c, s, r, t);
+}
+
 /* The lens at (theta, phi): only r and t. The one expression of the value: batches and single points share its bits. */
 static inline void lens_value(const pf_camera *camera, camera_kind kind, double theta, double c, double s, double *r,
                               double *t)
@@ -116,10 +129,7 @@ static inline void lens_value(const pf_camera *camera, camera_kind kind, double 
     double none;
     *r = pf_camera_radial(camera, theta, &none);
     *t = 0;
-    if (kind.asymmetric)
-        add_asymmetry(camera, theta, c, s, r, t);
-    if (kind.cpoly)
-        add_cpoly(camera, theta, c, s, r, t);
+    add_terms(camera, kind, theta, c, s, r, t);
 }
 
 /* From (r, t) = (R, T) / theta to pixels. */

@@ -63,8 +63,8 @@ typedef struct pf_msg_keyframe {
 
 /* Most bytes that a keyframe with so many live tracks and so large a JPEG takes, its break reason at most 256 bytes: 10
  * (id)
- * + 5 x 5 (x, y, covariance) + 5 (age) + 3 (quality) + 1 (status) a track. */
-#define PF_MSG_KEYFRAME_MAX(n_tracks, jpeg_size) ((size_t)1024 + 44u * (size_t)(n_tracks) + (size_t)(jpeg_size))
+ * + 5 x 5 (x, y, covariance) + 5 (age) + 3 (quality) + 1 (status) + 2 x 3 (settled) a track. */
+#define PF_MSG_KEYFRAME_MAX(n_tracks, jpeg_size) ((size_t)1024 + 50u * (size_t)(n_tracks) + (size_t)(jpeg_size))
 
 typedef struct pf_msg_survey_start {
     uint8_t survey_id[16];

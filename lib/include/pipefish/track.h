@@ -55,7 +55,9 @@ typedef struct pf_track {
     uint8_t status;   /* pf_track_status */
     uint8_t reason;   /* pf_track_reason */
     uint16_t quality; /* similarity with the previous frame's patch, Q0.15 ZNCC (32767 = identical); 0 when new */
+    int16_t settled_x_q8, settled_y_q8; /* by so much pf_wall_settle moved pos, Q8 px; the patch was found without it */
 } pf_track;
+_Static_assert(sizeof(pf_track) == 40, "what a track is settled by takes none of the memory");
 
 /* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
 typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
@@ -88,8 +90,9 @@ typedef struct pf_tracker_config {
                                  * pixel rules out its block. NULL = none. Read by pf_tracker_init only */
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
     pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
-                         * warp alone leaves 0.02 px a fifth of growth, the same way for all; and no track begins at
-                         * the edge of the glare [none] */
+                         * warp alone leaves 0.02 px a fifth of growth, the same way for all; no track begins at the
+                         * edge of the glare, nor, while the wall comes out towards the rim, where half a radius of way
+                         * is left of it: that is gone before the third keyframe [none] */
     bool has_wall; /* the caller gives up what walks off the wall, with pf_wall_check: what is left need look less alike
                     * (0.2 less than min_zncc, twice fb, twice the variance at which a track is lost) */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
