@@ -518,10 +518,11 @@ def _sigmas(m: Measurement) -> None:
         if exact.camera is not None and m.camera.covariance is not None:  # what is assumed of others has no radial part
             cameras[stretch.segment] = factor * np.interp(stations["s"], exact.s, exact.camera) / d
             stretch.camera = cameras[stretch.segment]
-        if m.scale.diameter_from_prior:  # of the wander along the path the tube's sigma tells
-            continue
-        wheel = float(m.structure.scale_sigma or 0.0)  # 0 where there is none in the adjustment
-        beyond = np.maximum(0, (factor * np.interp(stations["s"], exact.s, exact.random)) ** 2 - (wheel * d) ** 2)
+        # Where the mean diameter is the scale, a station's is known as far as the structure's own scale holds along it.
+        by_prior = m.scale.diameter_from_prior
+        wheel = 0.0 if by_prior else float(m.structure.scale_sigma or 0.0)  # 0 where there is none in the adjustment
+        random = np.interp(stations["s"], exact.s, exact.wander if by_prior else exact.random)
+        beyond = np.maximum(0, (factor * random) ** 2 - (wheel * d) ** 2)
         own = np.hypot(stations["d_mean_sigma"], np.sqrt(beyond))
         span = stations["ovality_sigma"] * d  # of widest less narrowest
         stations["d_mean_sigma"], stations["circumference_sigma"] = own, np.pi * own
@@ -530,6 +531,8 @@ def _sigmas(m: Measurement) -> None:
             stations[name + "_sigma"] = np.hypot(own, 0.5 * span)
         if stretch.tube.nominal:
             stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
+        if by_prior:
+            continue
         mean = stretch.tube.summary["d_mean"]
         rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)

@@ -24,7 +24,8 @@ class DiameterSigma:
     """Of the mean diameter along a stretch, in the structure's own unit.
 
     s (K,); random (K,) standard deviations, the encoder's scale included; camera
-    (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all
+    (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all;
+    wander (K,) random, of the difference to the mean over all in proportion: what is left where that mean is the scale
     """
 
     s: np.ndarray
@@ -32,6 +33,7 @@ class DiameterSigma:
     camera: np.ndarray | None
     mean_random: float
     mean_camera: float | None
+    wander: np.ndarray
 
 
 def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0, ellipse: float = 1.0) -> Shared:
@@ -75,13 +77,14 @@ def diameter_sigma(structure: Reconstruction, segment: int, tube: Tube) -> Diame
     known = np.flatnonzero(np.isfinite(table["d_mean"]))
     chosen = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), MOST)).round().astype(int))]
     total = np.zeros((len(tube.points["s"]), 3))
-    places, random, camera = [], [], []
+    places, random, camera, functions = [], [], [], []
     whole = structure.parts[segment][1] is not None
     for k in chosen:
         on, by = diameter_function(tube, float(table["s"][k]), float(table["d_mean"][k]))
         if not len(on):
             continue
         total[on] += by
+        functions.append((on, by, float(table["d_mean"][k])))
         places.append(float(table["s"][k]))
         random.append(float(structure.functions_covariance(first + on, by[None])[0, 0]))
         if whole:
@@ -96,4 +99,10 @@ def diameter_sigma(structure: Reconstruction, segment: int, tube: Tube) -> Diame
         added = np.sqrt(np.maximum(0, np.array(camera) - random))
         added_mean = float(structure.functions_covariance(first + on, by, systematic=True)[0, 0]) - mean
         added_mean = float(np.sqrt(max(0.0, added_mean)))
-    return DiameterSigma(np.array(places), np.sqrt(random), added, float(np.sqrt(mean)), added_mean)
+    across = np.mean([d for _, _, d in functions])
+    wander = []
+    for there, slope, d in functions:
+        rest = by[0] * (-d / across)
+        rest[np.searchsorted(on, there)] += slope
+        wander.append(float(structure.functions_covariance(first + on, rest[None])[0, 0]))
+    return DiameterSigma(np.array(places), np.sqrt(random), added, float(np.sqrt(mean)), added_mean, np.sqrt(wander))

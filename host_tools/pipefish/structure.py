@@ -229,6 +229,12 @@ class Reconstruction:
                 values.setdefault(key, list(getattr(camera, key)))[int(index[:-1])] += float(change)
             else:
                 values[key] = getattr(camera, key) + float(change)
+        for kind in ("asym_radial_phi", "asym_tangential_phi"):  # of unit norm: a factor belongs to the part in theta
+            norm = float(np.linalg.norm(values.get(kind, ())))
+            if norm > 0:
+                along = kind.replace("phi", "theta")
+                values[kind] = [v / norm for v in values[kind]]
+                values[along] = [v * norm for v in values.get(along, getattr(camera, along))]
         return dataclasses.replace(camera, covariance=None, covariance_parameters=(), **values)
 
     @property

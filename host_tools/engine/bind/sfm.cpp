@@ -276,8 +276,7 @@ const sfm::CameraPrior *prior_of(const std::vector<uint32_t> &parameters, const 
         return nullptr;
     }
     const Eigen::Index n = static_cast<Eigen::Index>(parameters.size());
-    room.parameter = parameters;
-    room.covariance = Eigen::Map<const Eigen::MatrixXd>(covariance->data(), n, n);
+    room = sfm::CameraPrior(parameters, Eigen::Map<const Eigen::MatrixXd>(covariance->data(), n, n));
     return &room;
 }
 

@@ -2,7 +2,7 @@
 
 #include "geometry/between.hpp"
 
-#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
 
 #include <algorithm>
 #include <array>
@@ -28,12 +28,15 @@ struct State {
     Vector3d down = Vector3d::UnitY();
     double late = 1.0; // of the stated line time
     Vector3d sag = Vector3d::Zero();
-    Eigen::VectorXd camera;
+    Eigen::VectorXd camera; // in units of the prior's root, whose covariance is the unit matrix
 };
 
 // The relative whitened residual of the distance from the first to the last frame: stiff enough to be exact beside
 // thousands of observations, soft enough to leave digits to the rest.
 constexpr double SCALE_SIGMA = 1e-7;
+
+// Of a correlation matrix's eigenvalues beside the largest: below is rounding.
+constexpr double ROUNDING = 1e-12;
 
 class Problem
 {
@@ -144,9 +147,10 @@ public:
                 j_border.col(late_at_) = moment_[k].share * (j_turn * turn_towards(f, frames[1]) -
                                                              j_point * (state_.centre[other] - state_.centre[f]));
             }
-            for (int c = 0; c < camera_columns_; c++) {
-                j_border.col(camera_at_ + c) =
-                    whiten * by_camera.col(options_.camera_prior->parameter[static_cast<size_t>(c)]);
+            if (camera_columns_ > 0) {
+                const CameraPrior &prior = *options_.camera_prior;
+                j_border.rightCols(camera_columns_) =
+                    whiten * (by_camera(Eigen::indexing::all, prior.parameter) * prior.root);
             }
             const double *j_f[2] = {j_pose[0].data(), j_pose[1].data()};
             const size_t poses = rolls() ? 2 : 1;
@@ -200,7 +204,7 @@ public:
         }
         if (camera_columns_ > 0) {
             state_.camera = saved_.camera + step.g.tail(camera_columns_);
-            camera_ = changed_camera(original_, *options_.camera_prior, state_.camera);
+            camera_ = changed_camera(original_, *options_.camera_prior, camera_change());
         }
         project_all();
     }
@@ -223,6 +227,12 @@ public:
     int observations() const { return static_cast<int>(place_.size()); }
     int late_at() const { return late_at_; }
     Vector3d down() const { return options_.gravity ? state_.down : Vector3d(Vector3d::Zero()); }
+
+    // Of the prior's parameters; empty without a prior.
+    Eigen::VectorXd camera_change() const
+    {
+        return options_.camera_prior ? Eigen::VectorXd(options_.camera_prior->root * state_.camera) : Eigen::VectorXd();
+    }
 
     // Of the pixels alone: what shares the border with them (wheel, gravity, priors) tells that border, and the scale.
     int redundancy() const
@@ -340,12 +350,9 @@ private:
             late_at_ = border_++;
         }
         if (options_.camera_prior) {
-            camera_at_ = border_;
-            camera_columns_ = static_cast<int>(options_.camera_prior->parameter.size());
+            camera_columns_ = static_cast<int>(options_.camera_prior->root.cols());
             border_ += camera_columns_;
             state_.camera = Eigen::VectorXd::Zero(camera_columns_);
-            const Eigen::LLT<Eigen::MatrixXd> llt(options_.camera_prior->covariance);
-            camera_root_ = llt.matrixL().solve(Eigen::MatrixXd::Identity(camera_columns_, camera_columns_));
         }
     }
 
@@ -429,7 +436,7 @@ private:
             sum += std::pow((state_.late - 1.0) / options_.late_sigma, 2);
         }
         if (camera_columns_ > 0) {
-            sum += (camera_root_ * state_.camera).squaredNorm();
+            sum += state_.camera.squaredNorm();
         }
         return 0.5 * sum;
     }
@@ -475,9 +482,8 @@ private:
         }
         if (camera_columns_ > 0) {
             RowsX j = RowsX::Zero(camera_columns_, border_);
-            j.rightCols(camera_columns_) = camera_root_;
-            const Eigen::VectorXd r = camera_root_ * state_.camera;
-            sink.add(camera_columns_, r.data(), plain, nullptr, {}, {}, j.data());
+            j.rightCols(camera_columns_).setIdentity();
+            sink.add(camera_columns_, state_.camera.data(), plain, nullptr, {}, {}, j.data());
         }
     }
 
@@ -550,12 +556,23 @@ private:
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
     std::vector<int> wanted_; // ascending
-    int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_at_ = 0, camera_columns_ = 0;
-    Eigen::MatrixXd camera_root_;
+    int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_columns_ = 0;
     double start_length_ = 1.0;
 };
 
 } // namespace
+
+CameraPrior::CameraPrior(std::vector<uint32_t> parameters, const Eigen::MatrixXd &covariance)
+    : parameter(std::move(parameters))
+{
+    // Directions are compared by correlation: the parameters have different units.
+    const Eigen::VectorXd sigma = covariance.diagonal().cwiseMax(0.0).cwiseSqrt();
+    const Eigen::VectorXd scale = (sigma.array() > 0.0).select(sigma.cwiseInverse(), 0.0);
+    const Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> own(scale.asDiagonal() * covariance * scale.asDiagonal());
+    const Eigen::VectorXd &value = own.eigenvalues(); // ascending
+    const Eigen::Index known = (value.array() <= ROUNDING * value.tail(1).sum()).count(), free = value.size() - known;
+    root = sigma.asDiagonal() * own.eigenvectors().rightCols(free) * value.tail(free).cwiseSqrt().asDiagonal();
+}
 
 pf_camera changed_camera(const pf_camera &camera, const CameraPrior &prior, const Eigen::VectorXd &change)
 {
@@ -610,7 +627,7 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.sag = problem.state().sag;
     report.late = problem.state().late;
     report.late_at = problem.late_at();
-    report.camera = problem.state().camera;
+    report.camera = problem.camera_change();
     report.used = problem.used();
     if (covariance) {
         auto known = solver.covariance(problem, options.threads);

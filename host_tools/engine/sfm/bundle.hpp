@@ -40,10 +40,14 @@ struct Gravity {
     double sigma = 0.01;        // radians
 };
 
-// Which of the camera's parameters are uncertain, and how much.
+// Which of the camera's parameters are uncertain, and how much. A calibration's covariance may be singular: it holds
+// what its model leaves free (the amplitude of a harmonic beside its function of theta).
 struct CameraPrior {
+    CameraPrior() = default;
+    CameraPrior(std::vector<uint32_t> parameters, const Eigen::MatrixXd &covariance);
+
     std::vector<uint32_t> parameter; // pf_camera_param
-    Eigen::MatrixXd covariance;
+    Eigen::MatrixXd root;            // root root^T is their covariance; as many columns as it has rank
 };
 
 struct BundleOptions {
@@ -103,7 +107,7 @@ public:
     const Eigen::MatrixXd &border() const
     {
         return known_.g;
-    } // wheel, gravity (2), sag (3), late, camera: those of the options
+    } // wheel, gravity (2), sag (3), late, camera (in units of its prior's root): those of the options
 
     // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
     Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const

@@ -426,8 +426,8 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
         BundleCovariance known;
         segment.drift.camera = adjust(segment.drift.map, table, central, settings, &known).camera;
         settings.noise = segment.noise;
-        const Eigen::Index n = segment.drift.camera.size();
-        segment.drift.covariance = known.border().bottomRightCorner(n, n);
+        const Eigen::MatrixXd &root = options.drift_prior->root;
+        segment.drift.covariance = root * known.border().bottomRightCorner(root.cols(), root.cols()) * root.transpose();
     }
     if (options.camera_prior) {
         settings.camera_prior = options.camera_prior;
