@@ -24,7 +24,8 @@ KNOT = 0.25
 STATION = 0.25  # spacing of the stations, diameters
 AGAINST_GRAVITY, FROM_FRAME = "against gravity", "-y of the points' frame at the start"  # twelve o'clock
 UPRIGHT = 0.1  # sine of the angle between a pipe and gravity that gives no clock
-NODES = 64  # of a path at least: how far its wall is away is measured from the nearest
+ENOUGH = 8  # centres of a path, to be as many nodes: more between them would be corners, where a bend has none
+NODES = 64  # of one with fewer, which is taken for straight: how far its wall is away is measured from the nearest
 MIN_INLIERS = 20  # in a section, for its values to be given
 # Root mean square of pipes' ovality, its direction anywhere: 95 % are below 5.2 %, about what is allowed of a laid
 # flexible pipe. What an ellipse through half a wall leans on.
@@ -333,7 +334,7 @@ def _forward(centres: np.ndarray) -> np.ndarray:
     for _ in range(3):
         line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
     s = np.r_[0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    even = np.linspace(0, s[-1], max(len(line), NODES))
+    even = np.linspace(0, s[-1], len(line) if len(line) >= ENOUGH else NODES)
     return np.ascontiguousarray(np.column_stack([np.interp(even, s, line[:, k]) for k in range(3)]))
 
 

@@ -12,6 +12,8 @@
 
 #include "track_private.h"
 
+_Static_assert(sizeof(pf_track) == 40, "what a track is settled by takes none of the memory");
+
 #define ONE      ((int64_t)1 << 24)
 #define UNKNOWN  10 /* w 0..2, t 3..5, o 6..9 */
 #define AXIS     6  /* the first of the axis */

@@ -369,7 +369,7 @@ def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius(change):
     found = health_of(3, "straight", change, density=300.0, length=5.0)
     assert found["verdict"] == "cannot tell"
     assert 0.02 < found["alpha_sigma"] < 0.2  # all that a lens may drift
-    assert f"{100 * found['alpha_sigma']:.2g} % of the diameter" in found["text"]
+    assert f"leaves the diameter open by {100 * found['alpha_sigma']:.2g} %" in found["text"]
 
 
 def test_a_known_diameter_without_an_encoder_tells_nothing_of_a_straight_drive():

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 namespace pipefish::sfm
 {
@@ -14,6 +15,7 @@ namespace
 
 constexpr double LEAST_FACTOR = 1e-6; // of the pixels' variance: sharper ones would leave the encoder no digits
 constexpr double LATE_SIGMA = 10.0;   // stated line times may have the other sign, or be of other units
+constexpr int LEAST_SEEN = 6;         // points: twice the numbers of a pose
 
 int common_tracks(const TrackTable &table, int first, int last)
 {
@@ -363,6 +365,30 @@ int select(Segment &segment, const TrackTable &table, const pf_camera &camera, B
     return observations;
 }
 
+// Without the frames at either end of which fewer than LEAST_SEEN points are where they should be: they have no pose of
+// their own. A camera's model that does not fit leaves such.
+Submap without_blind_ends(const Submap &map, const TrackTable &table, const pf_camera &camera, double gate)
+{
+    std::vector<int> seen(map.poses.size());
+    Pose room;
+    for (size_t p = 0; p < map.tracks.size(); p++) {
+        for (const Observation &o : table.of_track(map.tracks[p])) {
+            if (map.has(o.frame) &&
+                reprojection_squared(camera, pose_of(map, table, o, room), map.points[p], o) < gate * gate) {
+                seen[static_cast<size_t>(o.frame - map.first)]++;
+            }
+        }
+    }
+    const auto sees = [](int count) { return count >= LEAST_SEEN; };
+    const auto from = std::find_if(seen.begin(), seen.end(), sees);
+    const auto to = std::find_if(seen.rbegin(), std::make_reverse_iterator(from), sees).base();
+    if (to - from < 3) {
+        return map;
+    }
+    return part_of(map, table, map.first + static_cast<int>(from - seen.begin()),
+                   map.first + static_cast<int>(to - seen.begin()));
+}
+
 void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
@@ -393,6 +419,7 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
+    map = without_blind_ends(map, table, central, settings.gate);
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
     settings.cost_tolerance = 0.01 / std::max(observations, 1);

@@ -57,7 +57,6 @@ typedef struct pf_track {
     uint16_t quality; /* similarity with the previous frame's patch, Q0.15 ZNCC (32767 = identical); 0 when new */
     int16_t settled_x_q8, settled_y_q8; /* by so much pf_wall_settle moved pos, Q8 px; the patch was found without it */
 } pf_track;
-_Static_assert(sizeof(pf_track) == 40, "what a track is settled by takes none of the memory");
 
 /* Projects a ray of the camera frame; false where it cannot be seen. pf_track_project is one. */
 typedef bool (*pf_ray_project)(const void *camera, const pf_ray_q30 *ray, pf_point_q16 *at);
