@@ -303,7 +303,9 @@ def measure(
     )
     structure.gaps = renamed(structure.gaps, _jumped or [])
     if structure.status == "failed":
-        raise PipefishError(f"{survey.path}: nothing could be measured: {_why(survey, structure)}")
+        raise PipefishError(
+            f"{survey.path}: nothing could be measured: {_why(survey, structure)}{_pupil_doubt(camera, chainage)}"
+        )
     ahead = np.einsum("ni,ni->n", np.diff(structure.centres, axis=0), structure.poses[:-1, 2, :3])
     m = Measurement(
         survey=survey,
@@ -326,7 +328,8 @@ def measure(
         reasons = sorted({s.tube.reason for s in m.stretches})
         raise PipefishError(
             f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
-            f"found, but no pipe around them: {'; '.join(reasons)} (a wrong camera profile?)"
+            f"found, but no pipe around them: {'; '.join(reasons)}"
+            f"{_pupil_doubt(camera, chainage) or ' (a wrong camera profile?)'}"
         )
     if pictures:
         m.repeats, m.jumped = repetition(m), _jumped or []
@@ -394,6 +397,16 @@ def _why(survey: Survey, structure: Reconstruction) -> str:
     if not survey.info["tracks"]["observations"]:
         return f"no keyframe has tracks: a black or covered picture?{seen}"
     return structure.reason + seen
+
+
+def _pupil_doubt(camera: Camera, chainage: np.ndarray | None) -> str:
+    """What may be in the way without an encoder: to a structure that has no unit lenses are central."""
+    if not camera.pupil_e1 or chainage is not None:
+        return ""
+    return (
+        f" (the profile's pupil shifts by {1000 * camera.pupil_e1:.2g} mm a squared radian, which is left out where "
+        "no encoder tells lengths: close to a narrow pipe's wall that alone may be too much)"
+    )
 
 
 def _angles(tracks: Tracks, camera: Camera) -> np.ndarray:

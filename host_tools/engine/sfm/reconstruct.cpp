@@ -5,7 +5,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <iterator>
 
 namespace pipefish::sfm
 {
@@ -365,9 +364,9 @@ int select(Segment &segment, const TrackTable &table, const pf_camera &camera, B
     return observations;
 }
 
-// Without the frames at either end of which fewer than LEAST_SEEN points are where they should be: they have no pose of
-// their own. A camera's model that does not fit leaves such.
-Submap without_blind_ends(const Submap &map, const TrackTable &table, const pf_camera &camera, double gate)
+// The longest run of frames in each of which LEAST_SEEN points or more are where they should be: others have no pose of
+// their own. A camera's model that does not fit leaves such, and where it does not fit at all no frame.
+Submap seeing_part(const Submap &map, const TrackTable &table, const pf_camera &camera, double gate)
 {
     std::vector<int> seen(map.poses.size());
     Pose room;
@@ -379,17 +378,19 @@ Submap without_blind_ends(const Submap &map, const TrackTable &table, const pf_c
             }
         }
     }
-    const auto sees = [](int count) { return count >= LEAST_SEEN; };
-    const auto from = std::find_if(seen.begin(), seen.end(), sees);
-    const auto to = std::find_if(seen.rbegin(), std::make_reverse_iterator(from), sees).base();
-    if (to - from < 3) {
-        return map;
+    int from = 0, to = 0, run = 0;
+    for (size_t f = 0; f < seen.size(); f++) {
+        run = seen[f] >= LEAST_SEEN ? run + 1 : 0;
+        if (run > to - from) {
+            to = static_cast<int>(f) + 1;
+            from = to - run;
+        }
     }
-    return part_of(map, table, map.first + static_cast<int>(from - seen.begin()),
-                   map.first + static_cast<int>(to - seen.begin()));
+    return to - from < 3 ? Submap{} : part_of(map, table, map.first + from, map.first + to);
 }
 
-void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
+// False: too little of it agrees for poses.
+bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
     normalise(map);
@@ -419,7 +420,10 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
-    map = without_blind_ends(map, table, central, settings.gate);
+    map = seeing_part(map, table, central, settings.gate);
+    if (map.poses.empty()) {
+        return false;
+    }
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
     settings.cost_tolerance = 0.01 / std::max(observations, 1);
@@ -460,6 +464,7 @@ void finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
         settings.camera_prior = options.camera_prior;
         segment.report = adjust(map, table, central, settings, &segment.total);
     }
+    return true;
 }
 
 // Frames that two neighbours have stay with the first; what has then fewer than three is dropped.
@@ -570,8 +575,9 @@ Reconstruction reconstruct(const TrackTable &whole, const pf_camera &camera, con
     for (Submap &map : building.maps) {
         Segment segment;
         segment.map = std::move(map);
-        finish(segment, table, camera, inner);
-        out.segments.push_back(std::move(segment));
+        if (finish(segment, table, camera, inner)) {
+            out.segments.push_back(std::move(segment));
+        }
     }
     out.gaps = gaps_between(out.segments, building.gaps, table.frames());
     return out;
