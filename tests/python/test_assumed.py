@@ -54,6 +54,33 @@ def test_a_held_camera_stays_and_no_survey_sharpens_it() -> None:
     assert np.median(stated) > np.median(np.einsum("nii->n", free.systematic))
 
 
+def test_a_calibration_that_fixes_a_norm_has_a_covariance_like_any_other() -> None:
+    """Of a harmonic only the product of its amplitude in theta and its direction in phi is known: the direction has
+    unit norm, and no variance along itself. The drive is measured, its camera is a camera, and the systematic part is
+    that of the other parameters."""
+    drive = tube_drive(10, 1.0)
+    phi = (0.6, 0.8, 0.0, 0.0)
+    camera = dataclasses.replace(drive.camera, asym_radial_theta=(2e-4, 0.0, 0.0), asym_radial_phi=phi)
+    names = ("f_u", "f_v", *(f"asym_radial_phi[{i}]" for i in range(4)))
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2] = 0.3**2  # the two are one: singular too
+    covariance[2:, 2:] = 0.1**2 * (np.eye(4) - np.outer(phi, phi))
+    camera = dataclasses.replace(camera, covariance_parameters=names, covariance=covariance)
+    rec = pf.reconstruct(drive.tracks, camera, drive.driven)
+    assert rec.status == "ok" and rec.systematic is not None and np.isfinite(rec.systematic).all()
+    changed = rec.camera_of(camera, 0)
+    assert np.linalg.norm(changed.asym_radial_phi) == pytest.approx(1.0)
+    assert changed.f_u - camera.f_u == pytest.approx(changed.f_v - camera.f_v, abs=1e-9)
+    held = pf.reconstruct(drive.tracks, camera, drive.driven, hold_camera=True)
+    plain = dataclasses.replace(camera, covariance=None, covariance_parameters=())
+    moved = pf.reconstruct(
+        drive.tracks, dataclasses.replace(plain, f_u=plain.f_u + 0.3, f_v=plain.f_v + 0.3), drive.driven
+    )
+    there = pf.reconstruct(drive.tracks, plain, drive.driven)
+    ratio = np.einsum("nii->n", held.systematic) / ((moved.points - there.points) ** 2).sum(axis=1)
+    assert 0.8 < np.sqrt(np.median(ratio)) < 1.25
+
+
 def test_a_sag_that_differs_around_the_picture_makes_no_oval() -> None:
     """Tracks sag more to the sides than up and down: what a window's second moment as a tensor does."""
     drive = tube_drive(11, 1.5, sigma=0.03, ovality=0.0, limits=(25, 94))
