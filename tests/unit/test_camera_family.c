@@ -378,6 +378,43 @@ static void test_derivatives_where_there_are_none(void)
     TEST_ASSERT_DOUBLE_WITHIN(1e-5, (moved[1] - uv[1]) / (0.5 * h), by_point[3]);
 }
 
+/* Found by the fuzzer: the first-order start lies on the rim three quarters of a radian away from the pixel's own place
+ * there, and Newton's step from it leads outwards, where cut off it comes no closer. */
+static void test_the_rim_is_found_from_far_along_it(void)
+{
+    const struct {
+        uint32_t first;
+        double value[4];
+    } parameters[] = {{PF_PARAM_F_U, {356.25, 552.75, 0.125, 881.875}},
+                      {PF_PARAM_C_V, {639.125, 0.03125, 0.00390625, -0.0009765625}},
+                      {PF_PARAM_K5, {6.103515625e-05}},
+                      {PF_PARAM_ASYM_TANGENTIAL_THETA, {-0.125, -0.001953125, -0.001953125}},
+                      {PF_PARAM_ASYM_TANGENTIAL_PHI, {-1 / sqrt(13), 2 / sqrt(13), 2 / sqrt(13), 2 / sqrt(13)}},
+                      {PF_PARAM_TILT, {0.0109375, -0.0109375}}};
+    pf_camera camera = plain(PF_RADIAL_GENERIC, 0);
+    camera.height = 800;
+    camera.theta_max = 1.5032745098039215;
+    for (size_t i = 0; i < sizeof parameters / sizeof parameters[0]; i++)
+        for (uint32_t k = 0; k < 4 && parameters[i].value[k] != 0; k++)
+            *pf_camera_param_at(&camera, parameters[i].first + k) = parameters[i].value[k];
+    camera.asym_radial_phi[3] = -1;
+    for (int i = 0; i < PF_CPOLY_MAX; i++)
+        camera.cpoly[i] = 0.001953125;
+    camera.cpoly[10] = 0.0625;
+    camera.cpoly[11] = -0.0087890625;
+    camera.cpoly[12] = -0.1162109375;
+    const char *why = NULL;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_camera_check(&camera, &why), why);
+    for (int i = 0; i < 3600; i++) {
+        double phi = 0.1 * i * DEGREES, uv[2], ray[3];
+        double xyz[3] = {sin(camera.theta_max) * cos(phi), sin(camera.theta_max) * sin(phi), cos(camera.theta_max)};
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_project(&camera, xyz, uv, NULL, NULL));
+        TEST_ASSERT_EQUAL_INT(PF_OK, pf_camera_unproject(&camera, uv, ray, NULL, NULL));
+        for (int k = 0; k < 3; k++)
+            TEST_ASSERT_DOUBLE_WITHIN(1e-11, xyz[k], ray[k]);
+    }
+}
+
 /* Proves: d ray / d pixel is the five-point difference quotient (step 0.05 px: below 1e-9 where the lens does not
  * flatten), for every lens. */
 static void test_derivative_of_unproject(void)
@@ -613,6 +650,7 @@ int main(void)
     RUN_TEST(test_project_equals_the_definition);
     RUN_TEST(test_round_trip_over_the_whole_domain);
     RUN_TEST(test_round_trip_where_the_plane_is_huge);
+    RUN_TEST(test_the_rim_is_found_from_far_along_it);
     RUN_TEST(test_unproject_refuses_beyond_the_rim);
     RUN_TEST(test_unproject_refuses_the_impossible);
     RUN_TEST(test_derivatives_equal_finite_differences);

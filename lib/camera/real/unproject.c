@@ -83,44 +83,65 @@ static bool is_outside(const pf_camera *camera, camera_kind kind, plane_angle z,
     return false;
 }
 
+/* Where Newton's method stands: the plane point's miss e of the target, in the frame (u_r, u_phi) there. */
+typedef struct newton {
+    plane_angle at;
+    lens_point lens;
+    double e[2], cost;
+} newton;
+
+static newton newton_at(const pf_camera *camera, camera_kind kind, plane_angle at, double x, double y)
+{
+    newton now = {.at = at, .lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s)};
+    now.cost = residual(&now.lens, at, x, y, now.e);
+    return now;
+}
+
+/* Takes the step, halved until it comes closer to (x, y); false: it does not, and `now` stays. */
+static bool comes_closer(const pf_camera *camera, camera_kind kind, newton *now, double radial, double tangential,
+                         int halvings, double x, double y)
+{
+    for (double length = 1; halvings > 0; halvings--, length *= 0.5) {
+        newton next = newton_at(camera, kind, moved(camera, now->at, length * radial, length * tangential), x, y);
+        if (next.cost < now->cost) {
+            *now = next;
+            return true;
+        }
+    }
+    return false;
+}
+
 /* Newton on the whole map in the chart (X, Y), where the axis is an ordinary point; a step that does not come closer is
  * halved. pf_camera_check has proved the map one-to-one on the disc, so what stops with a residual lies outside, unless
- * the next step is less than a ray can tell: where r' is huge, the last bit of theta is more than the slack. */
+ * the next step is less than a ray can tell: where r' is huge, the last bit of theta is more than the slack. On the rim
+ * a step outwards, cut off there, may lead away from what lies along it: then the rim itself is followed (Gauss). */
 static bool asymmetric_inverse(const pf_camera *camera, camera_kind kind, double x, double y, double slack,
                                plane_angle *out)
 {
-    plane_angle at = first_order_start(camera, kind, x, y);
-    lens_point lens = pf_camera_lens(camera, kind, at.theta, at.c, at.s);
-    double e[2], cost = residual(&lens, at, x, y, e), step = 0;
-    for (int i = 0; i < 100 && cost > 0; i++) {
-        double det = lens.r_t * lens.t_p - lens.r_p * lens.t_t;
-        double radial = -(lens.t_p * e[0] - lens.r_p * e[1]) / det;
-        double tangential = -(lens.r_t * e[1] - lens.t_t * e[0]) / det;
+    newton now = newton_at(camera, kind, first_order_start(camera, kind, x, y), x, y);
+    double step = 0;
+    for (int i = 0; i < 100 && now.cost > 0; i++) {
+        const lens_point *l = &now.lens;
+        const double *e = now.e;
+        double det = l->r_t * l->t_p - l->r_p * l->t_t;
+        double radial = -(l->t_p * e[0] - l->r_p * e[1]) / det;
+        double tangential = -(l->r_t * e[1] - l->t_t * e[0]) / det;
         step = sqrt(radial * radial + tangential * tangential);
-        if (step <= DBL_EPSILON * at.theta)
+        if (step <= DBL_EPSILON * now.at.theta)
             break;
-        if (at.theta == camera->theta_max && radial > 0 && is_outside(camera, kind, at, x, y, slack))
+        bool held = now.at.theta == camera->theta_max && radial > 0;
+        if (held && is_outside(camera, kind, now.at, x, y, slack))
             return false;
         /* A step of this size that does not come closer is rounding, not the wrong way. */
-        int halvings = step <= 1e-12 * at.theta ? 1 : 40;
-        plane_angle next = at;
-        double next_cost = cost, length = 1, next_e[2];
-        for (int halving = 0; halving < halvings; halving++, length *= 0.5) {
-            next = moved(camera, at, length * radial, length * tangential);
-            lens = pf_camera_lens(camera, kind, next.theta, next.c, next.s);
-            next_cost = residual(&lens, next, x, y, next_e);
-            if (next_cost < cost)
-                break;
-        }
-        if (!(next_cost < cost))
-            break; /* rounding, or the rim */
-        at = next;
-        cost = next_cost;
-        e[0] = next_e[0];
-        e[1] = next_e[1];
+        int halvings = step <= 1e-12 * now.at.theta ? 1 : 40;
+        if (comes_closer(camera, kind, &now, radial, tangential, halvings, x, y))
+            continue;
+        double along = -(l->r_p * e[0] + l->t_p * e[1]) / (l->r_p * l->r_p + l->t_p * l->t_p);
+        if (!(held && comes_closer(camera, kind, &now, 0, along, halvings, x, y)))
+            break; /* rounding, or nothing on the rim is closer */
     }
-    *out = at;
-    return cost <= slack * slack || step <= THETA_SLACK;
+    *out = now.at;
+    return now.cost <= slack * slack || step <= THETA_SLACK;
 }
 
 /* Derivative of the ray by the pixel: through the inverse of the lens's Jacobian at the result. */
