@@ -57,6 +57,12 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
         d->is_damaged = true;
         status = PF_ERR_FORMAT;
         break;
+    case SQLITE_READONLY: /* of a file that can be written: its header names a format that SQLite may only read */
+        if (d->is_read_only || pf_spool_is_read_only(d->path))
+            break;
+        d->is_damaged = true;
+        status = PF_ERR_FORMAT;
+        break;
     case SQLITE_BUSY:
         return pf_fail(&d->failure, PF_ERR_IO, "%s: another program uses it", d->path);
     case SQLITE_FULL:
