@@ -110,6 +110,24 @@ static void test_damage_found_in_use_is_healed(void)
     TEST_ASSERT_TRUE(count_whole() >= 4);
 }
 
+/* Proves: a header that names a newer format, which SQLite may read but not write, is damage like any other where the
+ * file can be written: the next object is stored, and what was there is saved. */
+static void test_a_header_of_a_newer_format_is_damage(void)
+{
+    open_spool("newer.db", 0);
+    for (uint64_t id = 1; id <= 3; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    close_spool();
+    FILE *f = fopen(temporary_path("newer.db"), "r+b");
+    TEST_ASSERT_NOT_NULL(f);
+    TEST_ASSERT_EQUAL_INT(0, fseek(f, 18, SEEK_SET)); /* the write version */
+    TEST_ASSERT_EQUAL_INT(3, fputc(3, f));
+    TEST_ASSERT_EQUAL_INT(0, fclose(f));
+    open_spool("newer.db", 0);
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, put(4), spool.ops->error(spool.self));
+    TEST_ASSERT_EQUAL_INT(4, count_whole());
+}
+
 enum { COUNT = 80 }; /* more than SQLite keeps in memory */
 
 /* A spool of COUNT objects that is in use, and whose file has lost every page from `first` up to `end` (0: the last).
@@ -535,6 +553,7 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_a_damaged_file_is_set_aside_and_what_is_whole_is_saved);
     RUN_TEST(test_damage_found_in_use_is_healed);
+    RUN_TEST(test_a_header_of_a_newer_format_is_damage);
     RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_a_damaged_file_without_a_successor_is_read_later);
     RUN_TEST(test_a_damaged_file_that_cannot_be_opened_now_is_read_later);
