@@ -119,6 +119,7 @@ def _directions(camera: Camera, theta_end: float) -> Floats:
 
 def _own_covariance(camera: Camera, theta_end: float) -> Floats:
     """The covariance of FREE without a drift, (23,23): the profile's, and what it does not know of its lens."""
+    # A bound, taken for a sigma: twice as wide as the diameter's budget has it, for what is blamed here is the lens.
     # A wall 75 mm away looks through a shift that the profile does not know as if the angles had drifted.
     pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_MOST
     theta = np.linspace(0.2, 1.0, 60) * theta_end

@@ -141,6 +141,8 @@ class Course:
         from pipefish.measured_files import stations
 
         m = measure(self._part(indices), method="incremental", threads=1, pictures=False)
+        if self.places and m.scale.unit != self.unit:  # what an encoder that stood still left is of another unit
+            self.places, self.driven, self.every = {}, {}, 0.0
         self.why, self.unit = "", m.scale.unit
         told = self._warn("scale", 0, "no scale: diameters are not measured") if m.scale.unit != "metre" else []
         for gap in m.structure.gaps:

@@ -81,17 +81,29 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
     if not np.isfinite(value).any():
         return _verdict(name, bound, unit, "not measured", "no station has it")
     excess = (value - bound) * (1 if limit.side == "at most" else -1)
-    worst = int(np.nanargmax(excess))
-    at = length_text(column(document, "chainage")[worst], scale["unit"], metres=True)
-    shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
     outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
     known = np.isfinite(value)
+    reach = np.where(
+        np.isfinite(sigma), Z95 * sigma, 0.0
+    )  # the station that decides, surely outside or not surely inside
+    worst = int(np.nanargmax(excess - reach if outside[known].any() else excess + reach))
+    at = length_text(column(document, "chainage")[worst], scale["unit"], metres=True)
+    shown = f"{value[worst]:.2f} ± {Z95 * sigma[worst]:.2f} {unit} at {at}"
     missing = len(value) - int(known.sum())
     state = "failed" if outside[known].any() else "passed" if inside[known].all() else "undecided"
-    if state == "passed" and missing:
+    left_out = sum(_has_length(stretch) for stretch in document.get("not_measured", []))
+    if state == "passed" and (missing or left_out):
         state = "passed where measured"
     more = f"; {missing} of {len(value)} stations have no value" if missing else ""
+    if left_out:
+        more += f"; {left_out} {'stretch' if left_out == 1 else 'stretches'} not measured"
     return _verdict(name, bound, unit, state, shown + more)
+
+
+def _has_length(stretch: dict[str, Any]) -> bool:
+    """Of what was not measured: whether there is wall that was not seen."""
+    start, end = stretch["start"], stretch["end"]
+    return start is None or end is None or end > start
 
 
 def _verdict(name: str, bound: float, unit: str, state: str, shown: str) -> dict[str, Any]:

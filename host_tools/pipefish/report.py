@@ -56,8 +56,9 @@ class Report(Charts):
                 text = f"{word} anywhere, at {at}; ± {own:.{digits}f} repeatability (95 %)"
                 tiles.append((f"{self.factor * s[name]:.{digits}f}", self.short, text))
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
-            rms = 100 * s["ovality_rms"]
-            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}; {rms:.2f} % rms along the pipe"))
+            rms = s.get("ovality_rms")  # older documents have none
+            along = "" if rms is None else f"; {100 * rms:.2f} % rms along the pipe"
+            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}{along}"))
         figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
         tiles.append(figure)
         return tiles
@@ -98,7 +99,9 @@ class Report(Charts):
 
     def pupil_text(self) -> str:
         """What the pupil's shift leaves open in all diameters. Documents of older versions have none."""
-        pupil = self.summary["systematic"].get("pupil", 0.0)
+        if "pupil" not in self.summary["systematic"]:
+            return "not counted by the version that measured"
+        pupil = self.summary["systematic"]["pupil"]
         if pupil:
             return f"± {Z95 * 100 * pupil:.2f} %, assumed: the profile does not say how well it knows it"
         known = self.document["camera"].get("pupil_known", False)

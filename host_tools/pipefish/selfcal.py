@@ -311,7 +311,7 @@ def _reason(status: str, found: dict[str, Any]) -> str:
 
 def stored_alpha_sigma(camera: Camera) -> float | None:
     """Sigma of ln alpha that a self-calibrated camera's profile keeps; None of any other."""
-    kept = re.search(rf"{re.escape(ALPHA_TEXT)} ([0-9.e+-]+) %", camera.provenance.model_choice)
+    kept = re.search(rf"{re.escape(ALPHA_TEXT)} (\d+(?:\.\d+)?(?:e[+-]?\d+)?) %", camera.provenance.model_choice)
     return float(kept[1]) / 100 if camera.source == "selfcal" and kept else None
 
 

@@ -111,7 +111,8 @@ class Reconstruction:
     observations     used; outside: beyond the camera's model; repeated: the same track twice in a frame
     standing         frames not used: nothing had moved since the one before
     gaps             list of Gap
-    down             (3,) direction of gravity in the world, None without an inclinometer
+    down             (3,) direction of gravity in the world, None where the first segment has no reading of an
+                     inclinometer
     sag              (3,) px^2, of each segment: the tracks' common sag all around alike, and what along a radius at
                      phi its cosine and sine of 2 phi add
     line_time        seconds, and its sigma, as the survey's own rows tell it; None without a rolling shutter

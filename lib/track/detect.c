@@ -85,7 +85,7 @@ static int64_t rim_of(const pf_tracker *t)
 {
     const pf_scene_measures *m = &t->stats.scene;
     const int64_t rim = (int64_t)(t->config.circle_radius_q16 >> 8) * (OUTER - 1) / OUTER;
-    const bool comes_out = 5u * m->outward > 3u * m->moved; /* as many as must go in for it to be reversing */
+    const bool comes_out = 5u * m->outward > 3u * m->moved; /* the share that must go in for it to be reversing */
     return comes_out && t->late_q8 > 0 && t->late_q8 < rim ? t->late_q8 : rim;
 }
 

@@ -443,6 +443,31 @@ def test_stations_without_a_value_are_not_taken_for_passed(out, tmp_path, capsys
     assert json.loads(capsys.readouterr().out)["limits"][0]["state"] == "passed where measured"
 
 
+@pytest.mark.parametrize(("end", "state"), [(1.9, "passed where measured"), (1.2, "passed")])
+def test_a_limit_does_not_hold_over_a_stretch_that_nobody_measured(out, end, state):
+    """One without a length is a break in the chain of tracks whose wall was seen all the same."""
+    from pipefish.measured_limits import all_hold, verdict
+
+    document = document_of(out)
+    document["not_measured"] = [{"start": 1.2, "end": end, "reason": "weak_texture"}]
+    found = verdict(document, "ovality", 5.0)
+    assert found["state"] == state and all_hold([found]) == (state == "passed")
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "state", "shown"),
+    [([0.060, 0.055], [0.015, 0.001], "failed", "5.50"), ([0.049, 0.045], [0.0002, 0.010], "undecided", "4.50")],
+)
+def test_the_station_that_decides_is_the_one_that_is_shown(out, value, sigma, state, shown):
+    from pipefish.measured_limits import verdict
+
+    document = document_of(out)
+    stations = {name: column[:2] for name, column in document["stations"].items()}
+    document["stations"] = stations | {"ovality": value, "ovality_sigma": sigma, "ovality_systematic": [0.0, 0.0]}
+    found = verdict(document, "ovality", 5.0)
+    assert found["state"] == state and found["worst"].startswith(shown)
+
+
 def test_the_help_names_every_limit(capsys):
     from pipefish.measured_limits import LIMITS
 

@@ -53,8 +53,8 @@ public:
 
     // Where the sum is least. Throws std::runtime_error where it has no minimum.
     Eigen::VectorXd solve() const;
-    // The same to a hundredth of the way, by conjugate gradients from the factor of a similar system of the same
-    // pattern, which is replaced where it does not serve, or is none.
+    // The same by conjugate gradients from the factor of a similar system of the same pattern, which is replaced where
+    // it does not serve, or is none: until the residual, measured by that system, is a hundredth.
     Eigen::VectorXd solve(std::shared_ptr<const Factor> &similar) const;
 
 private:

@@ -368,14 +368,18 @@ int select(Segment &segment, const TrackTable &table, const pf_camera &camera, B
 // their own. A camera's model that does not fit leaves such, and where it does not fit at all no frame.
 Submap seeing_part(const Submap &map, const TrackTable &table, const pf_camera &camera, double gate)
 {
-    std::vector<int> seen(map.poses.size());
+    std::vector<int> seen(map.poses.size()), views;
     Pose room;
     for (size_t p = 0; p < map.tracks.size(); p++) {
+        views.clear();
         for (const Observation &o : table.of_track(map.tracks[p])) {
             if (map.has(o.frame) &&
                 reprojection_squared(camera, pose_of(map, table, o, room), map.points[p], o) < gate * gate) {
-                seen[static_cast<size_t>(o.frame - map.first)]++;
+                views.push_back(o.frame - map.first);
             }
+        }
+        for (const int frame : views) {
+            seen[static_cast<size_t>(frame)] += views.size() >= 3; // those with fewer are left out
         }
     }
     int from = 0, to = 0, run = 0;
@@ -386,23 +390,33 @@ Submap seeing_part(const Submap &map, const TrackTable &table, const pf_camera &
             from = to - run;
         }
     }
-    return to - from < 3 ? Submap{} : part_of(map, table, map.first + from, map.first + to);
+    if (to - from < 3) {
+        return {};
+    }
+    const Submap part = part_of(map, table, map.first + from, map.first + to);
+    return part.poses.size() == map.poses.size() ? part : seeing_part(part, table, camera, gate);
+}
+
+// The segment's gauge, and its unit where the encoder tells one.
+void anchor(Segment &segment, const ReconstructOptions &options)
+{
+    segment.metric = false;
+    segment.scale_sigma = 0.0;
+    normalise(segment.map);
+    const double ratio = options.odometry ? path_ratio(segment.map, *options.odometry, &segment.scale_sigma) : 0.0;
+    if (ratio > 0.0) {
+        segment.metric = true;
+        Similarity s;
+        s.scale = ratio;
+        transform(segment.map, s);
+    }
 }
 
 // False: too little of it agrees for poses.
 bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
-    normalise(map);
-    if (options.odometry) {
-        const double ratio = path_ratio(map, *options.odometry, &segment.scale_sigma);
-        if (ratio > 0.0) {
-            segment.metric = true;
-            Similarity s;
-            s.scale = ratio;
-            transform(map, s);
-        }
-    }
+    anchor(segment, options);
     pf_camera central = camera;
     if (!segment.metric) {
         central.pupil_e1 = 0.0; // a length, and lengths are not known
@@ -420,9 +434,15 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     // Least squares on what is left, for an honest covariance.
     settings.loss = {};
     settings.gate = 3.5 * std::max(segment.sigma, 0.5);
-    map = seeing_part(map, table, central, settings.gate);
-    if (map.poses.empty()) {
+    Submap part = seeing_part(map, table, central, settings.gate);
+    if (part.poses.size() < 3) {
         return false;
+    }
+    if (part.poses.size() < map.poses.size()) {
+        map = std::move(part);
+        anchor(segment, options);
+        central.pupil_e1 = segment.metric ? camera.pupil_e1 : 0.0;
+        settings.odometry = segment.metric ? options.odometry : nullptr;
     }
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
