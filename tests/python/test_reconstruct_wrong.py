@@ -11,7 +11,7 @@ import pipefish as pf
 from pipefish import _engine
 from pipefish.structure_gaps import zoom_between
 from test_reconstruct_covariance import residuals
-from tube_tracks import Drive, rotation, similarity, tube_drive
+from tube_tracks import Drive, fisheye, rotation, similarity, tube_drive
 
 
 def slid(drive: Drive, random: np.random.Generator, share: float, frame: int) -> tuple[pf.Tracks, np.ndarray]:
@@ -189,3 +189,14 @@ def test_pictures_that_cannot_be_are_a_status_without_a_wrong_number(kind: str) 
         assert rec.status == "ok" and np.abs(scale * rec.points @ turn.T + move - mirrored).max() < 0.05
     else:
         assert rec.status == "failed" and rec.reason
+
+
+@pytest.mark.parametrize(("shift", "seed"), [(0.001, 3), (0.001, 4), (0.002, 4), (0.004, 3)])
+def test_a_pupil_that_no_encoder_scales_ends_in_a_status(shift: float, seed: int) -> None:
+    """Without an encoder lenses count as central: of a pupil that moves by millimetres beside a wall 60 mm away hardly
+    an observation is left, and what is left determines nothing or little. That is a gap, and no internal error."""
+    camera = dataclasses.replace(fisheye(95), pupil_e1=shift)
+    drive = tube_drive(seed, 1.0, step=0.02, diameter=0.12, camera=camera)
+    rec = pf.reconstruct(drive.tracks, camera, None)
+    assert rec.status in ("partial", "failed") and rec.gaps and np.isfinite(rec.points).all()
+    assert np.isfinite(rec.covariance).all()

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 
 namespace pipefish::sfm
 {
@@ -595,8 +596,12 @@ Reconstruction reconstruct(const TrackTable &whole, const pf_camera &camera, con
     for (Submap &map : building.maps) {
         Segment segment;
         segment.map = std::move(map);
-        if (finish(segment, table, camera, inner)) {
-            out.segments.push_back(std::move(segment));
+        try {
+            if (finish(segment, table, camera, inner)) {
+                out.segments.push_back(std::move(segment));
+            }
+        } catch (const std::domain_error &) {
+            continue; // not determined: a gap, and the other segments stay
         }
     }
     out.gaps = gaps_between(out.segments, building.gaps, table.frames());
