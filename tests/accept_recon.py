@@ -31,7 +31,8 @@ from typing import Any
 import numpy as np
 
 import pipefish as pf
-from pipefish.measure import TRACK_COMMON_PX, TRACK_FLOOR_PX
+from pipefish.measure import TRACK_COMMON_PX
+from pipefish.readings import TRACK_FLOOR_PX
 from pipefish.sectionsigma import diameter_sigma, shared_of
 
 ROOT = Path(__file__).resolve().parents[1]

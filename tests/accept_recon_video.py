@@ -18,8 +18,9 @@ from accept_recon import FOLDER
 
 from pipefish.demo import Recording, find_programs, survey_over_the_line
 from pipefish.errors import PipefishError
-from pipefish.measure import Measurement, measure
+from pipefish.measure import measure
 from pipefish.measured_remarks import not_measured
+from pipefish.measurement import Measurement
 from pipefish.measuretruth import against_truth, bare, true_place
 from pipefish.simcamera import calibrated
 from pipefish.simulate import Scene, simulate

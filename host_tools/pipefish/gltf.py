@@ -16,8 +16,8 @@ from PIL import Image
 from pipefish import __version__
 from pipefish.colours import diverging
 from pipefish.errors import PipefishError
-from pipefish.measure import Measurement
 from pipefish.measured_files import COLOUR_SPAN, RING
+from pipefish.measurement import Measurement
 from pipefish.unroll import Tell, Unroller
 from pipefish.wall import Piece, Wall, measured_wall
 

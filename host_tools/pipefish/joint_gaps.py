@@ -13,7 +13,7 @@ from pipefish.unroll import Unroller
 from pipefish.wall import measured_wall
 
 if TYPE_CHECKING:
-    from pipefish.measure import Measurement
+    from pipefish.measurement import Measurement
 
 SECTORS = 36
 MOST = 2 / 3  # of the sectors that must show it

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,13 +14,14 @@ from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.pupil import pupil_sigma
-from pipefish.repeated import Repetition, cut, jumps, renamed, repetition
-from pipefish.rolling import shutter_of
+from pipefish.readings import TRACK_FLOOR_PX, Readings, angles, readings_of
+from pipefish.repeated import jumps, renamed, repetition
 from pipefish.scale import Known, Scale, with_diameter
-from pipefish.scale_sources import beforehand, find_scale
+from pipefish.scale_sources import Beforehand, beforehand, find_scale
 from pipefish.sectionsigma import diameter_sigma, shared_of
-from pipefish.structure import Encoder, Reconstruction, reconstruct
+from pipefish.structure import Reconstruction, reconstruct
 from pipefish.survey import Survey, Tracks
 from pipefish.target import Target
 from pipefish.tube import AGAINST_GRAVITY, Tube, fit_tube
@@ -31,18 +30,9 @@ from pipefish.tube_water import depth, mirrored
 T = TypeVar("T")
 Tell = Callable[[float, str], None]  # fraction done, what is going on
 
-OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are not in the COLMAP model
-ENCODER_LEAST_M = 0.02  # an encoder that moved less tells no scale
-# A tracker's stated covariance is that of one frame's noise. Along a track errors add up, each track its own: in
-# simulated pipes (concrete, brick) 0.3 to 0.5 px for each radian by which the point has moved away from the axis.
-TRACK_WALK_PX = 0.3
-# What all tracks have in common does not average out: 0.01 px a keyframe bends the scale by per cents in 6 m where
-# vision outvotes the encoder. The largest part of it has a known form and is estimated: px^2, the second moment
-# of a window of 21 px is 37; 70 to 90 were found, of a tracker that corrects for it 25. For the rest vision's word
-# counts less: scatter of the diameter in concrete and brick with 0.3 px 0.10 and 0.88 %, with 0.5 px 0.07 and
-# 0.09 %, with 0.8 px 0.06 and 0.10 %.
+# Of what all tracks have in common (see readings.TRACK_FLOOR_PX) the largest part has a known form and is estimated:
+# px^2, the second moment of a window of 21 px is 37; 70 to 90 were found, of a tracker that corrects for it 25.
 TRACK_SAG_PX2 = 100.0
-TRACK_FLOOR_PX = 0.5
 # An ellipse has no encoder in it, and the floor is more than what tracks have in common: ellipses of rendered brick,
 # concrete and PVC were off (both parameters, along the whole pipe) as by 0.5, 0.4 and 0.3 px.
 TRACK_COMMON_PX = 0.4
@@ -51,164 +41,6 @@ TRACK_COMMON_PX = 0.4
 # then show a drift with a chi-square of 2 and 3 for 5 degrees of freedom.
 TRACK_SHARPER = 0.6
 STOOD = 10  # frames in which less than a centimetre was driven
-DEFAULT_ATTITUDE_SIGMA = 0.01
-
-
-@dataclass
-class Stretch:
-    """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
-    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known).
-    water: see `tube_water.mirrored`, whose points are not in the tube."""
-
-    segment: int
-    tube: Tube
-    frames: np.ndarray
-    origin: float
-    sign: int
-    d_mean_sigma: float = math.nan
-    camera: Any = 0.0
-    water: list[dict[str, Any]] = field(default_factory=list)
-
-    def chainage(self, s: Any) -> Any:
-        """Along the survey, from s along the tube."""
-        return self.origin + self.sign * np.asarray(s, float)
-
-
-@dataclass
-class Residuals:
-    """Of every observation of a point: position of its frame and of its point in the structure, item of the tracks,
-    (N,2) px, angle from the axis, and size over OUTLIER_SIGMA's unit: the tracker's stated noise times `spread`, the
-    robust spread of the residuals over it."""
-
-    frame: np.ndarray
-    point: np.ndarray
-    item: np.ndarray
-    pixels: np.ndarray
-    theta: np.ndarray
-    whitened: np.ndarray
-    spread: float
-
-    @property
-    def inlier(self) -> np.ndarray:
-        return self.whitened <= OUTLIER_SIGMA
-
-
-@dataclass
-class Measurement:
-    """A measured survey.
-
-    index       (K,) index of each keyframe that is here; frames below and in `structure` count these
-    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
-    structure   in the unit of `scale`
-    camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
-                not known
-    pupil_sigma    the same by a pupil shift that the profile does not know, and so assumed
-    health      what the survey says of its profile
-    repeats     how often the wall looks the same elsewhere; None: its pictures were not looked at
-    jumped      frames at which tracks had gone on to the next repeat, and were cut
-    remarks     what one should know, in words, most serious first
-    factors     of each segment: by what the adjustment's unit was multiplied
-    """
-
-    survey: Survey
-    camera: Camera
-    tracks: Tracks
-    index: np.ndarray
-    encoder: np.ndarray | None
-    structure: Reconstruction
-    scale: Scale
-    nominal: float | None
-    stretches: list[Stretch]
-    camera_sigma: float | None
-    residuals: Residuals
-    backwards: bool
-    pupil_sigma: float = 0.0
-    health: ProfileCheck | None = None
-    repeats: Repetition | None = None
-    jumped: list[int] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
-    factors: list[float] = field(default_factory=list)
-
-    @property
-    def measured(self) -> list[Stretch]:
-        """Stretches with a tube."""
-        return [s for s in self.stretches if s.tube.status == "ok"]
-
-    @property
-    def systematic(self) -> float:
-        """Relative sigma that all diameters share."""
-        return math.hypot(self.scale.sigma, self.camera_sigma or 0.0, self.pupil_sigma)
-
-    @property
-    def up(self) -> np.ndarray:
-        """Against gravity, or up in the first keyframe."""
-        down = self.structure.down
-        return -down if down is not None else np.array([0.0, -1.0, 0.0])
-
-    def path(self, segment: int) -> np.ndarray:
-        """Camera centres in the order in which the tube's s grows: the way the camera looks."""
-        centres = self.structure.centres[self.structure.segment == segment]
-        return centres[::-1] if self.backwards else centres
-
-    def frame_chainage(self) -> np.ndarray:
-        """(F,) chainage of the structure's frames, by the encoder or along the path."""
-        if self.encoder is not None:
-            return self.encoder[self.structure.frames]
-        steps = np.linalg.norm(np.diff(self.structure.centres, axis=0), axis=1)
-        return np.append(0.0, np.cumsum(steps))
-
-
-def camera_of(survey: Survey, given: Camera | None) -> Camera:
-    """The given camera, or that of the survey's profile. Raises PipefishError where there is none that fits."""
-    camera = given
-    if camera is None:
-        if survey.start is None or not survey.start.profile:
-            raise PipefishError(f"{survey.path}: holds no camera profile: give one with --profile")
-        camera = Camera.from_binary(survey.start.profile)
-    frame = survey.keyframes[0]
-    if (camera.width, camera.height) != (frame.width, frame.height):
-        raise PipefishError(
-            f"{survey.path}: the camera profile is for pictures of {camera.width} x {camera.height}, the survey has "
-            f"{frame.width} x {frame.height}: a wrong profile?"
-        )
-    return camera
-
-
-def _encoder(survey: Survey, remarks: list[str]) -> tuple[np.ndarray | None, Encoder]:
-    """Distance at each keyframe, None if it tells nothing, and how good it is."""
-    chainage = survey.chainage()
-    told = survey.start.encoder if survey.start else None
-    count = told.metres_per_count if told else 0.0
-    known = chainage[np.isfinite(chainage)]
-    quality = Encoder(quantum=count)
-    if told is not None and told.noise_m_per_sqrt_m > 0:
-        quality = dataclasses.replace(quality, noise_m_per_sqrt_m=told.noise_m_per_sqrt_m)
-    if told is not None and told.metres_per_count_sigma > 0 and count > 0:
-        quality = dataclasses.replace(quality, scale_sigma=told.metres_per_count_sigma / count)
-    if len(known) < 2:
-        return None, quality
-    if np.abs(np.diff(known)).sum() < max(ENCODER_LEAST_M, 3 * count):
-        remarks.append("The encoder did not move: it tells no scale.")
-        return None, quality
-    if not told or not told.metres_per_count_sigma:
-        remarks.append(
-            f"The device does not say how good its encoder's scale is: {100 * quality.scale_sigma:.1f} % (one "
-            "sigma) is "
-            "assumed."
-        )
-    return chainage, quality
-
-
-def _attitude(survey: Survey) -> tuple[np.ndarray | None, float]:
-    values = np.full((len(survey.keyframes), 2), np.nan)
-    sigmas = []
-    for row, frame in zip(values, survey.keyframes, strict=True):
-        told = frame.telemetry
-        if "roll_rad" in told and "pitch_rad" in told:
-            row[:] = told["roll_rad"], told["pitch_rad"]
-            sigma = told.get("attitude_sigma_rad", 0.0)
-            sigmas.append(sigma if sigma > 0.0 and math.isfinite(sigma) else DEFAULT_ATTITUDE_SIGMA)
-    return (values, float(np.median(sigmas))) if sigmas else (None, DEFAULT_ATTITUDE_SIGMA)
 
 
 def _while_telling(work: Callable[[], T], tell: Callable[[], None]) -> T:
@@ -245,7 +77,6 @@ def measure(
     line_time: float | None = None,
     pictures: bool = True,
     tell: Tell | None = None,
-    _jumped: list[int] | None = None,
 ) -> Measurement:
     """Measures a survey.
 
@@ -268,108 +99,114 @@ def measure(
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
     if len(survey.keyframes) < 3:
         raise PipefishError(f"{survey.path}: {_too_short(survey)}; three are the least that can be measured")
-    camera = camera_of(survey, camera)
-    remarks: list[str] = []
-    chainage, quality = _encoder(survey, remarks)
-    attitude, attitude_sigma = _attitude(survey)
-    tracks = survey.tracks(as_found=True)
-    index = np.array([k.index for k in survey.keyframes], dtype=np.int64)
-    tracks = dataclasses.replace(
-        tracks,
-        frame=np.searchsorted(index, tracks.frame),  # missing keyframes take no number
-    )
-    if _jumped:
-        tracks = cut(tracks, _jumped)
-    walk = np.hypot(TRACK_FLOOR_PX, TRACK_WALK_PX * _travel(tracks, camera))
-    weighed = dataclasses.replace(tracks, covariance=tracks.covariance + (walk**2)[:, None, None] * np.eye(2))
-    shutter = shutter_of(survey, line_time)
-    structure = _while_telling(
+    readings = readings_of(survey, camera, line_time)
+
+    def fitted(readings: Readings, cuts: list[int]) -> tuple[Measurement, Reconstruction]:
+        """Poses and points, scale, tubes; and the structure in the adjustment's unit."""
+        structure = _adjusted(readings, method, threads, tell)
+        structure.gaps = renamed(structure.gaps, cuts)
+        m = _measurement(survey, readings, structure)
+        m.nominal = nominal or m.nominal
+        find_scale(m, known, threads, tell)
+        _fit_stretches(m, threads, tell)
+        _check_measured(m)
+        return m, structure
+
+    m, structure = fitted(readings, [])
+    if pictures:
+        m.repeats = repetition(m)
+        jumped = jumps(m, m.repeats)
+        if jumped:
+            readings = readings.cut_at(jumped)
+            m, structure = fitted(readings, jumped)
+            m.repeats, m.jumped = repetition(m), jumped
+    _sigmas(m)
+    _check_diameter(m, known.diameter)
+    m.health = _health(m, readings, structure, known, threads, tell)
+    if pictures:
+        tell_gaps(m)
+    remark(m)
+    return m
+
+
+def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) -> Reconstruction:
+    return _while_telling(
         lambda: reconstruct(
-            weighed,
-            assumed(camera),
-            chainage,
-            encoder=quality,
-            attitude=attitude,
-            attitude_sigma=attitude_sigma,
+            readings.weighed,
+            assumed(readings.camera),
+            readings.chainage,
+            encoder=readings.encoder,
+            attitude=readings.attitude,
+            attitude_sigma=readings.attitude_sigma,
             method=method,
             threads=threads,
             sag_sigma=TRACK_SAG_PX2,
-            hold_camera=camera.covariance is None,  # tracks are no better than what is assumed
-            drift=drift_prior(weighed, camera, TRACK_SHARPER),
+            hold_camera=readings.camera.covariance is None,  # tracks are no better than what is assumed
+            drift=drift_prior(readings.weighed, readings.camera, TRACK_SHARPER),
             common_errors=True,  # the floor
-            shutter=shutter,
+            shutter=readings.shutter,
         ),
         lambda: tell(0.05, "poses and points"),
     )
-    structure.gaps = renamed(structure.gaps, _jumped or [])
+
+
+def _measurement(survey: Survey, readings: Readings, structure: Reconstruction) -> Measurement:
+    """Of a structure whose scale is not looked for yet. Raises PipefishError where there is none."""
+    camera, chainage = readings.camera, readings.chainage
     if structure.status == "failed":
         raise PipefishError(
             f"{survey.path}: nothing could be measured: {_why(survey, structure)}{_pupil_doubt(camera, chainage)}"
         )
     ahead = np.einsum("ni,ni->n", np.diff(structure.centres, axis=0), structure.poses[:-1, 2, :3])
-    m = Measurement(
+    return Measurement(
         survey=survey,
         camera=camera,
-        tracks=tracks,
-        index=index,
+        tracks=readings.tracks,
+        index=readings.index,
         encoder=chainage,
         structure=structure,
         scale=Scale("none", "diameter", 0.0),
-        nominal=nominal or (survey.start.nominal_diameter_m if survey.start else 0.0) or None,
+        nominal=(survey.start.nominal_diameter_m if survey.start else 0.0) or None,
         stretches=[],
         camera_sigma=None,
-        residuals=_residuals(tracks, structure, camera),
+        residuals=_residuals(readings.tracks, structure, camera),
         backwards=bool(ahead.sum() < 0),
-        remarks=remarks,
+        remarks=list(readings.remarks),
     )
-    find_scale(m, known, threads, tell)
-    _fit_stretches(m, threads, tell)
-    if not m.measured:
-        reasons = sorted({s.tube.reason for s in m.stretches})
-        raise PipefishError(
-            f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
-            f"found, but no pipe around them: {'; '.join(reasons)}"
-            f"{_pupil_doubt(camera, chainage) or ' (a wrong camera profile?)'}"
-        )
-    if pictures:
-        m.repeats, m.jumped = repetition(m), _jumped or []
-        jumped = jumps(m, m.repeats) if _jumped is None else []
-        if jumped:
-            return measure(
-                survey,
-                camera,
-                diameter=known.diameter,
-                joint_spacing=known.spacing,
-                target=target,
-                nominal=nominal,
-                method=method,
-                threads=threads,
-                line_time=line_time,
-                tell=tell,
-                _jumped=jumped,
-            )
-    _sigmas(m)
-    _check_diameter(m, known.diameter)
-    m.health = _while_telling(
+
+
+def _check_measured(m: Measurement) -> None:
+    """Raises PipefishError where no stretch has a tube."""
+    if m.measured:
+        return
+    reasons = sorted({s.tube.reason for s in m.stretches})
+    raise PipefishError(
+        f"{m.survey.path}: poses of {len(m.structure.frames)} keyframes and {len(m.structure.points)} points were "
+        f"found, but no pipe around them: {'; '.join(reasons)}"
+        f"{_pupil_doubt(m.camera, m.encoder) or ' (a wrong camera profile?)'}"
+    )
+
+
+def _health(
+    m: Measurement, readings: Readings, structure: Reconstruction, known: Beforehand, threads: int | None, tell: Tell
+) -> ProfileCheck:
+    """structure: in the adjustment's unit."""
+    return _while_telling(
         lambda: check_profile(
-            weighed,
-            camera,
-            chainage,
+            readings.weighed,
+            readings.camera,
+            readings.chainage,
             structure=structure if structure.drift else None,
             noise=TRACK_SHARPER,
-            encoder=quality,
-            attitude=attitude,
-            attitude_sigma=attitude_sigma,
+            encoder=readings.encoder,
+            attitude=readings.attitude,
+            attitude_sigma=readings.attitude_sigma,
             diameter=known.diameter.value if known.diameter and m.scale.source == "encoder" else None,
             threads=threads,
-            shutter=shutter,
+            shutter=readings.shutter,
         ),
         lambda: tell(0.9, "profile"),
     )
-    if pictures:
-        tell_gaps(m)
-    remark(m)
-    return m
 
 
 def _states(survey: Survey) -> str:
@@ -409,21 +246,9 @@ def _pupil_doubt(camera: Camera, chainage: np.ndarray | None) -> str:
     )
 
 
-def _angles(tracks: Tracks, camera: Camera) -> np.ndarray:
-    """From the axis, (N,); NaN beyond the camera's model."""
-    rays, ok = camera.unproject(tracks.pixels)
-    return np.where(ok, np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), np.nan)
-
-
-def _travel(tracks: Tracks, camera: Camera) -> np.ndarray:
-    """(N,) radians that each point has moved away from or to the axis since it was first seen."""
-    theta = _angles(tracks, camera)
-    return np.nan_to_num(np.abs(theta - theta[tracks.bounds[:-1][tracks.track]]))
-
-
 def _sag(tracks: Tracks, camera: Camera, sag: np.ndarray, item: np.ndarray, first: np.ndarray) -> np.ndarray:
     """(n,2) pixels by which observations `item` (n,) are off for that sag (n,3), px^2; first (n,): of their tracks."""
-    theta = np.nan_to_num(_angles(tracks, camera))
+    theta = np.nan_to_num(angles(tracks, camera))
     size = _engine.sag(np.ascontiguousarray(theta[first]), np.ascontiguousarray(theta[item]), camera.f_u)
     out = tracks.pixels[item] - np.array([camera.c_u, camera.c_v])
     out /= np.maximum(np.linalg.norm(out, axis=1), 1e-9)[:, None]
@@ -566,14 +391,6 @@ def _systematic_columns(m: Measurement) -> None:
         half = 0.5 * stations["ovality_systematic"] * stations["d_mean"]
         for name in ("d_max", "d_min"):
             stations[name + "_systematic"] = np.hypot(stations[name + "_systematic"], half)
-
-
-def mean_diameter(m: Measurement) -> tuple[float, float]:
-    """Mean over all that was measured, and its random sigma."""
-    weight = np.array([s.tube.summary["measured"] for s in m.measured], float)
-    weight /= weight.sum()
-    value = float(sum(w * s.tube.summary["d_mean"] for w, s in zip(weight, m.measured, strict=True)))
-    return value, math.sqrt(sum((w * s.d_mean_sigma) ** 2 for w, s in zip(weight, m.measured, strict=True)))
 
 
 def _check_diameter(m: Measurement, known: Known | None) -> None:

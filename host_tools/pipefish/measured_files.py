@@ -16,10 +16,11 @@ from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
 from pipefish.files import csv_bytes, plain, write_atomically
-from pipefish.measure import Measurement, Tell, mean_diameter
+from pipefish.measure import Tell
 from pipefish.measured_reach import reach
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
+from pipefish.measurement import Measurement, mean_diameter
 from pipefish.pupil import pupil_is_known
 from pipefish.simulate import quaternion
 from pipefish.tube import rms_ovality

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.measure import Measurement, mean_diameter
 from pipefish.measured_texts import Z95, length_text
+from pipefish.measurement import Measurement, mean_diameter
 from pipefish.tube_findings import LEAST_HEIGHT, SURELY, TENTH
 
 FEWEST = 9  # points whose median makes a patch, at the least: more than half of them have to stand out

@@ -11,8 +11,8 @@ import numpy as np
 from pipefish.assumed import assumed_px
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
-from pipefish.measure import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.measured_texts import clock_text, length_text
+from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.repeated import against_encoder
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS

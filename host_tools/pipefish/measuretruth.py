@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.measure import Measurement, Stretch
 from pipefish.measured_files import stations
+from pipefish.measurement import Measurement, Stretch
 from pipefish.simulate import Scene
 
 DIRECTIONS = np.arange(180) * math.pi / 180

@@ -18,7 +18,7 @@ from pipefish.structure import Gap
 from pipefish.survey import Tracks
 
 if TYPE_CHECKING:
-    from pipefish.measure import Measurement, Stretch
+    from pipefish.measurement import Measurement, Stretch
 
 Floats = npt.NDArray[np.float64]
 

@@ -17,7 +17,8 @@ from pipefish.target import Target
 from pipefish.tube import Tube, fit_tube
 
 if TYPE_CHECKING:
-    from pipefish.measure import Measurement, Tell
+    from pipefish.measure import Tell
+    from pipefish.measurement import Measurement
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ MATCHES = (".npz", ".csv", ".txt")
 MOST_MATCHES = 2000  # a pair: more say little more and take longer
 DENSE_PIXELS = 2_000_000  # larger pictures are halved before they are matched: four times as fast, a tenth less sharp
 SURVEY_PAIRS = 24
-# Pixels: a tracker's errors are common to neighbours (measure.TRACK_FLOOR_PX), and a dense matcher's may be; residuals
+# Pixels: a tracker's errors are common to neighbours (readings.TRACK_FLOOR_PX), and a dense matcher's may be; residuals
 # show 0.06 and 0.2. By 0.06 bearings from a survey were wrong by a degree. For pictures it is caution: fountain-P11's
 # triples are then right to 0.9 of their sigmas, and to 1.2 with 0.2.
 COMMON_SIGMA = 0.5

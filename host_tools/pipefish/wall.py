@@ -13,9 +13,9 @@ import numpy as np
 from pipefish.camera import Camera
 from pipefish.cloudfile import read_columns
 from pipefish.errors import FormatError, PipefishError
-from pipefish.measure import Measurement
 from pipefish.measured_files import RING, wall_columns
 from pipefish.measured_texts import read_measured
+from pipefish.measurement import Measurement
 from pipefish.survey import Survey
 
 

@@ -20,7 +20,8 @@ import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import read_columns, read_points
-from pipefish.measure import DEFAULT_ATTITUDE_SIGMA, _attitude, measure
+from pipefish.measure import measure
+from pipefish.readings import DEFAULT_ATTITUDE_SIGMA, attitude_of
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
 from synthetic import BOOT, SURVEY, Object, as_object, picture, write_survey
@@ -132,7 +133,7 @@ def test_an_inclinometer_that_does_not_know_its_sigma_has_the_usual_one(drive: D
             item = as_object(OBJECT_KEYFRAME, message)
         objects.append(item)
     write_survey(tmp_path / "survey.mcap", objects=objects)
-    values, sigma = _attitude(Survey.open(tmp_path / "survey.mcap"))
+    values, sigma = attitude_of(Survey.open(tmp_path / "survey.mcap"))
     assert np.isfinite(values).all() and sigma == DEFAULT_ATTITUDE_SIGMA
 
 

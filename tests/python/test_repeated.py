@@ -11,8 +11,9 @@ from PIL import Image
 
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
-from pipefish.measure import Measurement, measure
+from pipefish.measure import measure
 from pipefish.measured_remarks import _repeated_remark, not_measured
+from pipefish.measurement import Measurement
 from pipefish.repeated import renamed
 from pipefish.structure import Gap
 from pipefish.survey import Survey

@@ -16,7 +16,8 @@ from PIL import Image
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.errors import ArgumentError
-from pipefish.measure import Measurement, measure
+from pipefish.measure import measure
+from pipefish.measurement import Measurement
 from pipefish.scale import Z95, Estimate, Known, _pattern, combine, joints_estimate
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_KEYFRAME

@@ -12,7 +12,8 @@ import pytest
 
 import pipefish as pf
 from pipefish.assumed import PUPIL_MOST
-from pipefish.measure import Measurement, mean_diameter, measure
+from pipefish.measure import measure
+from pipefish.measurement import Measurement, mean_diameter
 from pipefish.sectionsigma import diameter_function, shared_of
 from pipefish.survey import Survey
 from pipefish.tube import fit_tube
