@@ -21,6 +21,12 @@ from pipefish.report_wall import WallPicture, wall_picture
 from pipefish.unroll import Tell
 
 
+def _with_code(text: str) -> str:
+    """HTML of a text with its commands, between back-ticks, as code."""
+    parts = html.escape(text).split("`")
+    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
+
+
 class Report(Charts):
     """Collects the parts of the page. Use `write_report`."""
 
@@ -75,8 +81,11 @@ class Report(Charts):
             f"<td>worst: {html.escape(v['worst'])}</td></tr>"
             for v in shown
         )
+        table = f"<div class='wide'><table class='list'>{rows}</table></div>"
+        if all(v["state"] != "undecided" for v in self.verdicts):
+            return table
         note = "Undecided: the 95 % interval at the worst station, systematic part included, reaches across the limit."
-        return f"<div class='wide'><table class='list'>{rows}</table></div><p class='muted'>{note}</p>"
+        return f"{table}<p class='muted'>{note}</p>"
 
     def date(self) -> str:
         """When the first keyframe was taken."""
@@ -147,7 +156,7 @@ class Report(Charts):
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
             cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
             rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
-        told = f"<p class='note'>{html.escape(self.reach_text())}</p>"
+        told = f"<p class='note'>{_with_code(self.reach_text())}</p>"
         if not rows:
             return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
         head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
@@ -236,7 +245,7 @@ class Report(Charts):
         diameter, ovality, tube = self.chart_diameter(), self.chart_ovality(), self.chart_tube()
         line, quality = self.charts_line(), self.charts_quality()
         tables = dict(self.tables())
-        remarks = "".join(f"<li>{html.escape(r)}</li>" for r in self.document["remarks"])
+        remarks = "".join(f"<li>{_with_code(r)}</li>" for r in self.document["remarks"])
         values = {
             "limits": self.limits_html(),
             "accuracy": table_html("Accuracy, 95 %", tables.pop("Accuracy, 95 %")),

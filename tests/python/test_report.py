@@ -64,6 +64,20 @@ def with_map(folder: Path) -> None:
     write_dense(folder / "dense", [found], [strip], wall.unit, wall.document["summary"], fingerprint(folder))
 
 
+def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path):
+    assert "passed" in page.read_text() and "Undecided" not in page.read_text()
+    summary = read_wall(measured / "out").document["summary"]
+    out, close = tmp_path / "report.html", f"ovality={100 * summary['ovality_most']:.3f}"
+    assert main(["report", str(measured / "out"), "-o", str(out), "--limit", close]) == 1
+    assert "Undecided: the 95 % interval" in out.read_text()
+
+
+def test_commands_in_texts_are_shown_as_code(measured, tmp_path):
+    out = tmp_path / "report.html"
+    assert main(["report", str(measured / "out"), "-o", str(out)]) == 0
+    assert "<code>pipefish dense</code> maps the wall" in out.read_text() and "`pipefish" not in out.read_text()
+
+
 def test_what_the_dense_map_found_is_told_and_shown(page):
     text = page.read_text()
     cells = re.findall(r"<tr><td>(\w+)</td><td>([\d.]+) m</td><td>(\d+:\d\d)</td><td>([^<]*)</td><td>dense", text)
