@@ -64,11 +64,25 @@ pf_status pf_spool_fail(pf_spool_database *d, const char *doing)
     return status == PF_ERR_FORMAT ? PF_ERR_IO : status;
 }
 
+sqlite3_stmt *pf_spool_prepare(pf_spool_database *d, pf_spool_statement which)
+{
+    if (d->statements[which] == NULL)
+        (void)sqlite3_prepare_v3(d->db, sql[which], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[which], NULL);
+    return d->statements[which];
+}
+
+void pf_spool_unbind(sqlite3_stmt *q)
+{
+    if (q != NULL)
+        (void)sqlite3_clear_bindings(q);
+}
+
 bool pf_spool_run(pf_spool_database *d, pf_spool_statement which)
 {
-    int code = sqlite3_step(d->statements[which]);
-    int reset = sqlite3_reset(d->statements[which]);
-    sqlite3_clear_bindings(d->statements[which]);
+    sqlite3_stmt *q = pf_spool_prepare(d, which);
+    int code = sqlite3_step(q);
+    int reset = sqlite3_reset(q);
+    pf_spool_unbind(q);
     return code == SQLITE_DONE && reset == SQLITE_OK;
 }
 
@@ -229,9 +243,6 @@ static pf_status open_file(pf_spool_database *d)
     pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
     if (status == PF_OK)
         status = measure(d);
-    for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
-        if (sqlite3_prepare_v3(d->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[i], NULL) != SQLITE_OK)
-            status = fail_sqlite(d, "opening");
     return status;
 }
 

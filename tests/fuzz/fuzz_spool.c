@@ -31,6 +31,7 @@ static struct {
     uint8_t name[32], bytes[OBJECT_MAX];
 } object[OBJECTS + REMAINDER + 2]; /* all that are ever stored */
 enum { KNOWN = sizeof object / sizeof object[0] };
+static uint32_t known;       /* so many of them are made */
 static uint64_t index_pages; /* of the closed spool: bits, page 1 is bit 0 */
 
 /* ---- spools */
@@ -61,6 +62,21 @@ static void make_objects(void)
             object[i].bytes[k] = (uint8_t)(object[i].id * 31 + k * 7);
         require(pf_sha256(object[i].bytes, object[i].n, object[i].name) == PF_OK);
     }
+    known = KNOWN;
+}
+
+/* In place of the spool's own (--wrap): a known object's bytes have its name, which costs less to see. */
+pf_status __real_pf_sha256(const void *bytes, size_t n, uint8_t hash[32]);
+pf_status __wrap_pf_sha256(const void *bytes, size_t n, uint8_t hash[32]);
+
+pf_status __wrap_pf_sha256(const void *bytes, size_t n, uint8_t hash[32])
+{
+    for (uint32_t i = 0; i < known; i++)
+        if (object[i].n == n && memcmp(object[i].bytes, bytes, n) == 0) {
+            memcpy(hash, object[i].name, 32);
+            return PF_OK;
+        }
+    return __real_pf_sha256(bytes, n, hash);
 }
 
 /* Nothing of it stays. */

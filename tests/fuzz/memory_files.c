@@ -251,7 +251,10 @@ static const sqlite3_io_methods methods = {.iVersion = 2,
 
 static bool is_ours(const char *path)
 {
-    return strncmp(path, SPOOL_PATH, sizeof SPOOL_PATH - 1) == 0;
+    for (size_t i = 0; i < sizeof SPOOL_PATH - 1; i++) /* asked too often for strncmp(), which the fuzzer listens to */
+        if (path[i] != SPOOL_PATH[i])
+            return false;
+    return true;
 }
 
 static memory_file *find_file(const char *path)
