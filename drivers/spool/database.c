@@ -1,31 +1,13 @@
 #include "spool/database.h"
 #include "spool/readonly.h"
 #include "spool/salvage.h"
+#include "spool/schema.h"
 
 #include <errno.h>
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
 #include <unistd.h>
-
-#define APPLICATION_ID 0x50465350 /* "PFSP" */
-#define SCHEMA_VERSION 1
-
-/* AUTOINCREMENT: a row number is never used again, so that next() in order of rows is next() in order of storing. */
-static const char schema[] = "CREATE TABLE object ("
-                             "row INTEGER PRIMARY KEY AUTOINCREMENT,"
-                             "kind INTEGER NOT NULL,"
-                             "name BLOB NOT NULL UNIQUE CHECK (length(name) = 32),"
-                             "bytes BLOB NOT NULL);"
-                             "CREATE TABLE value (key TEXT PRIMARY KEY, bytes BLOB NOT NULL) WITHOUT ROWID;";
-
-/* Beside the objects, so that taking a rank away does not write the object anew, and so that programs without ranks can
- * go on with the file: to them it is a table that looks after itself. */
-static const char ranks[] = "CREATE TABLE IF NOT EXISTS evictable (row INTEGER PRIMARY KEY,"
-                            "importance INTEGER NOT NULL, number INTEGER NOT NULL);"
-                            "CREATE INDEX IF NOT EXISTS evictable_order ON evictable (importance, row);"
-                            "CREATE TRIGGER IF NOT EXISTS evictable_gone AFTER DELETE ON object BEGIN "
-                            "DELETE FROM evictable WHERE row = old.row; END;";
 
 static const char *const sql[SQL_STATEMENTS] = {
     [SQL_BEGIN] = "BEGIN IMMEDIATE",
@@ -51,7 +33,7 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
     pf_status status = PF_ERR_IO;
     switch (sqlite3_errcode(d->db)) {
     case SQLITE_NOTADB:
-        d->is_damaged = pf_spool_was_one(d->path, APPLICATION_ID);
+        d->is_damaged = pf_spool_was_one(d->path);
         return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: not an SQLite file", d->path);
     case SQLITE_CORRUPT:
         d->is_damaged = true;
@@ -82,11 +64,25 @@ pf_status pf_spool_fail(pf_spool_database *d, const char *doing)
     return status == PF_ERR_FORMAT ? PF_ERR_IO : status;
 }
 
+sqlite3_stmt *pf_spool_prepare(pf_spool_database *d, pf_spool_statement which)
+{
+    if (d->statements[which] == NULL)
+        (void)sqlite3_prepare_v3(d->db, sql[which], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[which], NULL);
+    return d->statements[which];
+}
+
+void pf_spool_unbind(sqlite3_stmt *q)
+{
+    if (q != NULL)
+        (void)sqlite3_clear_bindings(q);
+}
+
 bool pf_spool_run(pf_spool_database *d, pf_spool_statement which)
 {
-    int code = sqlite3_step(d->statements[which]);
-    int reset = sqlite3_reset(d->statements[which]);
-    sqlite3_clear_bindings(d->statements[which]);
+    sqlite3_stmt *q = pf_spool_prepare(d, which);
+    int code = sqlite3_step(q);
+    int reset = sqlite3_reset(q);
+    pf_spool_unbind(q);
     return code == SQLITE_DONE && reset == SQLITE_OK;
 }
 
@@ -110,34 +106,41 @@ static pf_status ask(pf_spool_database *d, const char *query, int64_t *value)
     return status;
 }
 
-/* Tells a spool from an empty file and from everything else, before anything is written. */
-static pf_status identify(pf_spool_database *d, bool *is_empty)
+static pf_status fail_foreign(pf_spool_database *d)
 {
-    int64_t id = 0, version = 0, objects = 0;
+    return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: an SQLite database of another program", d->path);
+}
+
+static pf_status fail_damaged(pf_spool_database *d, const char *why)
+{
+    d->is_damaged = true;
+    return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: damaged: %s", d->path, why);
+}
+
+/* Tells a spool from an empty file, a damaged one and everything else, before anything is written. */
+static pf_status identify(pf_spool_database *d, pf_spool_schema *schema)
+{
+    int64_t id = 0, version = 0;
     pf_status status = ask(d, "PRAGMA application_id", &id);
     if (status == PF_OK)
         status = ask(d, "PRAGMA user_version", &version);
-    if (status == PF_OK)
-        status = ask(d, "SELECT count(*) FROM sqlite_schema", &objects);
     if (status != PF_OK)
         return status;
-    *is_empty = id == 0 && version == 0 && objects == 0;
-    if (*is_empty)
+    const bool is_spool = id == PF_SPOOL_APPLICATION_ID;
+    const int code = pf_spool_read_schema(d->db, schema);
+    if (code == SQLITE_ERROR) /* of a format that SQLite does not know */
+        return is_spool || pf_spool_was_one(d->path) ? fail_damaged(d, sqlite3_errmsg(d->db)) : fail_foreign(d);
+    if (code != SQLITE_OK)
+        return fail_sqlite(d, "opening");
+    schema->is_empty = schema->is_empty && id == 0 && version == 0;
+    if (schema->is_empty)
         return PF_OK;
-    if (id != APPLICATION_ID)
-        return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: an SQLite database of another program", d->path);
-    if (version != SCHEMA_VERSION)
+    if (!is_spool && !schema->has_objects)
+        return fail_foreign(d);
+    if (is_spool && version != PF_SPOOL_VERSION)
         return pf_fail(&d->failure, PF_ERR_VERSION, "%s: spool of version %" PRId64 "; this program reads version %d",
-                       d->path, version, SCHEMA_VERSION);
-    return PF_OK;
-}
-
-static pf_status create(pf_spool_database *d)
-{
-    char text[sizeof schema + 128];
-    (void)snprintf(text, sizeof text, "BEGIN IMMEDIATE;%sPRAGMA application_id = %d;PRAGMA user_version = %d;COMMIT;",
-                   schema, APPLICATION_ID, SCHEMA_VERSION);
-    return run_text(d, text);
+                       d->path, version, PF_SPOOL_VERSION);
+    return is_spool && schema->is_right ? PF_OK : fail_damaged(d, "its first page is not a spool's");
 }
 
 /* The row of an object that could not be saved may be held by somebody, who will remove it: it is given to no other. */
@@ -154,7 +157,7 @@ static pf_status go_on_after_highest(pf_spool_database *d)
 
 static pf_status open_for_writing(pf_spool_database *d)
 {
-    bool is_empty = false;
+    pf_spool_schema schema = {0};
     pf_spool_finish_setting_aside(d->path);
     if (sqlite3_open_v2(d->path, &d->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
         SQLITE_OK)
@@ -163,15 +166,15 @@ static pf_status open_for_writing(pf_spool_database *d)
     /* Exclusive: a second daemon on the same spool is refused, and WAL needs no shared memory. */
     pf_status status = run_text(d, "PRAGMA locking_mode = EXCLUSIVE");
     if (status == PF_OK)
-        status = identify(d, &is_empty);
+        status = identify(d, &schema);
     /* The log is cut back to 4 MB after a checkpoint, lest it hold an SD card's free space for ever. */
     if (status == PF_OK)
         status =
             run_text(d, "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA journal_size_limit = 4194304;");
-    if (status == PF_OK && is_empty)
-        status = create(d);
-    if (status == PF_OK)
-        status = run_text(d, ranks);
+    if (status == PF_OK && schema.is_empty)
+        status = run_text(d, pf_spool_create);
+    if (status == PF_OK && !schema.has_ranks)
+        status = run_text(d, pf_spool_add_ranks);
     if (status == PF_OK)
         status = go_on_after_highest(d);
     if (status == PF_OK)
@@ -193,18 +196,19 @@ void pf_spool_database_close(pf_spool_database *d)
  * memory stands in, so that everybody else need not know. */
 static pf_status open_for_reading(pf_spool_database *d)
 {
-    bool is_empty = access(d->path, F_OK) != 0;
+    pf_spool_schema schema = {.is_empty = access(d->path, F_OK) != 0};
     pf_status status = PF_OK;
-    if (!is_empty) {
+    if (!schema.is_empty) {
         status = pf_spool_open_read_only(d->path, &d->db) == SQLITE_OK ? run_text(d, "PRAGMA locking_mode = EXCLUSIVE")
                                                                        : fail_sqlite(d, "opening");
         if (status == PF_OK)
-            status = identify(d, &is_empty);
+            status = identify(d, &schema);
     }
-    if (is_empty || d->is_damaged) {
+    if (schema.is_empty || d->is_damaged) {
         d->is_damaged = false;
         pf_spool_database_close(d);
-        status = sqlite3_open(":memory:", &d->db) == SQLITE_OK ? create(d) : fail_sqlite(d, "opening");
+        status =
+            sqlite3_open(":memory:", &d->db) == SQLITE_OK ? run_text(d, pf_spool_create) : fail_sqlite(d, "opening");
     }
     if (status == PF_OK) /* over the file's own: nothing has to go while nothing can come */
         status = run_text(d, "PRAGMA temp_store = MEMORY; CREATE TEMP TABLE evictable (row INTEGER PRIMARY KEY,"
@@ -239,9 +243,6 @@ static pf_status open_file(pf_spool_database *d)
     pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
     if (status == PF_OK)
         status = measure(d);
-    for (int i = 0; status == PF_OK && i < SQL_STATEMENTS; i++)
-        if (sqlite3_prepare_v3(d->db, sql[i], -1, SQLITE_PREPARE_PERSISTENT, &d->statements[i], NULL) != SQLITE_OK)
-            status = fail_sqlite(d, "opening");
     return status;
 }
 

@@ -30,8 +30,8 @@ typedef enum pf_spool_statement {
 
 typedef struct pf_spool_database {
     pthread_mutex_t mutex;
-    sqlite3 *db; /* NULL: it could not be opened again after it was found damaged */
-    sqlite3_stmt *statements[SQL_STATEMENTS];
+    sqlite3 *db;                              /* NULL: it could not be opened again after it was found damaged */
+    sqlite3_stmt *statements[SQL_STATEMENTS]; /* those that were asked for */
     char *path;
     uint64_t quota;
     void (*alive)(void);
@@ -56,6 +56,11 @@ void pf_spool_leave(pf_spool_database *d);
 /* In place of a damaged file a new one, with what can be read of it. Rows keep their numbers, so that whoever holds
  * some need not know. A file that cannot be set aside stays in use. */
 pf_status pf_spool_heal(pf_spool_database *d);
+
+/* A statement, made when it is first asked for. NULL: it cannot be; to bind and to step that fails, and the reason
+ * stays in the connection. */
+sqlite3_stmt *pf_spool_prepare(pf_spool_database *d, pf_spool_statement which);
+void pf_spool_unbind(sqlite3_stmt *q);
 
 /* Runs a statement that gives no rows, and leaves it ready for the next time. The error stays in the connection. */
 bool pf_spool_run(pf_spool_database *d, pf_spool_statement which);

@@ -1,6 +1,7 @@
 #include "spool/salvage.h"
 #include "pipefish/drivers/file.h"
 #include "pipefish/drivers/sha256.h"
+#include "spool/schema.h"
 
 #include <errno.h>
 #include <inttypes.h>
@@ -12,10 +13,11 @@
 #define CHUNK_OBJECTS 64  /* of one transaction: some megabytes, so that neither a kill nor the log costs much */
 #define PATH_BYTES    1024
 
-bool pf_spool_was_one(const char *path, uint32_t application_id)
+bool pf_spool_was_one(const char *path)
 {
     static const char mark[] = "CREATE TABLE object (row INTEGER PRIMARY KEY AUTOINCREMENT";
-    uint8_t page[4096];
+    const uint32_t application_id = PF_SPOOL_APPLICATION_ID;
+    uint8_t page[PF_SPOOL_PAGE];
     const uint8_t id[4] = {(uint8_t)(application_id >> 24), (uint8_t)(application_id >> 16),
                            (uint8_t)(application_id >> 8), (uint8_t)application_id};
     FILE *file = fopen(path, "rb");
@@ -249,6 +251,41 @@ static bool copy_all(salvage *s)
     return ok || give_up(s);
 }
 
+/* Nothing of the damaged file's own first page is needed: its tables lie where every spool's do. */
+static bool write_first_page(salvage *s, const char *file)
+{
+    const uint8_t *page = pf_spool_first_page();
+    FILE *f = page != NULL ? fopen(file, "r+b") : NULL;
+    bool ok = f != NULL && fwrite(page, 1, PF_SPOOL_PAGE, f) == PF_SPOOL_PAGE;
+    ok = f != NULL && fclose(f) == 0 && ok;
+    if (!ok)
+        (void)snprintf(s->why, sizeof s->why, "%s", page != NULL ? strerror(errno) : "no memory");
+    return ok;
+}
+
+/* The log's pages go into the file, its first one among them. */
+static bool empty_log(salvage *s, const char *file)
+{
+    bool ok = sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) == SQLITE_OK || is_lost(s);
+    /* The first opens the log, and fails where the log's first page is bad. */
+    ok = ok && (run(s->from, "PRAGMA user_version") || is_lost(s));
+    ok = ok &&
+         (sqlite3_wal_checkpoint_v2(s->from, NULL, SQLITE_CHECKPOINT_TRUNCATE, NULL, NULL) == SQLITE_OK || is_lost(s));
+    (void)sqlite3_close(s->from);
+    s->from = NULL;
+    return ok;
+}
+
+/* False: not now, and s->why says so. */
+static bool mend_first_page(salvage *s, const char *file)
+{
+    char log[PATH_BYTES + 8];
+    (void)snprintf(log, sizeof log, "%s-wal", file);
+    if (!write_first_page(s, file))
+        return false;
+    return access(log, F_OK) != 0 || (empty_log(s, file) && write_first_page(s, file));
+}
+
 static bool salvage_file(salvage *s, const char *file)
 {
     /* Where its row is another's by now it gets a new one. */
@@ -257,6 +294,8 @@ static bool salvage_file(salvage *s, const char *file)
                               "?2, ?3, ?4";
     static const char note[] = "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)";
     bool is_done;
+    if (!mend_first_page(s, file))
+        return false;
     if (sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK)
         is_done = is_lost(s);
     else if (sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) != SQLITE_OK ||

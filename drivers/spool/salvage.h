@@ -1,6 +1,7 @@
 /* A spool's file that has become unreadable: it is set aside, and what can be read of it goes into a new one. Until all
  * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk, a missing descriptor or
- * a new file that cannot be opened ends nothing: the next opening goes on. */
+ * a new file that cannot be opened ends nothing: the next opening goes on. Its log is taken into it, and its first page
+ * is replaced, by the one that every spool has. */
 #ifndef PIPEFISH_SPOOL_SALVAGE_H
 #define PIPEFISH_SPOOL_SALVAGE_H
 
@@ -10,7 +11,7 @@
 
 /* Whether a file that SQLite does not take was a spool: its header or its schema says so. Another program's file is
  * left alone. */
-bool pf_spool_was_one(const char *path, uint32_t application_id);
+bool pf_spool_was_one(const char *path);
 
 /* Gives the file, and the log beside it, the name <path>.damaged-1.unread, or that with the first free number above
  * those that are still called so. PF_OK, PF_ERR_IO. */

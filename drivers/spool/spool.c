@@ -23,7 +23,7 @@ typedef struct object {
 static pf_status evict(pf_spool_database *d, const object *o, uint64_t *freed, uint32_t *gone)
 {
     for (uint32_t i = 0; i < o->victims_n; i++) {
-        (void)sqlite3_bind_int64(d->statements[SQL_REMOVE], 1, (int64_t)o->victims[i].row);
+        (void)sqlite3_bind_int64(pf_spool_prepare(d, SQL_REMOVE), 1, (int64_t)o->victims[i].row);
         if (!pf_spool_run(d, SQL_REMOVE))
             return pf_spool_fail(d, "making room");
         if (sqlite3_changes(d->db) > 0) {
@@ -36,7 +36,7 @@ static pf_status evict(pf_spool_database *d, const object *o, uint64_t *freed, u
 
 static pf_status set_rank(pf_spool_database *d, int64_t row, const pf_spool_rank *rank)
 {
-    sqlite3_stmt *q = d->statements[SQL_RANK];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_RANK);
     (void)sqlite3_bind_int64(q, 1, row);
     (void)sqlite3_bind_int64(q, 2, rank->importance);
     (void)sqlite3_bind_int64(q, 3, rank->number);
@@ -48,12 +48,12 @@ static pf_status set_rank(pf_spool_database *d, int64_t row, const pf_spool_rank
 static pf_status insert(pf_spool_database *d, const object *o, uint64_t freed, bool *stored)
 {
     const uint64_t bytes = d->stats.bytes - freed;
-    sqlite3_stmt *has = d->statements[SQL_HAS], *put = d->statements[SQL_PUT];
+    sqlite3_stmt *has = pf_spool_prepare(d, SQL_HAS);
     *stored = false;
     (void)sqlite3_bind_blob(has, 1, o->name, 32, SQLITE_STATIC);
     int code = sqlite3_step(has);
     sqlite3_reset(has);
-    sqlite3_clear_bindings(has);
+    pf_spool_unbind(has);
     if (code == SQLITE_ROW)
         return PF_OK;
     if (code != SQLITE_DONE)
@@ -63,10 +63,11 @@ static pf_status insert(pf_spool_database *d, const object *o, uint64_t freed, b
         return pf_fail(&d->failure, PF_ERR_SPACE, "%s: quota: %" PRIu64 " bytes wait, %zu more are above %" PRIu64,
                        d->path, bytes, o->n, d->quota);
     }
+    sqlite3_stmt *put = pf_spool_prepare(d, SQL_PUT);
     (void)sqlite3_bind_int64(put, 1, o->kind);
     (void)sqlite3_bind_blob(put, 2, o->name, 32, SQLITE_STATIC);
     if (sqlite3_bind_blob64(put, 3, o->bytes, o->n, SQLITE_STATIC) != SQLITE_OK) {
-        sqlite3_clear_bindings(put);
+        pf_spool_unbind(put);
         return pf_spool_fail(d, "storing");
     }
     if (!pf_spool_run(d, SQL_PUT))
@@ -79,9 +80,10 @@ static pf_status insert(pf_spool_database *d, const object *o, uint64_t freed, b
 static pf_status set_value(pf_spool_database *d, const char *key, const void *bytes, size_t n)
 {
     pf_spool_statement which = n == 0 ? SQL_DELETE : SQL_SET;
-    (void)sqlite3_bind_text(d->statements[which], 1, key, -1, SQLITE_STATIC);
-    if (n != 0 && sqlite3_bind_blob64(d->statements[which], 2, bytes, n, SQLITE_STATIC) != SQLITE_OK) {
-        sqlite3_clear_bindings(d->statements[which]);
+    sqlite3_stmt *q = pf_spool_prepare(d, which);
+    (void)sqlite3_bind_text(q, 1, key, -1, SQLITE_STATIC);
+    if (n != 0 && sqlite3_bind_blob64(q, 2, bytes, n, SQLITE_STATIC) != SQLITE_OK) {
+        pf_spool_unbind(q);
         return pf_spool_fail(d, "setting a value");
     }
     return pf_spool_run(d, which) ? PF_OK : pf_spool_fail(d, "setting a value");
@@ -168,7 +170,7 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
     *count = 0;
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
-    sqlite3_stmt *q = d->statements[SQL_VICTIMS];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_VICTIMS);
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     (void)sqlite3_bind_int64(q, 2, importance);
     (void)sqlite3_bind_int64(q, 3, PF_SPOOL_VICTIMS_MAX);
@@ -222,7 +224,7 @@ static pf_status spool_next(void *self, uint64_t after, pf_spool_item *item)
         return PF_ERR_END;
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
-    sqlite3_stmt *q = d->statements[SQL_NEXT];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_NEXT);
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     int code = sqlite3_step(q);
     if (code == SQLITE_ROW && sqlite3_column_int64(q, 0) <= (int64_t)after) { /* SQLite believes its pages' order */
@@ -252,7 +254,7 @@ static pf_status spool_read(void *self, const pf_spool_item *item, void *bytes, 
     pf_status status = PF_OK;
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
-    sqlite3_stmt *q = d->statements[SQL_READ];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_READ);
     (void)sqlite3_bind_int64(q, 1, (int64_t)item->row);
     int code = sqlite3_step(q);
     const void *blob = code == SQLITE_ROW ? sqlite3_column_blob(q, 0) : NULL;
@@ -288,13 +290,13 @@ static pf_status spool_remove(void *self, uint64_t row)
         pf_spool_leave(d);
         return PF_ERR_IO;
     }
-    sqlite3_stmt *q = d->statements[SQL_SIZE];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_SIZE);
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
     uint64_t size = code == SQLITE_ROW ? (uint64_t)sqlite3_column_int64(q, 0) : 0;
     sqlite3_reset(q);
     if (code == SQLITE_ROW) /* not before: it would wipe out the error */
-        (void)sqlite3_bind_int64(d->statements[SQL_REMOVE], 1, (int64_t)row);
+        (void)sqlite3_bind_int64(pf_spool_prepare(d, SQL_REMOVE), 1, (int64_t)row);
     if (code != SQLITE_DONE && (code != SQLITE_ROW || !pf_spool_run(d, SQL_REMOVE))) {
         status = pf_spool_fail(d, "removing");
     } else if (code == SQLITE_ROW) {
@@ -312,7 +314,7 @@ static pf_status spool_get(void *self, const char *key, void *bytes, size_t capa
     pf_status status = PF_OK;
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
-    sqlite3_stmt *q = d->statements[SQL_GET];
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_GET);
     (void)sqlite3_bind_text(q, 1, key, -1, SQLITE_STATIC);
     int code = sqlite3_step(q);
     const void *blob = code == SQLITE_ROW ? sqlite3_column_blob(q, 0) : NULL;
@@ -328,7 +330,7 @@ static pf_status spool_get(void *self, const char *key, void *bytes, size_t capa
         memcpy(bytes, blob, *n);
     }
     sqlite3_reset(q);
-    sqlite3_clear_bindings(q);
+    pf_spool_unbind(q);
     pf_spool_leave(d);
     return status;
 }

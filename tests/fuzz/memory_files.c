@@ -119,8 +119,10 @@ static int write_file(sqlite3_file *f, const void *from, int n, sqlite3_int64 at
     memory_file *i = ((file *)f)->content;
     if (medium.is_read_only)
         return SQLITE_IOERR_WRITE;
-    if (at + n > MEMORY_FILE_MAX)
+    if (at + n > MEMORY_FILE_MAX) {
+        medium.was_full = true;
         return SQLITE_FULL;
+    }
     if ((size_t)at > i->n)
         memset(i->bytes + i->n, 0, (size_t)at - i->n);
     memcpy(i->bytes + at, from, (size_t)n);
@@ -249,7 +251,10 @@ static const sqlite3_io_methods methods = {.iVersion = 2,
 
 static bool is_ours(const char *path)
 {
-    return strncmp(path, SPOOL_PATH, sizeof SPOOL_PATH - 1) == 0;
+    for (size_t i = 0; i < sizeof SPOOL_PATH - 1; i++) /* asked too often for strncmp(), which the fuzzer listens to */
+        if (path[i] != SPOOL_PATH[i])
+            return false;
+    return true;
 }
 
 static memory_file *find_file(const char *path)
@@ -405,11 +410,17 @@ int __wrap_rename(const char *from, const char *to)
     return 0;
 }
 
+enum { FIRST_PAGE = 4096 }; /* what the spool writes by name */
+
 FILE *__wrap_fopen(const char *path, const char *how)
 {
     if (!is_ours(path))
         return __real_fopen(path, how);
     memory_file *i = find_file(path);
+    if (i != NULL && strchr(how, '+') != NULL && i->n < FIRST_PAGE) { /* which fmemopen() cannot make longer */
+        memset(i->bytes + i->n, 0, FIRST_PAGE - i->n);
+        i->n = FIRST_PAGE;
+    }
     return i != NULL && i->n > 0 ? fmemopen(i->bytes, i->n, how) : NULL;
 }
 

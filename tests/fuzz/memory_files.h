@@ -22,6 +22,7 @@ typedef struct memory_file {
 typedef struct memory_medium {
     memory_file file[MEMORY_FILES];
     bool is_read_only;
+    bool was_full;  /* a write was refused for that */
     int reads_left; /* then they fail; INT_MAX: they do not */
 } memory_medium;
 

@@ -57,4 +57,22 @@ static inline pf_status put_small(uint64_t id)
     return spool.ops->put(spool.self, 2, name, bytes, sizeof bytes);
 }
 
+enum { MANY = 300 }; /* ids of small objects are below, or one above */
+
+/* The ids that are there, each once. */
+static inline uint64_t list_ids(bool *is_there)
+{
+    pf_spool_item item;
+    uint64_t row = 0, n = 0, id;
+    size_t size;
+    memset(is_there, 0, MANY + 2);
+    for (; spool.ops->next(spool.self, row, &item) == PF_OK; row = item.row, n++) {
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->read(spool.self, &item, read_bytes, sizeof read_bytes, &size));
+        memcpy(&id, read_bytes, sizeof id);
+        TEST_ASSERT_TRUE(id <= MANY + 1 && !is_there[id]);
+        is_there[id] = true;
+    }
+    return n;
+}
+
 #endif
