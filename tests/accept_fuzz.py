@@ -115,7 +115,7 @@ def check(target: Path, minutes: float) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("only", nargs="*", help="names of targets; none: all of them")
-    parser.add_argument("--minutes", type=float, default=60, help="for each target")
+    parser.add_argument("--minutes", type=float, default=150, help="for each target")
     args = parser.parse_args()
     built = {path.name.removeprefix("fuzz_") for path in TARGETS.glob("fuzz_*") if os.access(path, os.X_OK)}
     names = args.only or sorted(built | set(REACH))
