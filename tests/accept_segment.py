@@ -79,6 +79,17 @@ def judged(s: pf.Segmentation, labels: tuple[np.ndarray, np.ndarray]) -> tuple[R
     }, names
 
 
+def over_scenes(
+    name: str, values: list[float], judge: Callable[[str, float, float], Row], bound: float
+) -> Iterator[Row]:
+    """A figure's median, and the share of scenes that hold by themselves: nine of ten have to. The worst is told."""
+    holding = [judge(name, v, bound)["holds"] for v in values]
+    worst = min(values) if judge is at_least else max(values)
+    print(f"  {name}: worst {worst:.4g}, mean {np.mean(values):.4g}", file=sys.stderr)
+    yield judge(f"{name}_median", np.median(values), bound)
+    yield at_least(f"{name}_share_that_holds", np.mean(holding), 0.9)
+
+
 def patches(seed: int) -> Row:
     """Two patches, bent and relit: also pictures exchanged, and light held fast over each layer."""
     pair = make_pair(1000 + seed, **SIZE)
@@ -100,16 +111,14 @@ def check_patches(count: int) -> Iterator[Row]:
     rows = kept_series(KEEP, "patches", count, patches)
     yield at_least("segment.layers_right", np.mean([r["layers"] == 2 for r in rows]), 0.9)
     overlaps = [min(r["overlap1"], r["overlap2"]) for r in rows]
-    print(f"  patches: overlap least {min(overlaps):.3f}, mean {np.mean(overlaps):.3f}", file=sys.stderr)
-    yield at_least("segment.overlap_median", np.median(overlaps), 0.92)
-    yield at_least("segment.overlap_share", np.mean(np.array(overlaps) >= 0.92), 0.9)
-    yield at_most("segment.flow_median_px", np.median([r.get("epe", 99) for r in rows]), 0.5)
-    yield at_most("segment.flow_p95_px", np.median([r.get("epe95", 99) for r in rows]), 2)
-    yield at_most("segment.gain_rms", np.median([r.get("gain", 9) for r in rows]), 0.05)
-    yield at_least("segment.round_trip_1px", np.median([r.get("back", 0) for r in rows]), 0.95)
-    yield at_least("segment.exchanged", np.median([r["exchanged"] for r in rows]), 0.97)
-    lost = np.median(np.array([r["overlap1"] - r["held"] for r in rows]))
-    yield at_least("segment.overlap_lost_without_light", lost, 0.05)
+    lost = [r["overlap1"] - r["held"] for r in rows]
+    yield from over_scenes("segment.overlap", overlaps, at_least, 0.92)
+    yield from over_scenes("segment.flow_px", [r.get("epe", 99) for r in rows], at_most, 0.5)
+    yield from over_scenes("segment.flow_p95_px", [r.get("epe95", 99) for r in rows], at_most, 2)
+    yield from over_scenes("segment.gain_rms", [r.get("gain", 9) for r in rows], at_most, 0.05)
+    yield from over_scenes("segment.round_trip_1px", [r.get("back", 0) for r in rows], at_least, 0.95)
+    yield from over_scenes("segment.exchanged", [r["exchanged"] for r in rows], at_least, 0.97)
+    yield from over_scenes("segment.overlap_lost_without_light", lost, at_least, 0.05)
     yield at_most("segment.energy_rise", max(r["rise"] for r in rows), 1e-6)
 
 
@@ -133,8 +142,7 @@ def covered(seed: int) -> Row:
 
 def check_covered(count: int) -> Iterator[Row]:
     rows = kept_series(KEEP, "covered", count, covered)
-    print(f"  covered: boundary least {min(r['boundary'] for r in rows):.3f}", file=sys.stderr)
-    yield at_least("segment.covered_boundary_median", np.median([r["boundary"] for r in rows]), 0.8)
+    yield from over_scenes("segment.covered_boundary", [r["boundary"] for r in rows], at_least, 0.8)
 
 
 def sized(seed: int) -> Row:
@@ -151,7 +159,7 @@ def check_sizes(count: int) -> Iterator[Row]:
     rows = kept_series(KEEP, "sizes", max(count, len(SCALES)), sized)
     for k, scale in enumerate(SCALES):
         own = [min(r["overlap1"], r["overlap2"]) for r in rows if r["seed"] % len(SCALES) == k]
-        yield at_least(f"segment.size_{scale}_overlap", np.median(own), 0.85)
+        yield at_least(f"segment.size_{scale}_overlap_least", min(own), 0.85)
 
 
 def simulated(seed: int) -> Row:
@@ -182,8 +190,8 @@ def simulated(seed: int) -> Row:
 def check_simulator(count: int) -> Iterator[Row]:
     rows = kept_series(KEEP, "simulator", count, simulated)
     yield at_least("segment.sim_sheets_found", sum(r["found"] for r in rows) / sum(r["sheets"] for r in rows), 0.9)
-    yield at_least("segment.sim_overlap", np.mean([r["overlap_mean"] for r in rows]), 0.85)
-    yield at_most("segment.sim_flow_median_px", np.median([r["epe"] for r in rows]), 0.5)
+    yield from over_scenes("segment.sim_overlap", [r["overlap_mean"] for r in rows], at_least, 0.85)
+    yield from over_scenes("segment.sim_flow_px", [r["epe"] for r in rows], at_most, 0.5)
 
 
 def within(outline: str) -> np.ndarray:
@@ -200,7 +208,8 @@ def real(seed: int) -> Row:
     start, cpu, main = time.perf_counter(), time.process_time(), time.thread_time()
     s = pf.segment_motion(*images, threads=2)
     row = {"pair": name, "wall_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
-    row["main_s"] = time.thread_time() - main  # of the thread that also does what only one can: two cores need as much
+    row["load"] = os.getloadavg()[0]
+    row["main_s"] = time.thread_time() - main  # of the thread that also does what only one can
     found = points_in_layers(s, np.loadtxt(DATA / name / f"{name}.txt"))
     picture(name, images, s)
     row |= {"layers": len(s.layers), "back": float((round_trips(s) <= 1).mean()), "rise": rises(s)}
@@ -218,11 +227,14 @@ def check_real(_: int) -> Iterator[Row]:
         yield at_least(f"segment.{r['pair']}_purity", min(r["purity"]), 0.9)
         yield at_least(f"segment.{r['pair']}_recall", min(r["recall"]), 0.8)
         yield at_most(f"segment.{r['pair']}_outliers", r["outliers"], 0.15)
-        least = 0.22 if r["pair"] == "breadcube" else 0.15  # of a faultless cut-out
+        least = 17 / 77 if r["pair"] == "breadcube" else 0.15  # of a faultless cut-out
         yield at_most(f"segment.{r['pair']}_outliers_by_labels_alone", r["same_layer"], least)
         yield at_least(f"segment.{r['pair']}_overlap_with_outline", min(r["overlap"]), 0.7)
         yield at_least(f"segment.{r['pair']}_round_trip_1px", r["back"], 0.95)
-        yield at_most(f"segment.{r['pair']}_s_on_two_cores", max(r["main_s"], r["cpu_s"] / 2), 30)
+        # Of all threads: on two idle cores the clock's time is no longer, since a thread works all the while.
+        yield at_most(f"segment.{r['pair']}_processor_s", r["cpu_s"], 30)
+        told = f"main thread {r['main_s']:.1f} s, by the clock {r['wall_s']:.1f} s beside what else ran"
+        print(f"  {r['pair']}: {told} (load {r['load']:.1f})", file=sys.stderr)
 
 
 PICTURES: list[Path] = []

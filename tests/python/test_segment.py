@@ -214,6 +214,13 @@ def test_layers_may_be_much_smaller_in_one_picture():
     assert np.median(flow_errors(s, pair, names)) <= 0.5
 
 
+def test_a_surface_whose_matches_are_right_is_not_lost_for_its_common_colours():
+    """Seen much smaller in picture 2, a sixth of a patch was lost where its colours are common: pixels alone spoke."""
+    pair = make_pair(4000, width=480, height=360, scale=0.4)
+    s = pf.segment_motion(*pair.images)
+    assert overlap(s.labels1, pair.labels[0], paired(s.labels1, pair.labels[0])) >= 0.9
+
+
 def test_grey_pictures_do_too():
     pair = scene(seed=1)
     s = pf.segment_motion(*(image.mean(axis=2) for image in pair.images), rounds=2)

@@ -15,12 +15,18 @@ constexpr double kHidden = 0.05;  // share of a layer's pixels that are hidden o
 constexpr double kTexture = 0.02; // deviation within a window from which texture tells motions apart, of 1
 constexpr double kDissimilar = 1; // cost of a correlation of -1, nats
 constexpr double kGround = 0.03;  // cost of a layer's pixel where nothing speaks for it, nats
+constexpr double kMatched = 1;    // what each match of a layer speaks for its being there, nats
 constexpr int kWindow = 7;        // of variance and correlation, pixels
 constexpr double kHalfLog2Pi = 0.91893853320467274;
 
 double square(double v)
 {
     return v * v;
+}
+
+cv::Point nearest(const Vector2d &at)
+{
+    return {static_cast<int>(std::lround(at.x())), static_cast<int>(std::lround(at.y()))};
 }
 
 // Where the other picture has each pixel, and whether that is a place at all.
@@ -179,6 +185,17 @@ private:
     std::vector<float> line_; // zeros on either side
 };
 
+// A match speaks for its pixel, as far as the layer carries it where the match says.
+void count_match(const Side &side, const Tie &tie, const cv::Mat_<cv::Vec2f> &flow, cv::Mat_<int32_t> &cost)
+{
+    const cv::Point at = nearest(tie.at) - side.box().tl();
+    if (!cv::Rect({0, 0}, cost.size()).contains(at) || cost(at) >= Problem::kNever)
+        return;
+    const Vector2d to(static_cast<double>(flow(at)[0]), static_cast<double>(flow(at)[1]));
+    const double off = (to - tie.to).norm() / unit_there(side);
+    cost(at) -= static_cast<int32_t>(std::lround(kUnit * kMatched * tie.weight / (1 + square(off))));
+}
+
 } // namespace
 
 Light light_at(const Side &side, size_t channel, int x, int y)
@@ -271,6 +288,8 @@ void look_likely(const Side &side, Evidence &seen)
             const float nats = seen.informed(y, x) * (unlike - std::log(ratio + hidden)) + static_cast<float>(kGround);
             cost(y, x) = static_cast<int32_t>(std::lround(static_cast<float>(kUnit) * nats));
         }
+    for (const Tie &t : side.ties)
+        count_match(side, t, seen.flow, cost);
     seen.fits = fits;
     seen.cost = cost;
 }

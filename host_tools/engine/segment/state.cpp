@@ -150,6 +150,9 @@ void State::claim()
         }
         return best != nullptr;
     });
+    for (Layer &layer : layers_)
+        for (size_t s = 0; s < 2; s++)
+            look_likely(layer.side[s], layer.seen[s]); // matches speak for their pixels
 }
 
 Problem State::problem() const
