@@ -267,6 +267,15 @@ static void expect(pf_tracking *p, const pf_motion_hints *hints)
     (void)pf_tracker_expect(p->tracker, p->expected, n);
 }
 
+/* Tells the tracker what of the wall will be gone before the third keyframe. */
+static void look_ahead(pf_tracking *p, const pf_motion_hints *hints)
+{
+    const uint64_t counts = hints->has_encoder ? pf_keyframe_third(&p->choice_state, &p->choice, hints->encoder) : 0;
+    const int64_t way = pf_predictor_way(&p->predictor, counts);
+    int64_t axis[4];
+    pf_tracker_foresee(p->tracker, way > 0 ? way : PF_WAY_USUAL, pf_wall_axis_of(&p->wall, axis) ? axis : NULL);
+}
+
 static uint32_t update_scene(pf_tracking *p, const pf_shot *shot)
 {
     const pf_msg_telemetry *t = &shot->telemetry;
@@ -317,8 +326,10 @@ void pf_tracking_shot(void *tracking, void *item)
     shot->break_reason[0] = '\0';
     check_gap(p, shot);
     const pf_motion_hints hints = motion_hints(shot);
-    if (predicts)
+    if (predicts) {
         expect(p, &hints);
+        look_ahead(p, &hints);
+    }
     (void)pf_tracker_frame(p->tracker, &shot->frame.image, pf_now, shot->stage_ns);
     const pf_track *tracks = pf_tracker_tracks(p->tracker, &n);
     if (p->camera != NULL)

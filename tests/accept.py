@@ -133,7 +133,7 @@ def check_daemon_kills() -> list[Row]:
     return [exactly("daemon.kills_failed_of_10", failures, 0)]
 
 
-GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "67e9f76a"
+GOLDEN_FRAMES, GOLDEN_HASH = 10_000, "bf6e1884"
 
 
 def check_golden_replay() -> list[Row]:

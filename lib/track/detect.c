@@ -2,10 +2,6 @@
 #include "tracker_private.h"
 
 #define INNER 8 /* polar cells: nothing new in this fraction of the radius */
-/* Nor, with a circle, in its outer eighth: what comes up there first is the lamp's mirror image on wet and smooth
- * walls, which is always beside the camera; the wall itself was seen before. On clay and in wide plastic pipes it made
- * 43 to 69 % of the losses and a quarter to a half of the wrong places. */
-#define OUTER 8
 /* px^2, Q20: a place known to no better than 0.11 px along some direction at first sight (a line, a faint mark) makes
  * no track. In narrow plastic pipes these were 3 to 6 % of the sightings, 14 to 17 % of the wrong and up to 20 % of the
  * lost ones. */
@@ -15,12 +11,6 @@
  * glare, which goes with the camera. On PVC two thirds of what was lost to the glare had begun there. Elsewhere,
  * clipped corners are as good as others. */
 #define GLARE 40u
-
-/* Nor, in a tube whose wall comes out towards the rim, from where it has less than half a radius of way left before it
- * leaves the picture (60 degrees off the axis where the field ends at 86). Keyframes are a quarter of a radius apart:
- * what begins there is seen in two of them at most, and a point needs three views. Q24. */
-#define WAY_LEFT ((int64_t)1 << 23)
-#define STEEP    ((int64_t)1 << 26) /* sine of a polar angle, Q30: less says nothing */
 
 static bool weaker(const pf_corner *a, const pf_corner *b)
 {
@@ -60,46 +50,10 @@ static void remember(pf_tracker *t, const pf_corner *corner)
     }
 }
 
-int64_t pf_detect_late(const pf_tracker *t)
-{
-    const pf_track_lens *lens = &t->config.lens;
-    const int64_t last = (int64_t)(t->config.width - 1u) << 16, reach = (int64_t)(t->klt.half * 3 / 2 + 1) << 16;
-    pf_point_q16 at = t->config.circle;
-    if (!lens->ray || !t->config.circle_radius_q16)
-        return 0;
-    const int64_t x = at.x + (int64_t)t->config.circle_radius_q16, rim = (x < last ? x : last) - reach;
-    const pf_ray_q30 leaves = lens->ray(lens->rays, (pf_point_q16){(int32_t)rim, at.y});
-    const int64_t sine = pf_ray_sine(&leaves);
-    if (sine < STEEP)
-        return 0;
-    const int64_t cot = ((int64_t)leaves.z * (1 << 24)) / sine + WAY_LEFT;
-    const int64_t norm = pf_isqrt64((uint64_t)(cot * cot + ((int64_t)1 << 48)));
-    const pf_ray_q30 late = {(int32_t)(((int64_t)1 << 54) / norm), 0, (int32_t)(cot * ((int64_t)1 << 30) / norm)};
-    if (!lens->project(lens->camera, &late, &at))
-        return 0;
-    return ((int64_t)at.x - t->config.circle.x) >> 8;
-}
-
-/* Radius within which new tracks begin, Q8 px; 0 = no circle. */
-static int64_t rim_of(const pf_tracker *t)
-{
-    const pf_scene_measures *m = &t->stats.scene;
-    const int64_t rim = (int64_t)(t->config.circle_radius_q16 >> 8) * (OUTER - 1) / OUTER;
-    const bool comes_out = 5u * m->outward > 3u * m->moved; /* the share that must go in for it to be reversing */
-    return comes_out && t->late_q8 > 0 && t->late_q8 < rim ? t->late_q8 : rim;
-}
-
-static bool within_rim(const pf_tracker *t, pf_point_q16 at)
-{
-    const int64_t x = ((int64_t)at.x - t->config.circle.x) >> 8, y = ((int64_t)at.y - t->config.circle.y) >> 8;
-    const int64_t rim = rim_of(t);
-    return rim == 0 || x * x + y * y <= rim * rim;
-}
-
 /* Corners keep half a cell apart: greedy by strength, so spread leaves about one a cell. */
 static bool place_allowed(const pf_tracker *t, pf_point_q16 at)
 {
-    return within_rim(t, at) && pf_mask_allows_new(t, at.x >> 16, at.y >> 16) &&
+    return pf_rim_allows(t, at) && pf_mask_allows_new(t, at.x >> 16, at.y >> 16) &&
            pf_klt_inside(&t->klt, &t->pyramid[t->now].level[0], at) &&
            !pf_grid_near(t, at, (int64_t)t->config.cell << 15);
 }
@@ -197,7 +151,7 @@ static bool cell_box(const pf_tracker *t, int32_t cx, int32_t cy, int32_t box[4]
         return false;
     if (!t->klt.radius_q16)
         return true;
-    const int32_t u = t->klt.circle.x >> 16, v = t->klt.circle.y >> 16, r = (int32_t)(rim_of(t) >> 8) + 1;
+    const int32_t u = t->klt.circle.x >> 16, v = t->klt.circle.y >> 16, r = (int32_t)(t->rim_most_q8 >> 8) + 1;
     const int64_t dx = u < box[0] ? box[0] - u : u >= box[2] ? u - box[2] + 1 : 0;
     const int64_t dy = v < box[1] ? box[1] - v : v >= box[3] ? v - box[3] + 1 : 0;
     return dx * dx + dy * dy <= (int64_t)r * r;
@@ -210,6 +164,7 @@ void pf_tracks_detect(pf_tracker *t)
     t->found_n = 0;
     if (t->spare_n == 0)
         return;
+    pf_rim_set(t);
     for (uint32_t i = 0; i < SECTORS * RINGS; i++)
         t->bin[i] = 0;
     for (uint32_t i = 0; t->config.polar && i < t->n; i++)

@@ -8,6 +8,7 @@
 #define YOUNG        2u  /* frames: noise of the sensor gives corners by the hundred, none of which lives so long */
 #define WAIT_MOST    64u /* frames between keyframes for want of common tracks, where the reference was poor */
 #define STATE_FRAMES 30u /* another state than the last keyframe's is a keyframe when it has lasted so long */
+#define LEAP         ((uint64_t)1 << 24) /* counts a frame: more is no reading */
 
 #define BLIND (PF_SCENE_DARK | PF_SCENE_COVERED | PF_SCENE_WEAK_TEXTURE)
 
@@ -152,10 +153,32 @@ static void watch(pf_keyframe_state *state, const int64_t *encoder, uint32_t sce
     state->frames_since += state->frames_since < UINT32_MAX;
 }
 
+static uint64_t counts_between(int64_t a, int64_t b)
+{
+    return a > b ? (uint64_t)a - (uint64_t)b : (uint64_t)b - (uint64_t)a;
+}
+
 static bool is_far_enough(pf_keyframe_state *state, const pf_keyframe_config *config, const int64_t *encoder)
 {
-    const uint64_t now = (uint64_t)*encoder, then = (uint64_t)state->encoder;
-    return (*encoder > state->encoder ? now - then : then - now) >= config->step_counts;
+    return counts_between(*encoder, state->encoder) >= config->step_counts;
+}
+
+/* Counts until `counts` of them are reached or passed, `frame` a frame, in `frames` at the earliest. */
+static uint64_t in_whole_frames(uint64_t counts, uint64_t frame, uint64_t frames)
+{
+    const uint64_t needed = frame ? (counts + frame - 1u) / frame : 0;
+    return frame ? (needed > frames ? needed : frames) * frame : counts;
+}
+
+uint64_t pf_keyframe_third(const pf_keyframe_state *state, const pf_keyframe_config *config, int64_t encoder)
+{
+    if (!state->started || !state->have_encoder || !state->had_encoder || config->step_counts == 0)
+        return 0;
+    const uint64_t driven = counts_between(encoder, state->encoder), step = config->step_counts;
+    const uint64_t moved = counts_between(encoder, state->encoder_before), frame = moved < LEAP ? moved : LEAP;
+    const uint32_t apart = or_default(config->min_interval, 2), since = state->frames_since + 1u;
+    return in_whole_frames(driven < step ? step - driven : 0, frame, since < apart ? apart - since : 0) +
+           2u * in_whole_frames(step, frame, apart);
 }
 
 /* A poor reference is no measure: replaced by another as poor at once, it would be a keyframe every other frame. */

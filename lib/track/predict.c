@@ -89,6 +89,12 @@ void pf_predictor_assume(pf_predictor *p, int32_t radii_per_count_q27)
     p->has_per_count = true;
 }
 
+int64_t pf_predictor_way(const pf_predictor *p, uint64_t counts)
+{
+    const int64_t each = p->has_per_count ? pf_clamp_i64(p->per_count_q30, INT32_MAX) : 0;
+    return (int64_t)(counts < 1u << 24 ? counts : 1u << 24) * (each < 0 ? -each : each) >> 6;
+}
+
 /* Moves a ray to the cotangent `cot`. */
 static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
 {

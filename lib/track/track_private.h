@@ -142,6 +142,15 @@ typedef struct pf_bow {
  * camera driven along it or turned about it. False, and no bow, where the lens does not tell. */
 bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t y, pf_point_q16 to, pf_bow *bow);
 
+/* --- the tube (wall.c) --- */
+
+/* A round tube of radius 1 whose axis runs through (o0, o1) + z (o2, o3) in the camera's frame, at most 0.6 off it. All
+ * Q24. Distance from the camera's z axis of the wall in the direction (c, s) at z; */
+int64_t pf_tube_reach(int64_t c, int64_t s, int64_t z, const int64_t o[4]);
+
+/* and where a ray of that direction and cotangent meets it; *z gets how far along, from -1 to 4. */
+int64_t pf_tube_wall(int64_t c, int64_t s, int64_t cot, const int64_t o[4], int64_t *z);
+
 /* --- relief (relief.c) --- */
 
 /* The companion of the template in klt (.t, its gradients and `plane`, its sums times 1, x, y) around (x, y): what

@@ -130,7 +130,7 @@ pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config,
     t->klt.lens = c.lens;
     t->klt.circle = c.circle;
     t->klt.radius_q16 = (int32_t)c.circle_radius_q16;
-    t->late_q8 = pf_detect_late(t);
+    pf_tracker_foresee(t, PF_WAY_USUAL, NULL);
     pf_mask_init(t, c.mask);
     t->config.mask = NULL;
     pf_tracker_reset(t);

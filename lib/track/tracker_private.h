@@ -1,5 +1,6 @@
 /* The tracker's own state, for the files that share it: tracker.c (memory, the frame), follow.c (live tracks), detect.c
- * (new ones), mask.c (where nothing may be), measure.c (what the picture tells of the scene). */
+ * (new ones), rim.c (how far out those begin), mask.c (where nothing may be), measure.c (what the picture tells of the
+ * scene). */
 #ifndef PIPEFISH_TRACKER_PRIVATE_H
 #define PIPEFISH_TRACKER_PRIVATE_H
 
@@ -8,8 +9,9 @@
 #define BLOCK      8u  /* px: side of a block of the masks */
 #define SECTORS    12u /* detection in polar cells: sectors of 30 degrees */
 #define RINGS      6u
-#define CANDIDATES 4u /* for corners, times the tracks there may be: most stand too near a stronger one */
-#define CLIPPED    4u /* at most this fraction of a window may be clipped */
+#define DIRECTIONS 36u /* in which it is asked how far out tracks begin */
+#define CANDIDATES 4u  /* for corners, times the tracks there may be: most stand too near a stronger one */
+#define CLIPPED    4u  /* at most this fraction of a window may be clipped */
 
 typedef struct pf_slot {  /* the hidden part of a live track */
     pf_point_q16 move;    /* its last displacement */
@@ -46,7 +48,9 @@ struct pf_tracker {
     int32_t *radial;
     uint32_t n;
     pf_slot *slots;
-    int64_t late_q8; /* pf_detect_late */
+    int64_t way_q24, axis[4];   /* pf_tracker_foresee */
+    int64_t rim_q8[DIRECTIONS]; /* how far from the circle's centre new tracks begin, px; 0 = no circle */
+    int64_t rim_most_q8;
     uint8_t *pixels; /* templates, patch_bytes each */
     uint32_t patch_bytes;
     uint16_t *spare; /* free slots */
@@ -93,9 +97,13 @@ pf_point_q16 pf_flow_centre(const pf_tracker *t);
 
 void pf_tracks_detect(pf_tracker *t);
 
-/* How far from the circle's centre, Q8 px, tracks begin too late, where the wall of a tube comes out: it is gone before
- * the third keyframe. 0: not known. */
-int64_t pf_detect_late(const pf_tracker *t);
+/* --- how far out they begin (rim.c) */
+
+/* After pf_scene_measure: sets rim_q8. */
+void pf_rim_set(pf_tracker *t);
+
+/* Whether a new track may begin there. */
+bool pf_rim_allows(const pf_tracker *t, pf_point_q16 at);
 
 /* The sector of 30 degrees, 0 .. SECTORS - 1 from x to y, that (dx, dy), |.| < 2^40, lies in. */
 uint32_t pf_sector_of(int64_t dx, int64_t dy);

@@ -85,17 +85,21 @@ static bool make_pair(const pf_ray_q30 *before, const pf_ray_q30 *after, pf_pair
     return true;
 }
 
-/* Distance of the wall from the camera's z axis at the pair's azimuth and cotangent; *z gets how far along. */
-static int64_t depth_of(const pf_pair *p, const int64_t o[4], int64_t *z)
+int64_t pf_tube_reach(int64_t c, int64_t s, int64_t z, const int64_t o[4])
+{
+    const int64_t x = o[0] + mul(o[2], z), y = o[1] + mul(o[3], z), off = mul(x, s) - mul(y, c);
+    const int64_t square = ONE * ONE - off * off;
+    const int64_t rho = mul(x, c) + mul(y, s) + (square > 0 ? (int64_t)pf_isqrt64((uint64_t)square) : 0);
+    return rho < ONE / 8 ? ONE / 8 : rho > 4 * ONE ? 4 * ONE : rho;
+}
+
+int64_t pf_tube_wall(int64_t c, int64_t s, int64_t cot, const int64_t o[4], int64_t *z)
 {
     int64_t rho = ONE;
     for (int32_t i = 0; i < 3; i++) {
-        *z = mul(p->cot, rho);
+        *z = mul(cot, rho);
         *z = *z < -ONE ? -ONE : *z > 4 * ONE ? 4 * ONE : *z;
-        const int64_t x = o[0] + mul(o[2], *z), y = o[1] + mul(o[3], *z), off = mul(x, p->s) - mul(y, p->c);
-        const int64_t square = ONE * ONE - off * off;
-        rho = mul(x, p->c) + mul(y, p->s) + (square > 0 ? (int64_t)pf_isqrt64((uint64_t)square) : 0);
-        rho = rho < ONE / 8 ? ONE / 8 : rho > 4 * ONE ? 4 * ONE : rho;
+        rho = pf_tube_reach(c, s, *z, o);
     }
     return rho;
 }
@@ -105,7 +109,7 @@ static int64_t depth_of(const pf_pair *p, const int64_t o[4], int64_t *z)
 static void residual(const pf_pair *p, const int64_t v[UNKNOWN], int64_t r[2], int32_t j[2][UNKNOWN])
 {
     int64_t z, turn[3], more[3], at[3];
-    const int64_t rho = depth_of(p, v + AXIS, &z), way[3] = {p->c, p->s, p->cot};
+    const int64_t rho = pf_tube_wall(p->c, p->s, p->cot, v + AXIS, &z), way[3] = {p->c, p->s, p->cot};
     for (int32_t k = 0; k < 3; k++)
         at[k] = mul(way[k], rho) - v[3 + k];
     cross(v, at, turn);
@@ -461,6 +465,14 @@ static bool knows_axis(const pf_wall *wall)
 {
     const int64_t enough = prior_of(wall->axis.variance / 2, WELL);
     return wall->axis.known[0][0] >= enough && wall->axis.known[1][1] >= enough;
+}
+
+bool pf_wall_axis_of(const pf_wall *wall, int64_t axis[4])
+{
+    if (!knows_axis(wall))
+        return false;
+    memcpy(axis, wall->axis.at, sizeof wall->axis.at);
+    return true;
 }
 
 /* The part, Q16, of what a track walks off alone that is the light's doing. On brick, clay and plastic that is 0.27 %

@@ -172,3 +172,43 @@ def test_dropped_frames_are_counted_and_a_long_gap_is_a_marked_break(tmp_path: P
         (32, "gap of 12 frames", pb.KEYFRAME_CAUSE_FIRST)
     ]
     assert set(breaks[0].observations.status) == {pb.TRACK_STATUS_NEW}
+
+
+def drive_through_a_tube(path: Path, frames: int, per_frame: float) -> pf.Camera:
+    """A recording of the inside of a round tube, drawn ray by ray: `per_frame` radii and 45 encoder counts a frame."""
+    side, focal, circle = 320, 100.0, 150.0
+    y, x = np.mgrid[:side, :side] - side / 2 + 1e-6
+    r, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    ahead = 1 / np.tan(np.minimum(r / focal, 3.0))
+    contrast = 22 * np.clip(3.5 - ahead, 0, 1)  # farther away the waves are finer than pixels
+    rows = ["sequence,time_ns,encoder_count"]
+    with path.open("wb") as out:
+        out.write(f"YUV4MPEG2 W{side} H{side} F30:1 Ip A1:1 Cmono\n".encode())
+        for i in range(frames):
+            waves = (
+                np.sin((3 + 5 * k % 17) * azimuth + (-1) ** k * (6 + 7 * k % 13) * (ahead + per_frame * i) + 1.7 * k)
+                for k in range(12)
+            )
+            pixels = np.where(r < circle, np.clip(120 + contrast * sum(waves), 3, 245), 0).astype(np.uint8)
+            out.write(b"FRAME\n" + pixels.tobytes())
+            rows.append(f"{i},{10**9 + i * 10**9 // 30},{45 * i}")
+    path.with_suffix(".csv").write_text("\n".join(rows) + "\n")
+    return pf.Camera(
+        **{"width": side, "height": side, "f_u": focal, "f_v": focal, "c_u": side / 2, "c_v": side / 2},
+        **{"theta_max": 1.55, "circle_u": side / 2, "circle_v": side / 2, "circle_radius": circle},
+    )
+
+
+def test_what_begins_on_the_way_is_seen_in_three_keyframes(tmp_path: Path):
+    camera = drive_through_a_tube(tmp_path / "survey.y4m", 110, 0.03)
+    (tmp_path / "camera.bin").write_bytes(camera.to_binary())
+    crawler = Crawler(tmp_path, keyframe__step_mm=0, survey__nominal_diameter_mm=300)
+    store = Store(crawler.port)
+    crawler.start("--set", f"camera.profile={tmp_path / 'camera.bin'}")
+    assert receive_all(crawler, store) == 0
+    seen = [set(np.cumsum(k.observations.id_delta).tolist()) for k in store.keyframes]
+    assert len(seen) >= 12
+    times = Counter(track for ids in seen for track in ids)
+    on_the_way = set.union(*seen[2:-3]) - set.union(*seen[:2]) - set.union(*seen[-3:])
+    assert len(on_the_way) > 100
+    assert sum(times[track] < 3 for track in on_the_way) < 0.1 * len(on_the_way)  # a third, if a fixed way is left

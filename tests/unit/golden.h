@@ -61,8 +61,8 @@ static void make_frame(uint32_t k, uint8_t *out)
     for (int32_t y = 0; y < HEIGHT; y++)
         for (int32_t x = 0; x < WIDTH; x++) {
             const int32_t dx = x - WIDTH / 2, dy = y - HEIGHT / 2;
-            const int32_t u = (256 << 16) + dx * scale - dy * turn + i * 50000;
-            const int32_t v = (256 << 16) + dx * turn + dy * scale + i * 20000;
+            const int32_t u = (256 << 16) + dx * scale - dy * turn + i * 12000;
+            const int32_t v = (256 << 16) + dx * turn + dy * scale + i * 5000;
             const uint8_t *p = texture + (v >> 16) * TEXTURE + (u >> 16);
             const int32_t a = (u >> 8) & 255, b = (v >> 8) & 255;
             const int32_t top = p[0] * (256 - a) + p[1] * a, bottom = p[TEXTURE] * (256 - a) + p[TEXTURE + 1] * a;
@@ -183,6 +183,12 @@ static bool golden_replay(uint32_t frames, golden *out)
             if (pf_tracker_expect(tracker, expected, n) != PF_OK)
                 return false;
         }
+        int64_t axis[4];
+        const uint64_t third = hints.has_encoder ? pf_keyframe_third(&keyframes, &choice, hints.encoder) : 0;
+        const int64_t way = pf_predictor_way(&predictor, third);
+        const bool is_known = pf_wall_axis_of(&wall, axis);
+        out->crc = hash_u32(out->crc, (uint32_t)way);
+        pf_tracker_foresee(tracker, way > 0 ? way : PF_WAY_USUAL, is_known ? axis : NULL);
         if (pf_tracker_frame(tracker, &image, NULL, NULL) != PF_OK)
             return false;
         tracks = pf_tracker_tracks(tracker, &n);

@@ -1,4 +1,5 @@
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "pipefish/track.h"
@@ -64,6 +65,36 @@ static void test_encoder_steps_choose_keyframes_in_both_directions(void)
         look(0.02 * (double)i, 0, 0);
         TEST_ASSERT_EQUAL_INT(step[i].expected, decide(&c, &step[i].at, NULL));
     }
+}
+
+/* Proves: the third keyframe from any frame on comes when it was foreseen to, to a frame: at even speeds, slow ones,
+ * those at which keyframes are as near as frames allow, and backwards; and nothing is foreseen without counts. */
+static void test_the_third_keyframe_is_foreseen(void)
+{
+    static const int64_t speed[] = {3, 7, 30, 60, 80, 250, -13};
+    const pf_keyframe_config c = {.step_counts = 100, .min_interval = 2};
+    for (size_t i = 0; i < sizeof speed / sizeof speed[0]; i++) {
+        const uint64_t frame = (uint64_t)llabs(speed[i]);
+        uint64_t foreseen[400];
+        int64_t at[400];
+        uint32_t chosen[400], n = 0;
+        pf_keyframe_reset(&state);
+        TEST_ASSERT_EQUAL_UINT64(0, pf_keyframe_third(&state, &c, 5000));
+        for (int k = 0; k < 400; k++) {
+            at[k] = 5000 + speed[i] * k;
+            foreseen[k] = pf_keyframe_third(&state, &c, at[k]);
+            look(0.0001 * k, 0, 0);
+            if (decide(&c, &at[k], NULL) != PF_KEYFRAME_NO)
+                chosen[n++] = (uint32_t)k;
+        }
+        TEST_ASSERT_GREATER_THAN_UINT32(8, n);
+        for (uint32_t k = 2, next = 1; k < chosen[n - 3u]; k++) {
+            next += k > chosen[next];
+            const uint64_t true_way = (uint64_t)llabs(at[chosen[next + 2u]] - at[k]);
+            TEST_ASSERT_UINT64_WITHIN(frame, true_way, foreseen[k]);
+        }
+    }
+    TEST_ASSERT_EQUAL_UINT64(0, pf_keyframe_third(&state, &config, 5000));
 }
 
 /* Proves: rotation alone is no parallax, about any axis and up to 15 degrees; it is compensated, not just ignored. */
@@ -265,6 +296,7 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_encoder_steps_choose_keyframes_in_both_directions);
+    RUN_TEST(test_the_third_keyframe_is_foreseen);
     RUN_TEST(test_pure_rotation_makes_no_keyframe);
     RUN_TEST(test_rotation_is_found_to_a_ten_thousandth);
     RUN_TEST(test_forward_motion_makes_a_keyframe_at_the_parallax);

@@ -126,6 +126,25 @@ static void test_driving_is_predicted_through_rays(void)
     }
 }
 
+/* Proves: what an encoder count means in radii is learned, to 3 %, whichever way the encoder counts; before, and
+ * without one, nothing is said. */
+static void test_a_count_is_so_many_radii(void)
+{
+    const uint64_t radius = (uint64_t)lround(TUBE_RADIUS * 20); /* counts, as hints_of has them */
+    for (int way = -1; way <= 1; way++) {
+        setUp();
+        TEST_ASSERT_EQUAL_INT64(0, pf_predictor_way(&predictor, radius));
+        for (int i = 0; i < 16; i++) {
+            view.z += way < 0 ? -4 : 4;
+            feed(true, way != 0);
+        }
+        const int64_t said = pf_predictor_way(&predictor, radius);
+        TEST_ASSERT_INT64_WITHIN(way ? (1 << 24) / 33 : 0, way ? 1 << 24 : 0, said);
+    }
+    pf_predictor_assume(&predictor, -(1 << 20)); /* -1/128 of a radius */
+    TEST_ASSERT_EQUAL_INT64((1 << 24) / 128 * 10, pf_predictor_way(&predictor, 10));
+}
+
 /* Proves: a steady roll is predicted from the pictures, a sudden one from the inclinometer. */
 static void test_roll_is_predicted(void)
 {
@@ -250,6 +269,7 @@ int main(void)
     tube_make();
     UNITY_BEGIN();
     RUN_TEST(test_driving_is_predicted_through_rays);
+    RUN_TEST(test_a_count_is_so_many_radii);
     RUN_TEST(test_roll_is_predicted);
     RUN_TEST(test_dropped_frames_are_counted);
     RUN_TEST(test_readings_wrap_and_leaps_are_ignored);

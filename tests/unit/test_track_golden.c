@@ -5,7 +5,7 @@
 #include "unity.h"
 
 #define FRAMES 100
-#define GOLDEN 0xACF17C51u
+#define GOLDEN 0x2952EE21u
 
 void setUp(void) {}
 void tearDown(void) {}

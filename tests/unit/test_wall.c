@@ -100,6 +100,19 @@ static void test_nobody_walks_off_a_round_wall(void)
         TEST_ASSERT_EQUAL_UINT32(0, times[i]);
 }
 
+/* Proves: and then it is known where the camera stands in it, and how it is tilted. */
+static void test_the_axis_is_found(void)
+{
+    uint32_t times[TRACKS];
+    int64_t axis[4];
+    drive(times);
+    TEST_ASSERT_TRUE(pf_wall_axis_of(&wall, axis));
+    TEST_ASSERT_DOUBLE_WITHIN(0.03, -0.02 * sin(3), (double)axis[0] / 16777216.0);
+    TEST_ASSERT_DOUBLE_WITHIN(0.03, -0.16, (double)axis[1] / 16777216.0);
+    TEST_ASSERT_DOUBLE_WITHIN(0.02, -0.01 - 0.01 * sin(5), (double)axis[2] / 16777216.0);
+    TEST_ASSERT_DOUBLE_WITHIN(0.02, -0.02, (double)axis[3] / 16777216.0);
+}
+
 /* Proves: a track that moves like a wall a fiftieth nearer, 2 px and more at the rim, is found, and it alone. */
 static void test_a_track_that_walks_off_is_found(void)
 {
@@ -272,6 +285,7 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_nobody_walks_off_a_round_wall);
+    RUN_TEST(test_the_axis_is_found);
     RUN_TEST(test_a_track_that_walks_off_is_found);
     RUN_TEST(test_a_slow_camera_finds_it_too);
     RUN_TEST(test_what_stands_on_the_wall_stays);

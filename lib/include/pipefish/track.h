@@ -90,8 +90,7 @@ typedef struct pf_tracker_config {
     bool no_static_mask;        /* true: the tracker does not look for parts that stand still while the picture moves */
     pf_track_lens lens; /* with one, patches bend as those on the wall of a tube along the optical axis do: an affine
                          * warp alone leaves 0.02 px a fifth of growth, the same way for all; no track begins at the
-                         * edge of the glare, nor, while the wall comes out towards the rim, where half a radius of way
-                         * is left of it: that is gone before the third keyframe [none] */
+                         * edge of the glare, nor where pf_tracker_foresee says that it is too late [none] */
     bool has_wall; /* the caller gives up what walks off the wall, with pf_wall_check: what is left need look less alike
                     * (0.2 less than min_zncc, twice fb, twice the variance at which a track is lost) */
     bool polar; /* new corners are spread over 12 sectors and 6 rings of the image circle, at most 1.5 x max_tracks / 72
@@ -166,6 +165,15 @@ typedef struct pf_expected {
  * PF_ERR_ARGUMENT: n is not the table's. */
 pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, uint32_t n);
 
+#define PF_WAY_USUAL ((int64_t)1 << 23) /* half a radius: two steps of keyframes a quarter of it apart */
+#define PF_WAY_MOST  ((int64_t)1 << 25) /* two radii */
+
+/* Says what is foreseen from the next frame on: what of a tube's wall will have left the picture when the camera has
+ * driven on by `way_q24` radii, PF_WAY_MOST at most, is too late for new tracks to begin on, as long as the wall comes
+ * out towards the rim and 12 tracks at least were found again. The tube's axis as of pf_wall_axis_of; NULL: the optical
+ * axis. It holds until it is called again; before: PF_WAY_USUAL, NULL. Needs a lens and a circle. */
+void pf_tracker_foresee(pf_tracker *tracker, int64_t way_q24, const int64_t axis[4]);
+
 /* The table after the last frame: live tracks (max_tracks at most) and those lost in it (as many again at most), by
  * ascending id. Valid until the next call. */
 const pf_track *pf_tracker_tracks(const pf_tracker *tracker, uint32_t *n);
@@ -234,6 +242,9 @@ void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const p
 void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected);
 
+/* The way, Q24 radii, of so many encoder counts; 0: it is not known what a count means. */
+int64_t pf_predictor_way(const pf_predictor *predictor, uint64_t counts);
+
 /* --- The wall -----------------------------------------------------------------------------------------------------
  * Tracks that walk off it. In a light that goes with the camera, relief that shines along with the paint moves like a
  * wall a little nearer; one track alone cannot tell. All of them tell how the camera moved in its round tube. */
@@ -289,6 +300,10 @@ uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *
  * off alike is the wall's own shape and stays. The tracker goes on from where it found them. Cost: 20 n^2
  * instructions. */
 void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_project project, const void *camera);
+
+/* Where the tube's axis is in the camera's frame, Q24 radii: through (axis[0], axis[1]) + z (axis[2], axis[3]). False,
+ * and nothing written, where it is not known to a 32nd. */
+bool pf_wall_axis_of(const pf_wall *wall, int64_t axis[4]);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
  * Flags with hysteresis, from a frame's measures. What the picture cannot tell (dark, covered) the encoder does. */
@@ -377,6 +392,10 @@ void pf_keyframe_reset(pf_keyframe_state *state);
 pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe_config *config, const pf_track *tracks,
                                      const pf_ray_q30 *rays, uint32_t n, const int64_t *encoder, uint32_t scene,
                                      uint32_t *common);
+
+/* Encoder counts from the frame that comes, of that reading, until the third keyframe from then on, itself included;
+ * as it drives now, and where the encoder alone decides. 0: there are none to decide by. */
+uint64_t pf_keyframe_third(const pf_keyframe_state *state, const pf_keyframe_config *config, int64_t encoder);
 
 #ifdef __cplusplus
 }
