@@ -17,6 +17,7 @@ from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
 from pipefish.pupil import pupil_sigma
+from pipefish.readings import smoothed
 from pipefish.repeated import Repetition, cut, jumps, renamed, repetition
 from pipefish.rolling import shutter_of
 from pipefish.scale import Known, Scale, with_diameter
@@ -98,7 +99,8 @@ class Measurement:
     """A measured survey.
 
     index       (K,) index of each keyframe that is here; frames below and in `structure` count these
-    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
+    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one. Without the jitter of its
+                readings where they have one
     structure   in the unit of `scale`
     camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
                 not known
@@ -283,8 +285,9 @@ def measure(
     walk = np.hypot(TRACK_FLOOR_PX, TRACK_WALK_PX * _travel(tracks, camera))
     weighed = dataclasses.replace(tracks, covariance=tracks.covariance + (walk**2)[:, None, None] * np.eye(2))
     shutter = shutter_of(survey, line_time)
-    structure = _while_telling(
-        lambda: reconstruct(
+
+    def adjusted() -> Reconstruction:
+        return reconstruct(
             weighed,
             assumed(camera),
             chainage,
@@ -298,9 +301,18 @@ def measure(
             drift=drift_prior(weighed, camera, TRACK_SHARPER),
             common_errors=True,  # the floor
             shutter=shutter,
-        ),
-        lambda: tell(0.05, "poses and points"),
-    )
+        )
+
+    structure = _while_telling(adjusted, lambda: tell(0.05, "poses and points"))
+    told = chainage is not None and structure.status != "failed"
+    smooth = smoothed(structure, chainage, quality) if told else None
+    if smooth:
+        chainage, quality, white = smooth
+        remarks.append(
+            f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which it does not say: they "
+            "were smoothed along what the pictures say was driven from one to the next."
+        )
+        structure = _while_telling(adjusted, lambda: tell(0.3, "poses and points, the encoder smoothed"))
     structure.gaps = renamed(structure.gaps, _jumped or [])
     if structure.status == "failed":
         raise PipefishError(
