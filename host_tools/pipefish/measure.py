@@ -337,11 +337,14 @@ def measure(
     find_scale(m, known, threads, tell)
     _fit_stretches(m, threads, tell)
     if not m.measured:
-        reasons = sorted({s.tube.reason for s in m.stretches})
+        reasons, shaped = (
+            sorted({s.tube.reason for s in m.stretches}),
+            any(s.tube.status == "open" for s in m.stretches),
+        )
+        doubt = "" if shaped else _pupil_doubt(camera, chainage) or " (a wrong camera profile?)"
         raise PipefishError(
             f"{survey.path}: poses of {len(structure.frames)} keyframes and {len(structure.points)} points were "
-            f"found, but no pipe around them: {'; '.join(reasons)}"
-            f"{_pupil_doubt(camera, chainage) or ' (a wrong camera profile?)'}"
+            f"found, but no pipe {'of any size' if shaped else 'around them'}: {'; '.join(reasons)}{doubt}"
         )
     if pictures:
         m.repeats, m.jumped = repetition(m), _jumped or []

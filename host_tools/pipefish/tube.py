@@ -5,6 +5,7 @@ o'clock; hours = clock * 6 / pi. Lengths are metres."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipefish import _engine
+from pipefish import _engine, tube_shape
 from pipefish.errors import ArgumentError
 from pipefish.tube_shared import Common, Shared
 
@@ -37,6 +38,7 @@ REASONS = {
     "too_few_points": "too few points for a tube",
     "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
     "one_sided": "points on one side only: neither centre nor diameter is determined",
+    "open": "the section is no ellipse (an egg?), and too little of it is seen to tell what it is",
     "not_determined": "the points are too uncertain for a tube",
     "too_short": "the wall is shorter than half a radius",
 }
@@ -48,7 +50,7 @@ class Tube:
 
     stations: arrays with one row a station, by name:
       s, x, y, z, tx, ty, tz   chainage, point of the axis, unit tangent
-      status                   "ok", "circle_only", "one_sided", "too_few_points"; values not measured are NaN
+      status                   "ok", "circle_only", "open", "one_sided", "too_few_points"; what was not measured is NaN
       d_mean, d_area, circumference, d_max, d_min   perimeter / pi; diameter of the circle of equal area; widest and
                                narrowest caliper width. The ellipse's part is without the noise's bias
       clock_max                clock angle of d_max, radians, 0 to pi
@@ -59,6 +61,7 @@ class Tube:
       ovality_squared          square of the ovality less the noise's share, below zero as often as above where the
                                pipe is round: what averages are made of (`rms_ovality`)
       <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
+      departure                of the section from its ellipse, at most (harmonics 3 and up): an egg's, a dent's
       curvature, curvature_sigma, inliers, gap, rms, roughness
     events: one dictionary a finding; see `pipefish.tube_findings`."""
 
@@ -225,38 +228,72 @@ def fit_tube(
     nodes, rho = _reference(cloud, sections, centres)
     if len(nodes) < 2:
         return _none("too_short", "", nominal)
-    diameter = 2 * float(np.median(rho))
-    tell(0.4, "looking for joints")
+    tell(0.4, "fitting the surface")
+    fit = _Fit(cloud, noise, used, up_vector, nominal, order, spacing, scale_sigma, shared)
     try:
-        coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+        tube, common = fit.on(nodes, rho)
     except ValueError as error:  # the normal matrix is singular
         return _none("not_determined", str(error), nominal)
-    breaks = tube_findings.break_candidates(coarse, nodes, diameter)
-    tell(0.55, "fitting the surface")
-    try:
-        surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False, ASSUMED_OVALITY)
-    except ValueError as error:
-        return _none("not_determined", str(error), nominal)
-    known = np.flatnonzero(used)
-    common = Common(surface, shared, known, diameter)
-    kept = tube_findings.confirmed(surface, diameter, breaks, common)
-    if len(kept) < len(breaks):
-        surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False, ASSUMED_OVALITY)
-        common = Common(surface, shared, known, diameter)
-    tube = Tube("ok", "", {}, nominal=nominal, surface=surface)
-    tube._up, tube.clock_zero = _clock_of(surface, up_vector)
-    tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
-    tube.summary = _summary(tube, by_shape, used)
+    if tube_shape.much_off(tube):
+        tell(0.7, "trying another shape")
+        with contextlib.suppress(ValueError):
+            other, its = fit.on(*tube_shape.wide_circles(np.asarray(points, float), tube, len(nodes)))
+            if tube_shape.likelier(other, tube):
+                tube, common = other, its
     if not np.isin(tube.stations["status"], MEASURED).any():
         statuses, count = np.unique(tube.stations["status"], return_counts=True)
         return _none(str(statuses[count.argmax()]), "", nominal)  # of most of it
-    tube.points = _all_points(tube._places(surface.placed()), used)
-    tube.summary["points_apart"] = float(np.mean(tube.points["piece"][used] < 0))
     tell(0.9, "looking for what departs from it")
     tube.events = tube_findings.events(tube, common)
     tube.summary["events"] = len(tube.events)
     tell(1.0, "done")
     return tube
+
+
+@dataclass
+class _Fit:
+    """A surface through the cloud, and what a tube has of it."""
+
+    cloud: np.ndarray
+    noise: Any
+    used: np.ndarray
+    up: Any
+    nominal: float | None
+    order: int
+    spacing: float | None
+    scale_sigma: float
+    shared: Shared | None
+
+    def _surface(self, nodes: np.ndarray, rho: list[float], breaks: list[float]) -> Any:
+        return _engine.tube_surface(
+            self.cloud, self.noise, nodes, rho, breaks, KNOT, self.order, 12, False, ASSUMED_OVALITY
+        )
+
+    def on(self, nodes: np.ndarray, rho: list[float]) -> tuple[Tube, Common]:
+        """From circles along the pipe; the tube is without findings. ValueError: nothing is determined."""
+        from pipefish import tube_findings
+
+        diameter, known = 2 * float(np.median(rho)), np.flatnonzero(self.used)
+        coarse = _engine.tube_surface(self.cloud, self.noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+        breaks = tube_findings.break_candidates(coarse, nodes, diameter)
+        surface = self._surface(nodes, rho, breaks)
+        common = Common(surface, self.shared, known, diameter)
+        kept = tube_findings.confirmed(surface, diameter, breaks, common)
+        if len(kept) < len(breaks):
+            surface = self._surface(nodes, rho, kept)
+            common = Common(surface, self.shared, known, diameter)
+        tube = Tube("ok", "", {}, nominal=self.nominal, surface=surface)
+        tube._up, tube.clock_zero = _clock_of(surface, self.up)
+        tube.stations, by_shape = _stations(tube, self.spacing or STATION * diameter, self.scale_sigma, common)
+        tube.summary = _summary(tube, by_shape, self.used)
+        tube.points = _all_points(tube._places(surface.placed()), self.used)
+        unknown = tube_shape.is_open(tube)
+        if unknown.any():
+            tube.stations["status"][unknown] = "open"
+            _blank(tube.stations)
+            tube.summary = _summary(tube, by_shape, self.used)
+        tube.summary["points_apart"] = float(np.mean(tube.points["piece"][self.used] < 0))
+        return tube, common
 
 
 def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any, Any, np.ndarray]:
@@ -521,8 +558,11 @@ def _stations(
     d_mean, d_area = _size(debiased)
     values = {"d_mean": d_mean, "d_area": d_area, "d_max": sound["max"], "d_min": sound["min"]}
 
-    def sigma_of(g: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", g, cov, g)))
+    out["departure"] = tube_shape.departure(shape)
+    beyond = tube_shape.left_out(out["departure"], d_mean)
+
+    def sigma_of(g: np.ndarray, diameters: int = 1) -> np.ndarray:
+        return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", g, cov, g)) + diameters * beyond**2)
 
     for name, value in values.items():
         out[name] = value
@@ -532,14 +572,14 @@ def _stations(
     out["circumference_sigma"] = np.pi * out["d_mean_sigma"]
     out["clock_max"] = (raw["max_direction"] - f["zero"]) % np.pi
     out["clock_max_sigma"] = np.minimum(np.pi / 2, 0.5 * np.sqrt(trace / 2) / np.maximum(e, 1e-300))
-    span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"])
+    span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"], 2)
     out["ovality"], out["ovality_sigma"] = span / d_mean, span_sigma / d_mean
     by_ellipse = (gradient["d_max"] - gradient["d_min"])[:, 1:3]
     out["ovality_systematic"] = np.sqrt(np.einsum("ni,nij,nj->n", by_ellipse, camera, by_ellipse)) / d_mean
     out["ovality_astm"] = (d_mean - values["d_min"]) / d_mean
-    out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"]) / d_mean
+    out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"], 2) / d_mean
     out["ovality_astm_max"] = (values["d_max"] - d_mean) / d_mean
-    out["ovality_astm_max_sigma"] = sigma_of(gradient["d_max"] - gradient["d_mean"]) / d_mean
+    out["ovality_astm_max_sigma"] = sigma_of(gradient["d_max"] - gradient["d_mean"], 2) / d_mean
     nominal = tube.nominal or math.nan
     out["ovality_nominal"], out["ovality_nominal_sigma"] = span / nominal, span_sigma / nominal
     out["reduction_nominal"] = (nominal - values["d_min"]) / nominal
