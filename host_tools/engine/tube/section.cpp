@@ -91,19 +91,15 @@ Offset section_distance(int order, const double *shape, const Eigen::Vector2d &y
         g += p[0] * ch + p[1] * sh;
         slope += h * (p[1] * ch - p[0] * sh);
     }
-    const double steep = slope / f.speed, scale = 1.0 / std::sqrt(1.0 + steep * steep);
+    slope /= f.speed;
+    const double scale = 1.0 / std::sqrt(1.0 + slope * slope);
     out.distance = (f.distance - g) * scale;
-    // The foot is where the way to y is across the ellipse: it moves with y, and g with it, and with the ellipse.
-    const double c = f.u[0], s = f.u[1], rho = shape[0], ec = shape[1], es = shape[2];
-    const Eigen::Vector2d along = f.speed * Eigen::Vector2d(-f.n[1], f.n[0]);
-    const Eigen::Vector2d at((rho + ec) * c + es * s, es * c + (rho - ec) * s);
-    const double turn = f.speed * f.speed + f.distance * f.n.dot(at);
-    out.n = (f.n - slope / turn * along) * scale;
+    // dt/dy of the foot is the tangent over the speed, so g turns the normal.
+    const Eigen::Vector2d tangent(-f.n[1], f.n[0]);
+    out.n = (f.n - slope * tangent) * scale;
     if (by_shape) {
-        const Eigen::Vector2d moved[3] = {{c, s}, {c, -s}, {s, c}}, turned[3] = {{-s, c}, {-s, -c}, {c, -s}};
         for (int i = 0; i < 3; i++) {
-            const double slides = (f.distance * f.n.dot(turned[i]) - along.dot(moved[i])) / turn;
-            by_shape[i] = (by_shape[i] - slope * slides) * scale;
+            by_shape[i] *= scale;
         }
         for (int h = 3; h <= order; h++) {
             double *p = by_shape + shape_parameters(h - 1);
