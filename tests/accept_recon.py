@@ -7,7 +7,7 @@ tubes       the same drives through `fit_tube`: diameters and ovality of its sta
 draws       200 draws of noise on one drive of 1 m: scatter of points, rings, lengths, poses beside their posterior
 two_view    400 pairs of views in a tube, errors beside the bound of Cramer and Rao
 long        time and memory of 300 m against 30 m
-video       three pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
+video       four pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
 
 Each piece's figures are kept in build/accept/recon/NAME.jsonl and taken from there while the package and its engine are
 the same: what was interrupted goes on where it stopped.

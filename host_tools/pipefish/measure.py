@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.jitter import smoothed
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.pupil import pupil_sigma
 from pipefish.readings import TRACK_FLOOR_PX, Readings, angles, readings_of
@@ -101,35 +103,52 @@ def measure(
         raise PipefishError(f"{survey.path}: {_too_short(survey)}; three are the least that can be measured")
     readings = readings_of(survey, camera, line_time)
 
-    def fitted(readings: Readings, cuts: list[int]) -> tuple[Measurement, Reconstruction]:
-        """Poses and points, scale, tubes; and the structure in the adjustment's unit."""
-        structure = _adjusted(readings, method, threads, tell)
+    def fitted(given: Readings, cuts: list[int]) -> tuple[Measurement, Readings, Reconstruction]:
+        """Poses and points, scale, tubes; what was adjusted, and the structure in the adjustment's unit."""
+        used, structure = _adjusted(given, method, threads, tell)
         structure.gaps = renamed(structure.gaps, cuts)
-        m = _measurement(survey, readings, structure)
+        m = _measurement(survey, used, structure)
         m.nominal = nominal or m.nominal
         find_scale(m, known, threads, tell)
         _fit_stretches(m, threads, tell)
         _check_measured(m)
-        return m, structure
+        return m, used, structure
 
-    m, structure = fitted(readings, [])
+    m, used, structure = fitted(readings, [])
     if pictures:
         m.repeats = repetition(m)
         jumped = jumps(m, m.repeats)
         if jumped:
-            readings = readings.cut_at(jumped)
-            m, structure = fitted(readings, jumped)
+            m, used, structure = fitted(readings.cut_at(jumped), jumped)
             m.repeats, m.jumped = repetition(m), jumped
     _sigmas(m)
     _check_diameter(m, known.diameter)
-    m.health = _health(m, readings, structure, known, threads, tell)
+    m.health = _health(m, used, structure, known, threads, tell)
     if pictures:
         tell_gaps(m)
     remark(m)
     return m
 
 
-def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) -> Reconstruction:
+def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) -> tuple[Readings, Reconstruction]:
+    """Poses and points; and the readings, of which the encoder's are smoothed where they jitter."""
+    structure = _adjusted_once(readings, method, threads, lambda: tell(0.05, "poses and points"))
+    if readings.chainage is None or structure.status == "failed":
+        return readings, structure
+    smooth = smoothed(structure, readings.chainage, readings.encoder)
+    if smooth is None:
+        return readings, structure
+    chainage, encoder, white = smooth
+    remark = (
+        f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which it does not say: they "
+        "were smoothed along what the pictures say was driven from one to the next."
+    )
+    readings = dataclasses.replace(readings, chainage=chainage, encoder=encoder, remarks=[*readings.remarks, remark])
+    again = _adjusted_once(readings, method, threads, lambda: tell(0.3, "poses and points, the encoder smoothed"))
+    return readings, again
+
+
+def _adjusted_once(readings: Readings, method: str, threads: int | None, tell: Callable[[], None]) -> Reconstruction:
     return _while_telling(
         lambda: reconstruct(
             readings.weighed,
@@ -146,7 +165,7 @@ def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) 
             common_errors=True,  # the floor
             shutter=readings.shutter,
         ),
-        lambda: tell(0.05, "poses and points"),
+        tell,
     )
 
 
@@ -180,10 +199,11 @@ def _check_measured(m: Measurement) -> None:
     if m.measured:
         return
     reasons = sorted({s.tube.reason for s in m.stretches})
+    shaped = any(s.tube.status == "open" for s in m.stretches)
+    doubt = "" if shaped else _pupil_doubt(m.camera, m.encoder) or " (a wrong camera profile?)"
     raise PipefishError(
         f"{m.survey.path}: poses of {len(m.structure.frames)} keyframes and {len(m.structure.points)} points were "
-        f"found, but no pipe around them: {'; '.join(reasons)}"
-        f"{_pupil_doubt(m.camera, m.encoder) or ' (a wrong camera profile?)'}"
+        f"found, but no pipe {'of any size' if shaped else 'around them'}: {'; '.join(reasons)}{doubt}"
     )
 
 

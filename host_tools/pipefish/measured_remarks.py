@@ -17,6 +17,7 @@ from pipefish.repeated import against_encoder
 from pipefish.scale import disagreement
 from pipefish.structure import REASONS
 from pipefish.survey import Tracks
+from pipefish.tube_shape import NO_ELLIPSE
 
 THETA_BIN = math.radians(10)
 TREND_PX = 0.15  # mean radial residual of a bin: more says that the profile or its centre of projection is wrong
@@ -91,7 +92,7 @@ def remark(m: Measurement) -> None:
     if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
         remarks.append(m.health.text)
     remarks += _repeated_remark(m)
-    remarks += _water_remark(m) + _invert_remark(m)
+    remarks += _shape_remark(m) + _water_remark(m) + _invert_remark(m)
     if m.camera.covariance is None:
         whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
         remarks.append(
@@ -215,6 +216,23 @@ def _turned_remark(m: Measurement) -> list[str]:
     ]
 
 
+def _shape_remark(m: Measurement) -> list[str]:
+    """Of sections that are no ellipse."""
+    out = []
+    for stretch in m.measured:
+        table = stretch.tube.stations
+        odd = (table["status"] == "ok") & (table["departure"] > NO_ELLIPSE * table["d_mean"])
+        if odd.mean() < GAP_SHARE:
+            continue
+        ends = np.sort(stretch.chainage(table["s"][odd][[0, -1]]))
+        most = length_text(float(table["departure"][odd].max()), m.scale.unit)
+        out.append(
+            f"From {ends[0]:.2f} to {ends[1]:.2f} the section is no ellipse (an egg, or bent in?): it departs from the "
+            f"nearest one by up to {most}. Diameters and ovality are those of the section as it is."
+        )
+    return out
+
+
 def _water_remark(m: Measurement) -> list[str]:
     """Of points that were seen in water or through it."""
     out = []
@@ -294,6 +312,7 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
             ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
             what = {
                 "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
+                "open": "nothing: the section is no ellipse, and too little of it is seen to tell what it is",
                 "one_sided": "nothing: no wall seen over more than 220 degrees",
                 "too_few_points": "nothing: too few points on the wall",
             }[str(good)]

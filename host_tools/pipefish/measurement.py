@@ -63,7 +63,8 @@ class Measurement:
     """A measured survey.
 
     index       (K,) index of each keyframe that is here; frames below and in `structure` count these
-    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one
+    encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one. Without the jitter of its
+                readings where they have one
     structure   in the unit of `scale`
     camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
                 not known

@@ -5,6 +5,7 @@ o'clock; hours = clock * 6 / pi. Lengths are metres."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Callable
@@ -13,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pipefish import _engine
+from pipefish import _engine, tube_shape
 from pipefish.errors import ArgumentError
+from pipefish.tube_section import calipers, gradients, section_points, size
 from pipefish.tube_shared import Common, Shared
 
 SECTION = 0.75  # length of the stretch that counts as one section, diameters
@@ -37,6 +39,7 @@ REASONS = {
     "too_few_points": "too few points for a tube",
     "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
     "one_sided": "points on one side only: neither centre nor diameter is determined",
+    "open": "the section is no ellipse (an egg?), and too little of it is seen to tell what it is",
     "not_determined": "the points are too uncertain for a tube",
     "too_short": "the wall is shorter than half a radius",
 }
@@ -48,7 +51,7 @@ class Tube:
 
     stations: arrays with one row a station, by name:
       s, x, y, z, tx, ty, tz   chainage, point of the axis, unit tangent
-      status                   "ok", "circle_only", "one_sided", "too_few_points"; values not measured are NaN
+      status                   "ok", "circle_only", "open", "one_sided", "too_few_points"; what was not measured is NaN
       d_mean, d_area, circumference, d_max, d_min   perimeter / pi; diameter of the circle of equal area; widest and
                                narrowest caliper width. The ellipse's part is without the noise's bias
       clock_max                clock angle of d_max, radians, 0 to pi
@@ -59,6 +62,7 @@ class Tube:
       ovality_squared          square of the ovality less the noise's share, below zero as often as above where the
                                pipe is round: what averages are made of (`rms_ovality`)
       <name>_sigma             random standard deviation;  <name>_systematic: of what all stations share (scale)
+      departure                of the section from its ellipse, at most (harmonics 3 and up): an egg's, a dent's
       curvature, curvature_sigma, inliers, gap, rms, roughness
     events: one dictionary a finding; see `pipefish.tube_findings`."""
 
@@ -225,38 +229,72 @@ def fit_tube(
     nodes, rho = _reference(cloud, sections, centres)
     if len(nodes) < 2:
         return _none("too_short", "", nominal)
-    diameter = 2 * float(np.median(rho))
-    tell(0.4, "looking for joints")
+    tell(0.4, "fitting the surface")
+    fit = _Fit(cloud, noise, used, up_vector, nominal, order, spacing, scale_sigma, shared)
     try:
-        coarse = _engine.tube_surface(cloud, noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+        tube, common = fit.on(nodes, rho)
     except ValueError as error:  # the normal matrix is singular
         return _none("not_determined", str(error), nominal)
-    breaks = tube_findings.break_candidates(coarse, nodes, diameter)
-    tell(0.55, "fitting the surface")
-    try:
-        surface = _engine.tube_surface(cloud, noise, nodes, rho, breaks, KNOT, order, 12, False, ASSUMED_OVALITY)
-    except ValueError as error:
-        return _none("not_determined", str(error), nominal)
-    known = np.flatnonzero(used)
-    common = Common(surface, shared, known, diameter)
-    kept = tube_findings.confirmed(surface, diameter, breaks, common)
-    if len(kept) < len(breaks):
-        surface = _engine.tube_surface(cloud, noise, nodes, rho, kept, KNOT, order, 12, False, ASSUMED_OVALITY)
-        common = Common(surface, shared, known, diameter)
-    tube = Tube("ok", "", {}, nominal=nominal, surface=surface)
-    tube._up, tube.clock_zero = _clock_of(surface, up_vector)
-    tube.stations, by_shape = _stations(tube, spacing or STATION * diameter, scale_sigma, common)
-    tube.summary = _summary(tube, by_shape, used)
+    if tube_shape.much_off(tube):
+        tell(0.7, "trying another shape")
+        with contextlib.suppress(ValueError):
+            other, its = fit.on(*tube_shape.wide_circles(np.asarray(points, float), tube, len(nodes)))
+            if tube_shape.likelier(other, tube):
+                tube, common = other, its
     if not np.isin(tube.stations["status"], MEASURED).any():
         statuses, count = np.unique(tube.stations["status"], return_counts=True)
         return _none(str(statuses[count.argmax()]), "", nominal)  # of most of it
-    tube.points = _all_points(tube._places(surface.placed()), used)
-    tube.summary["points_apart"] = float(np.mean(tube.points["piece"][used] < 0))
     tell(0.9, "looking for what departs from it")
     tube.events = tube_findings.events(tube, common)
     tube.summary["events"] = len(tube.events)
     tell(1.0, "done")
     return tube
+
+
+@dataclass
+class _Fit:
+    """A surface through the cloud, and what a tube has of it."""
+
+    cloud: np.ndarray
+    noise: Any
+    used: np.ndarray
+    up: Any
+    nominal: float | None
+    order: int
+    spacing: float | None
+    scale_sigma: float
+    shared: Shared | None
+
+    def _surface(self, nodes: np.ndarray, rho: list[float], breaks: list[float]) -> Any:
+        return _engine.tube_surface(
+            self.cloud, self.noise, nodes, rho, breaks, KNOT, self.order, 12, False, ASSUMED_OVALITY
+        )
+
+    def on(self, nodes: np.ndarray, rho: list[float]) -> tuple[Tube, Common]:
+        """From circles along the pipe; the tube is without findings. ValueError: nothing is determined."""
+        from pipefish import tube_findings
+
+        diameter, known = 2 * float(np.median(rho)), np.flatnonzero(self.used)
+        coarse = _engine.tube_surface(self.cloud, self.noise, nodes, rho, [], 2.0, 2, 8, True, ASSUMED_OVALITY)
+        breaks = tube_findings.break_candidates(coarse, nodes, diameter)
+        surface = self._surface(nodes, rho, breaks)
+        common = Common(surface, self.shared, known, diameter)
+        kept = tube_findings.confirmed(surface, diameter, breaks, common)
+        if len(kept) < len(breaks):
+            surface = self._surface(nodes, rho, kept)
+            common = Common(surface, self.shared, known, diameter)
+        tube = Tube("ok", "", {}, nominal=self.nominal, surface=surface)
+        tube._up, tube.clock_zero = _clock_of(surface, self.up)
+        tube.stations, by_shape = _stations(tube, self.spacing or STATION * diameter, self.scale_sigma, common)
+        tube.summary = _summary(tube, by_shape, self.used)
+        tube.points = _all_points(tube._places(surface.placed()), self.used)
+        unknown = tube_shape.is_open(tube)
+        if unknown.any():
+            tube.stations["status"][unknown] = "open"
+            _blank(tube.stations)
+            tube.summary = _summary(tube, by_shape, self.used)
+        tube.summary["points_apart"] = float(np.mean(tube.points["piece"][self.used] < 0))
+        return tube, common
 
 
 def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any, Any, np.ndarray]:
@@ -405,72 +443,6 @@ def _zero_angle(found: dict[str, np.ndarray], up: np.ndarray | None, surface: An
     return zero
 
 
-def section_points(shape: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The curve { M u + g n } of tube/section.hpp: shape (n,k), t (m,) -> (n,m,2)."""
-    rho, ec, es = (shape[:, k, None] for k in range(3))
-    c, s = np.cos(t), np.sin(t)
-    y = np.stack([(rho + ec) * c + es * s, es * c + (rho - ec) * s], -1)
-    if shape.shape[1] > 3:
-        n = np.stack([(rho - ec) * c - es * s, -es * c + (rho + ec) * s], -1)
-        g = sum(
-            shape[:, k, None] * np.cos(h * t) + shape[:, k + 1, None] * np.sin(h * t)
-            for h, k in zip(range(3, 9), range(3, shape.shape[1], 2), strict=False)
-        )
-        y = y + g[..., None] * n / np.linalg.norm(n, axis=-1, keepdims=True)
-    return y
-
-
-AROUND = np.arange(360) * np.pi / 180
-
-
-def _size(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Perimeter / pi, and diameter of the circle of equal area, of each section."""
-    y = section_points(shape, AROUND)
-    following = np.roll(y, -1, axis=1)
-    # A polygon of 360 corners: its perimeter is short by 1 / (24 * 57.3^2), its area by four times that.
-    chord = np.linalg.norm(following - y, axis=2).sum(1) * (1 + (np.pi / 180) ** 2 / 24)
-    area = 0.5 * np.abs((y[..., 0] * following[..., 1] - y[..., 1] * following[..., 0]).sum(1))
-    area *= 1 + (np.pi / 180) ** 2 / 6
-    return chord / np.pi, 2 * np.sqrt(area / np.pi)
-
-
-def _calipers(shape: np.ndarray) -> dict[str, np.ndarray]:
-    """Widest and narrowest caliper width of each section, their direction and the parameters where they touch."""
-    direction = np.arange(180) * np.pi / 180
-    y = section_points(shape, AROUND)
-    reach = y @ np.stack([np.cos(direction), np.sin(direction)])
-    width = reach.max(1) - reach.min(1)
-    out = {}
-    for name, at in (("max", width.argmax(1)), ("min", width.argmin(1))):
-        rows = np.arange(len(shape))
-        out[name] = width[rows, at]
-        out[name + "_direction"] = direction[at]
-        out[name + "_touch"] = np.stack([reach[rows, :, at].argmax(1), reach[rows, :, at].argmin(1)], 1)
-    return out
-
-
-def _gradients(shape: np.ndarray, calipers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Derivatives (n,k) of the diameters by the section's parameters. A caliper's touching points may be held (they
-    are where the width is stationary)."""
-    n, k = shape.shape
-    out = {name: np.zeros((n, k)) for name in ("d_mean", "d_area", "d_max", "d_min")}
-    step = 1e-4 * shape[:, :1]
-    for p in range(k):
-        up, down = shape.copy(), shape.copy()
-        up[:, p : p + 1] += step
-        down[:, p : p + 1] -= step
-        for name, a, b in zip(("d_mean", "d_area"), _size(up), _size(down), strict=True):
-            out[name][:, p] = (a - b) / (2 * step[:, 0])
-        difference = (section_points(up, AROUND) - section_points(down, AROUND)) / (2 * step[..., None])
-        rows = np.arange(n)
-        for name in ("max", "min"):
-            d = calipers[name + "_direction"]
-            touch = calipers[name + "_touch"]
-            move = difference[rows, touch[:, 0]] - difference[rows, touch[:, 1]]
-            out["d_" + name][:, p] = move[:, 0] * np.cos(d) + move[:, 1] * np.sin(d)
-    return out
-
-
 def _rice_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Central 95 % interval of |e| / sigma from its estimate, in two dimensions: both are lengths of a vector. Its
     upper end is at least that of a circle's median: estimates nearer to zero than noise brings would give no width."""
@@ -515,14 +487,17 @@ def _stations(
     trace = cov[:, 1, 1] + cov[:, 2, 2]
     debiased = shape.copy()
     debiased[:, 1:3] *= (np.sqrt(np.maximum(e**2 - trace, 0)) / np.maximum(e, 1e-300))[:, None]
-    raw = _calipers(shape)
-    sound = _calipers(debiased)
-    gradient = _gradients(shape, raw)
-    d_mean, d_area = _size(debiased)
+    raw = calipers(shape)
+    sound = calipers(debiased)
+    gradient = gradients(shape, raw)
+    d_mean, d_area = size(debiased)
     values = {"d_mean": d_mean, "d_area": d_area, "d_max": sound["max"], "d_min": sound["min"]}
 
-    def sigma_of(g: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", g, cov, g)))
+    out["departure"] = tube_shape.departure(shape)
+    beyond = tube_shape.left_out(out["departure"], d_mean)
+
+    def sigma_of(g: np.ndarray, diameters: int = 1) -> np.ndarray:
+        return np.sqrt(np.maximum(0, np.einsum("ni,nij,nj->n", g, cov, g)) + diameters * beyond**2)
 
     for name, value in values.items():
         out[name] = value
@@ -532,14 +507,14 @@ def _stations(
     out["circumference_sigma"] = np.pi * out["d_mean_sigma"]
     out["clock_max"] = (raw["max_direction"] - f["zero"]) % np.pi
     out["clock_max_sigma"] = np.minimum(np.pi / 2, 0.5 * np.sqrt(trace / 2) / np.maximum(e, 1e-300))
-    span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"])
+    span, span_sigma = values["d_max"] - values["d_min"], sigma_of(gradient["d_max"] - gradient["d_min"], 2)
     out["ovality"], out["ovality_sigma"] = span / d_mean, span_sigma / d_mean
     by_ellipse = (gradient["d_max"] - gradient["d_min"])[:, 1:3]
     out["ovality_systematic"] = np.sqrt(np.einsum("ni,nij,nj->n", by_ellipse, camera, by_ellipse)) / d_mean
     out["ovality_astm"] = (d_mean - values["d_min"]) / d_mean
-    out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"]) / d_mean
+    out["ovality_astm_sigma"] = sigma_of(gradient["d_mean"] - gradient["d_min"], 2) / d_mean
     out["ovality_astm_max"] = (values["d_max"] - d_mean) / d_mean
-    out["ovality_astm_max_sigma"] = sigma_of(gradient["d_max"] - gradient["d_mean"]) / d_mean
+    out["ovality_astm_max_sigma"] = sigma_of(gradient["d_max"] - gradient["d_mean"], 2) / d_mean
     nominal = tube.nominal or math.nan
     out["ovality_nominal"], out["ovality_nominal_sigma"] = span / nominal, span_sigma / nominal
     out["reduction_nominal"] = (nominal - values["d_min"]) / nominal
