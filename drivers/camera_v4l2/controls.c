@@ -53,14 +53,25 @@ void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info)
     info->gain_now = info->has_gain ? get(c, c->gain_control.id, info->gain.min) : 0;
 }
 
-void pf_v4l2_controls_set(pf_v4l2 *c, int64_t time, int64_t gain)
+/* Its own automatics, whichever it has. They stay as they are set when the device is closed, so what an earlier run
+ * switched off must be switched on. The frame rate never gives way to the exposure. */
+static void set_automatics(pf_v4l2 *c, bool are_on)
 {
-    if (!c->is_manual) { /* whatever of its own automatics the camera has */
+    if (!are_on)
         (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL);
-        (void)set(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0);
-        (void)set(c, V4L2_CID_AUTOGAIN, 0);
-        c->is_manual = true;
-    }
+    else if (!set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_AUTO)) /* a fixed iris: most USB cameras */
+        (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY);
+    (void)set(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0);
+    (void)set(c, V4L2_CID_AUTOGAIN, are_on);
+    c->is_manual = !are_on;
+}
+
+void pf_v4l2_controls_set(pf_v4l2 *c, bool is_automatic, int64_t time, int64_t gain)
+{
+    if (is_automatic || !c->is_manual)
+        set_automatics(c, is_automatic);
+    if (is_automatic)
+        return;
     if (c->time_control.is_there)
         (void)set(c, c->time_control.id, time);
     if (c->gain_control.is_there)

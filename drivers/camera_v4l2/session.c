@@ -187,8 +187,7 @@ static void v4l2_give(void *self, uint32_t i)
 
 static void v4l2_set(void *self, bool is_automatic, int64_t time, int64_t gain)
 {
-    if (!is_automatic) /* else as v4l2-ctl has set it */
-        pf_v4l2_controls_set(self, time, gain);
+    pf_v4l2_controls_set(self, is_automatic, time, gain);
 }
 
 static void v4l2_keep(void *self, uint32_t i)

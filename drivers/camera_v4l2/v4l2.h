@@ -59,8 +59,8 @@ pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const 
  * picture to give yet. */
 pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_info *info);
 
-/* controls.c: finds the controls of a negotiated device, and sets them. */
+/* controls.c: finds the controls of a negotiated device, and sets them; is_automatic: hands them to the camera. */
 void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info);
-void pf_v4l2_controls_set(pf_v4l2 *c, int64_t time, int64_t gain);
+void pf_v4l2_controls_set(pf_v4l2 *c, bool is_automatic, int64_t time, int64_t gain);
 
 #endif

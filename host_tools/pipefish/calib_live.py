@@ -33,6 +33,7 @@ _EVERY = 3  # views between trials; each takes about a second
 _ENOUGH_VIEWS, _ENOUGH_SEEN = 15, 0.85  # views, share of the cells: then more tell little
 _SAME = 0.02  # of the picture's width: a target that moved less says nothing new
 _STILL = 0.003  # of the width, between two stills: 4 px of 1280 in half a second blur an exposure of 20 ms by 0.16 px
+_UNSTEADY = "exposure or gain changes between the views: set camera.exposure to hold or fixed"
 _PLACES = (("top", "middle", "bottom"), ("left", "middle", "right"))
 
 
@@ -152,7 +153,8 @@ def collect(
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Takes stills until they suffice, there are `most` views, the survey ends, or Ctrl-C; those with a new view of the
-    target are kept in `folder`, which must be new. -> folder, views, ended, seen.
+    target are kept in `folder`, which must be new. -> folder, views, ended, seen, exposures: how many settings of
+    exposure and gain the views have; more than one is warned of, as the views' blur and noise then differ.
 
     Raises PipefishError, also where fewer than three views came; the folder stays."""
     if any(t.target is None for t in targets):
@@ -160,6 +162,7 @@ def collect(
     kept = StillFolder(folder)
     guide = Guide(targets)
     screen = Screen(quiet)
+    exposures: set[tuple[int, float]] = set()
     try:
         with Stills(transport, timeout_s) as stills:
             while not guide.enough and len(guide.names) < most:
@@ -168,6 +171,9 @@ def collect(
                 line = guide.add(f"frame {still.sequence}", still.image)
                 if len(guide.names) > count:
                     kept.add(still)
+                    exposures.add((still.telemetry.exposure_us, still.telemetry.gain))
+                    if len(exposures) > 1:
+                        line += f"; {_UNSTEADY}"
                 screen.show(line, guide)
         ended = "enough has been seen" if guide.enough else f"{most} views"
     except KeyboardInterrupt:
@@ -184,7 +190,13 @@ def collect(
         raise PipefishError(
             f"{len(guide.names)} views with the target came from the device ({ended}); at least 3 are needed"
         )
-    return {"folder": str(folder), "views": len(guide.names), "ended": ended, "seen": guide.seen}
+    return {
+        "folder": str(folder),
+        "views": len(guide.names),
+        "ended": ended,
+        "seen": guide.seen,
+        "exposures": len(exposures),
+    }
 
 
 class Screen:

@@ -273,6 +273,7 @@ def run_evaluate(args: argparse.Namespace) -> Result:
         ("survival", "kept of those visible"),
         ("median_px", "median error, px"),
         ("length_median", "median length, frames"),
+        ("length_mean", "mean length, frames"),
         ("length_possible", "if none were lost"),
         ("whole", "share of whole lives"),
     ):

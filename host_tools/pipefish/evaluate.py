@@ -167,7 +167,8 @@ def figures(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] | 
     """Figures of `track_errors` as plain values; None if no track was seen twice. `frames`: of `survival`.
 
     within_1px: share of observations; median_px, p95_px, p99_px, max_px; survival: see there; length_median: camera
-    frames that half of the tracks live; length_possible: if none were lost, and whole: share of whole lives (`lives`);
+    frames that half of the tracks live; length_mean: that they live on average; length_possible: the median if none
+    were lost, and whole: share of whole lives (`lives`);
     by_age: list of age_low, age_high, count, within_1px and median_px.
     """
     result = track_errors(seen, truth)
@@ -197,6 +198,7 @@ def figures(seen: Observed, truth: Truth, frames: Callable[[int], np.ndarray] | 
         "max_px": percentile(error, 100),
         "survival": survival(seen, truth, frames),
         "length_median": float(np.median(seen.tracks.length_frames)),
+        "length_mean": float(np.mean(seen.tracks.length_frames)),
         "length_possible": float(np.median(possible)),
         "whole": float(np.mean(whole)),
         "by_age": by_age,

@@ -16,7 +16,7 @@ FRAMES = 10
 
 
 def against_opencv() -> list[dict]:
-    """The five figures against each OpenCV that is installed; a line on stderr for one that is not."""
+    """The figures against each OpenCV that is installed; a line on stderr for one that is not."""
     figures: list[dict] = []
     for name, python in PEERS.items():
         peer = f"opencv-{name}"

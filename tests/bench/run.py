@@ -1,7 +1,8 @@
 """Runs the benchmarks and writes build/bench.json: a list of {name, value, unit, peer, peer_value, ratio}.
 
 Each program bench_ROOM of build/release/tests/bench prints one JSON object a line, {"name", "value", "unit"} and, where
-a peer was measured in the same run, {"peer", "peer_value"}; ratio = value / peer_value. Rooms of the Python package are
+a peer was measured in the same run, {"peer", "peer_value"}, with "peer_version" and "peer_isa" of the tracker's peers;
+ratio = value / peer_value. Rooms of the Python package are
 measured here. `--only link.goodput` keeps the figures whose names start so.
 """
 

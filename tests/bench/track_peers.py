@@ -63,6 +63,34 @@ def chain_frame(one: np.ndarray, two: np.ndarray, points: np.ndarray) -> tuple[n
     return (to[keep] if fresh is None else np.concatenate([to[keep], fresh])), drawing
 
 
+def test_textures() -> dict[str, np.ndarray]:
+    """Pictures that a detector finds easy and hard: nothing, a corner everywhere, edges only, corners alike."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    pictures = {
+        "flat": np.full((HEIGHT, WIDTH), 128),
+        "noise": np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH)),
+        "stripes": np.where(x // 8 % 2, 200, 60),
+        "checker": np.where((x // 16 + y // 16) % 2, 200, 60),
+    }
+    return {name: np.ascontiguousarray(picture, np.uint8) for name, picture in pictures.items()}
+
+
+def detection(ours: Entry, picture: np.ndarray) -> tuple[float, float]:
+    """Milliseconds of ours, without the pyramid, and of OpenCV's."""
+
+    def detect() -> int:
+        ours.reset()
+        return ours.frame(picture)
+
+    t = least(
+        10,
+        pyramid=lambda: ours.pyramid(1, picture),
+        detect=detect,
+        detect_cv=lambda: corners(picture, TRACKS),
+    )
+    return t["detect"] - t["pyramid"], t["detect_cv"]
+
+
 def main() -> None:
     """Measures and prints."""
     peer = sys.argv[1]
@@ -94,6 +122,7 @@ def main() -> None:
         klt_cv=lambda: flow(one, two, points),
     )
     t |= least(15, detect=detect, detect_cv=lambda: corners(one, TRACKS))
+    textures = {name: detection(ours, picture) for name, picture in test_textures().items()}
     klt_cv = t["klt_cv"] - t["klt_cv_pyramids"]
 
     # whole frames: both sides along the same drive, frame by frame in turns; the least time of each frame, their mean
@@ -116,17 +145,22 @@ def main() -> None:
     # built twice: two pyramids and derivatives of one; needed once: a pyramid and its derivatives
     frame_cv = float(np.min(chain, axis=0).mean()) - t["klt_cv_pyramids"] - t["pyramid_cv"]
 
+    features = [f for f in ("AVX512_SKX", "AVX2", "SSE4_2") if f in cv2.getBuildInformation()]
+    built = {"peer_version": f"OpenCV {cv2.__version__}", "peer_isa": features[0] if features else "baseline"}
+
     def say(name: str, value: float, peer_value: float) -> None:
-        print(json.dumps({"name": name, "value": value, "unit": "ms", "peer": peer, "peer_value": peer_value}))
+        figure = {"name": name, "value": value, "unit": "ms", "peer": peer, "peer_value": peer_value, **built}
+        print(json.dumps(figure))
 
     say("track.pyramid", t["pyramid"], t["pyramid_cv"])
     say("track.detect", t["detect"] - t["pyramid"], t["detect_cv"])  # ours with the templates of its corners taken
+    for name, (value, peer_value) in textures.items():
+        say(f"track.detect_{name}", value, peer_value)
     say("track.klt_plain", t["plain"], klt_cv)  # ours estimates gain and bias even so
     say("track.klt_light", t["light"], klt_cv)  # ours takes each template and fits gain, bias, slopes and affine
     say("track.frame", frame, frame_cv)
-    features = [f for f in ("AVX512_SKX", "AVX2", "SSE4_2") if f in cv2.getBuildInformation()]
     print(
-        f"{peer}: OpenCV {cv2.__version__}, dispatches up to {features[0] if features else 'its baseline'}; "
+        f"{peer}: OpenCV {cv2.__version__}, dispatches up to {built['peer_isa']}; "
         f"{len(points)} points, {tracked} tracked by ours in the last frame",
         file=sys.stderr,
     )

@@ -1,13 +1,15 @@
 /* Delivery of objects over the link (lib/link/SPEC.md, "Bulk"): bulk_send.c and pf_store on the device, bulk_receive.c
  * and the survey file on the host, under frames lost and overtaken, sessions that break, and ends that restart.
  *
- * Proved for OBJECTS objects of FRAGMENTS fragments, a receiver with SLOTS slots, LOSSES lost frames, BREAKS broken
- * sessions and CRASHES restarts at any moment:
+ * Proved for OBJECTS objects of FRAGMENTS fragments, a receiver with SLOTS slots, LOSSES lost frames, REORDERS frames
+ * that overtake another, BREAKS broken sessions and CRASHES restarts at any moment:
  *   - the device forgets an object only after the host has it durably           (assertion in SENT)
- *   - the host keeps no object twice                                            (assertion in keep)
+ *   - the host keeps no object twice                                            (assertion in user)
+ *   - a fragment lands in no other object than its own                          (assertion in host)
  *   - whatever happens, all objects arrive and are forgotten: no end state and no cycle before that (-DNOREDUCE -l)
  * Abstract: HELLO is one step that both ends take together; a frame of another session is dropped by its nonce; time is
- * "nothing is under way". Names are those of the specification and the code.
+ * "nothing is under way". Names are those of the specification and the code: prove looks for what stands in
+ * backquotes, begins with pf_ or is a C file in the code, and for a mtype's with the prefix beside it.
  */
 #ifndef OBJECTS
 #define OBJECTS 2
@@ -16,6 +18,7 @@
 #define SLOTS     1
 #define NO_HANDLE 255
 #define ALL       3 /* bits of FRAGMENTS */
+#define OF_1      4 /* beside them in a frame: of object 1; of the proof, not of the program */
 #ifndef LOSSES
 #define LOSSES 2
 #endif
@@ -25,16 +28,19 @@
 #ifndef CRASHES
 #define CRASHES 1
 #endif
+#ifndef REORDERS
+#define REORDERS 1
+#endif
 
-mtype = { OFFER, DATA };                               /* frames to the host */
-mtype = { WAITING, BUSY, UNKNOWN };                    /* answers to the device, beside the slot's own states */
-mtype = { FREE, NEW, OFFERED, SENDING, STORING };      /* pf_send_state */
-mtype = { NONE, ASKED, RECEIVING, COMPLETE, STORED };  /* states of a receiver's slot */
+mtype = { OFFER, DATA };                          /* PF_FRAME_: frames to the host */
+mtype = { WAITING, BUSY, UNKNOWN };               /* PF_ACK_: answers to the device, beside the slot's own states */
+mtype = { FREE, NEW, OFFERED, SENDING, STORING }; /* PF_SEND_: pf_send_state */
+mtype = { ASKED, RECEIVING, COMPLETE, STORED };   /* PF_RECEIVE_: states of a receiver's slot; FREE is one of them too */
 
 chan to_host = [2] of { byte, mtype, byte, byte };   /* session, frame, handle, name (OFFER) or fragment (DATA) */
 chan to_device = [2] of { byte, byte, mtype, byte }; /* session, handle, state, bits that are here */
 
-byte session = 1, losses = LOSSES, breaks = BREAKS, crashes = CRASHES;
+byte session = 1, losses = LOSSES, breaks = BREAKS, crashes = CRASHES, reorders = REORDERS;
 bool up = true, ready;
 
 /* the device: the spool is durable, the slots of the link are not */
@@ -48,14 +54,14 @@ byte kept[OBJECTS]; /* how often: of the proof, not of the program */
 mtype slot_state[OBJECTS];
 byte slot_handle[OBJECTS], here[OBJECTS];
 
-#define used ((slot_state[0] != NONE) + (slot_state[1] != NONE))
+#define used ((slot_state[0] != FREE) + (slot_state[1] != FREE))
 #define is_known(o) (send_state[o] == OFFERED || send_state[o] == SENDING || send_state[o] == STORING)
 #define count_known (is_known(0) + is_known(1))
 #define question (slot_state[0] == ASKED || slot_state[0] == COMPLETE || slot_state[1] == ASKED || slot_state[1] == COMPLETE)
 #define quiet (up && len(to_host) == 0 && len(to_device) == 0 && !question)
 #define done (!spooled[0] && !spooled[1])
 
-/* A frame is lost, or arrives; ?? at the other end lets later ones overtake it. */
+/* A frame is lost, or is under way, where chaos may let the next one overtake it. */
 inline send_frame(kind, h, f)
 {
     if
@@ -84,7 +90,7 @@ inline end_session(i)
         :: else
         fi;
         if
-        :: slot_state[i] == STORED -> slot_state[i] = NONE
+        :: slot_state[i] == STORED -> slot_state[i] = FREE
         :: else
         fi;
         slot_handle[i] = NO_HANDLE;
@@ -99,7 +105,7 @@ init
     d_step {
         spooled[0] = true; spooled[1] = true;
         send_state[0] = NEW; send_state[1] = NEW;
-        slot_state[0] = NONE; slot_state[1] = NONE;
+        slot_state[0] = FREE; slot_state[1] = FREE;
         ready = true
     }
 }
@@ -112,8 +118,8 @@ active proctype device()
 end:
     do
     /* acknowledgements: pf_sender_receive_ack */
-    :: to_device ?? s, h, state, bits -> d_step {
-        o = 0; /* find_handle */
+    :: to_device ? s, h, state, bits -> d_step {
+        o = 0; /* `find_handle` */
         if
         :: is_known(0) && handle[0] == h
         :: else -> o = 1
@@ -144,7 +150,7 @@ end:
             fi
         :: else
         fi; s = 0; o = 0; h = 0; bits = 0; state = 0 }
-    /* offers: next_signal, no more than the peer's slots */
+    /* offers: `next_signal`, no more than the peer's slots */
     :: atomic { up && nfull(to_host) && send_state[0] == NEW && count_known < SLOTS ->
         next_handle++; handle[0] = next_handle; send_state[0] = OFFERED; send_frame(OFFER, handle[0], 0) }
     :: atomic { up && nfull(to_host) && send_state[1] == NEW && count_known < SLOTS ->
@@ -155,9 +161,9 @@ end:
     :: atomic { up && nfull(to_host) && send_state[0] == SENDING && (sent[0] & 2) == 0 ->
         sent[0] = sent[0] | 2; send_frame(DATA, handle[0], 2) }
     :: atomic { up && nfull(to_host) && send_state[1] == SENDING && (sent[1] & 1) == 0 ->
-        sent[1] = sent[1] | 1; send_frame(DATA, handle[1], 1) }
+        sent[1] = sent[1] | 1; send_frame(DATA, handle[1], OF_1 | 1) }
     :: atomic { up && nfull(to_host) && send_state[1] == SENDING && (sent[1] & 2) == 0 ->
-        sent[1] = sent[1] | 2; send_frame(DATA, handle[1], 2) }
+        sent[1] = sent[1] | 2; send_frame(DATA, handle[1], OF_1 | 2) }
     /* timeouts: OFFER again (offered, storing); lost fragments again (pf_sender_tick) */
     :: atomic { quiet && (send_state[0] == OFFERED || send_state[0] == STORING) ->
         send_frame(OFFER, handle[0], 0) }
@@ -170,7 +176,7 @@ end:
         fi }
     :: atomic { quiet && send_state[1] == SENDING && sent[1] == ALL -> sent[1] = acked[1];
         if
-        :: acked[1] == ALL -> send_frame(DATA, handle[1], 1)
+        :: acked[1] == ALL -> send_frame(DATA, handle[1], OF_1 | 1)
         :: else
         fi }
     od
@@ -184,20 +190,20 @@ active proctype host()
 end:
     do
     :: nfull(to_device) && len(to_host) > 0 -> atomic {
-        to_host ?? s, kind, h, f;
+        to_host ? s, kind, h, f;
         if
         :: s != session || !up
         :: s == session && up && kind == OFFER ->
             o = f; /* found by its name */
             if
-            :: slot_state[o] == NONE && used >= SLOTS && (slot_state[1 - o] == STORED ||
+            :: slot_state[o] == FREE && used >= SLOTS && (slot_state[1 - o] == STORED ||
                     (slot_state[1 - o] == RECEIVING && slot_handle[1 - o] == NO_HANDLE)) ->
-                slot_state[1 - o] = NONE; here[1 - o] = 0 /* stored, or not mentioned in this session */
+                slot_state[1 - o] = FREE; here[1 - o] = 0 /* stored, or not mentioned in this session */
             :: else
             fi;
             if
-            :: slot_state[o] == NONE && used >= SLOTS -> answer(h, BUSY, 0)
-            :: slot_state[o] == NONE && used < SLOTS || slot_state[o] == STORED && slot_handle[o] != h ->
+            :: slot_state[o] == FREE && used >= SLOTS -> answer(h, BUSY, 0)
+            :: slot_state[o] == FREE && used < SLOTS || slot_state[o] == STORED && slot_handle[o] != h ->
                 slot_state[o] = ASKED; slot_handle[o] = h; here[o] = 0; answer(h, WAITING, 0)
             :: else ->
                 slot_handle[o] = h; /* takes over what has arrived */
@@ -213,11 +219,12 @@ end:
             :: else -> o = 1
             fi;
             if
-            :: slot_state[o] == NONE || slot_handle[o] != h -> answer(h, UNKNOWN, 0)
+            :: slot_state[o] == FREE || slot_handle[o] != h -> answer(h, UNKNOWN, 0)
             :: else ->
                 if
                 :: slot_state[o] == RECEIVING ->
-                    here[o] = here[o] | f;
+                    assert((f & OF_1) == OF_1 * o);
+                    here[o] = here[o] | (f & ALL);
                     if
                     :: here[o] == ALL -> slot_state[o] = COMPLETE
                     :: else
@@ -259,10 +266,16 @@ end:
 
 active proctype chaos()
 {
-    byte i;
+    byte i, a, b, c;
+    mtype m;
     ready;
 end:
     do
+    /* the second frame of two that are under way overtakes the first */
+    :: d_step { reorders > 0 && len(to_host) == 2 -> reorders--;
+        to_host ? a, m, b, c; to_host ! a, m, b, c; a = 0; m = 0; b = 0; c = 0 }
+    :: d_step { reorders > 0 && len(to_device) == 2 -> reorders--;
+        to_device ? a, b, m, c; to_device ! a, b, m, c; a = 0; b = 0; m = 0; c = 0 }
     :: d_step { up && breaks > 0 -> breaks--; end_session(i) }
     :: d_step { crashes > 0 -> crashes--; end_session(i); /* the device: what the spool has is loaded again */
         next_handle = 0;
@@ -279,7 +292,7 @@ end:
     :: d_step { crashes > 0 -> crashes--; end_session(i); /* the host: only the file outlives it */
         i = 0;
         do
-        :: i < OBJECTS -> slot_state[i] = NONE; here[i] = 0; i++
+        :: i < OBJECTS -> slot_state[i] = FREE; here[i] = 0; i++
         :: else -> break
         od; i = 0 }
     od

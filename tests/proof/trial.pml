@@ -1,5 +1,5 @@
-/* A profile's trial (lib/profile/SPEC.md, "The store"; store.c, keeper.c; "confirmed" is the record's `active`): written, on trial, confirmed or given up,
- * with power cut between any two steps, and a profile that keeps the daemon from running.
+/* A profile's trial (lib/profile/SPEC.md, "The store"; store.c, keeper.c; "confirmed" is the record's `active`): written,
+ * on trial, confirmed or given up, with power cut between any two steps, and a profile that keeps the daemon from running.
  *
  * Proved for WRITES profiles that the host sends, good ones and one that is bad, and CUTS power cuts at any moment:
  *   - what is loaded is a whole profile that was sent, never half of one          (assertion in load)
@@ -7,7 +7,7 @@
  *   - a profile that keeps the daemon from running is never confirmed             (assertion in confirm)
  *   - "stored" is said only of what the next start takes                          (assertion after read back)
  *   - after every history the daemon runs again, with a good profile              (no end state and no cycle before that)
- * Abstract: a record is appended whole or not at all (tests/unit/test_profile_store.c cuts power inside it). The numbers
+ * Abstract: a record is appended whole or not at all (test_profile_store of tests/unit cuts power inside it). The numbers
  * 1 and 3 are good profiles, 2 is the bad one, 0 is none, TORN is a slot that was being written.
  */
 #ifndef CUTS
@@ -16,7 +16,7 @@
 #ifndef WRITES
 #define WRITES 3
 #endif
-#define STARTS 2 /* camera.trial_starts */
+#define STARTS 2 /* camera.`trial_starts` */
 #define TORN   9
 #define NONE   2
 #define BAD    2
@@ -34,7 +34,7 @@ inline load()
     assert(in_use == 1 || in_use == BAD || in_use == 3)
 }
 
-/* pf_profile_store_start and take_into_use: then the pipeline opens, or the daemon dies of a bad profile. */
+/* pf_profile_store_start and `take_into_use`: then the pipeline opens, or the daemon dies of a bad profile. */
 inline boot()
 {
     if
@@ -46,7 +46,7 @@ inline boot()
     running = (in_use != BAD)
 }
 
-/* The host sends `p`: store_profile, pf_profile_store_write. Each step may be the last before a cut. */
+/* The host sends a profile p: `store_profile`, pf_profile_store_write. Each step may be the last before a cut. */
 active proctype daemon()
 {
     byte to, p;
@@ -65,7 +65,7 @@ restart:
         :: p = 1
         fi;
         if
-        :: p == loaded -> skip /* is_stored: nothing to do */
+        :: p == loaded -> skip /* `is_stored`: nothing to do */
         :: else ->
             to = 1 - confirmed;
             if
@@ -90,10 +90,10 @@ restart:
             if :: cuts > 0 -> cuts--; goto restart :: skip fi;
             assert(loaded == p) /* read back: "stored" */
         fi
-    :: running && trial != NONE && slot[trial] == in_use -> /* confirm_profile: only what runs */
+    :: running && trial != NONE && slot[trial] == in_use -> /* `confirm_profile`: only what runs */
         assert(slot[trial] != BAD);
         atomic { previous = confirmed; confirmed = trial; trial = NONE }
-    :: running && trial != NONE -> trial = NONE                           /* revert_profile */
+    :: running && trial != NONE -> trial = NONE                           /* `revert_profile` */
     :: running && trial == NONE && previous != NONE ->
 progress_by_hand: /* the host may go to and fro for ever; the device may not restart for ever */
         atomic { to = previous; previous = confirmed; confirmed = to }

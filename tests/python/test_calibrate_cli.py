@@ -526,14 +526,16 @@ def test_points_of_the_target_lie_inside_the_image_circle():
 # ---------------------------------------------------------------------- from a device
 
 
-def stills_of(folder) -> list[bytes]:
-    """Each picture of a folder as a still, twice, as of a target held still for a moment; the first thrice."""
+def stills_of(folder, exposures: int = 1) -> list[bytes]:
+    """Each picture of a folder as a still, twice, as of a target held still for a moment; the first thrice. exposures:
+    different ones, until the last stays."""
     files = sorted(folder.iterdir(), key=lambda p: natural(p.name))
     messages = []
     for i, path in enumerate([files[0], *(f for f in files for _ in range(2))]):
         pixels = np.array(Image.open(path))
         frame = pb.RawFrame(frame_sequence=i, width=480, height=360, encoding="mono8", pixels=pixels.tobytes())
         frame.time.boot_id = BOOT
+        frame.telemetry.exposure_us = 1000 * min(i // 2 + 1, exposures)
         messages.append(frame.SerializeToString())
     return messages
 
@@ -551,12 +553,21 @@ def test_a_device_is_calibrated_from_stills_and_they_are_kept(pictures, tmp_path
     assert lines[0] == "frame 0: hold the target still"
     assert "frame 1: view 1, " in lines[1] and "next: " in lines[1]
     assert lines[2] == "frame 2: seen; move the target to another place"
+    assert "exposure or gain" not in text.err
     assert pf.Camera.load(out).provenance.views == 9
     kept = tmp_path / "c-shots"
     assert len(list(kept.glob("shot*.png"))) == 9
     first = np.array(Image.open(folder / "shot0.png"))
     np.testing.assert_array_equal(np.array(Image.open(kept / "shot1.png")), first)
     assert run(*arguments) == 2 and "calibrate from it" in capsys.readouterr().err
+
+
+def test_views_of_different_exposures_are_warned_of(pictures, tmp_path, capsys):
+    folder, target, _ = pictures
+    with Device([], SURVEY, state="surveying", stills=stills_of(folder, 2)) as device:
+        assert run("--device", device.address, "--target", target, "-o", tmp_path / "c.json", "--model", "p9") == 0
+    views = [line for line in capsys.readouterr().err.splitlines() if ": view " in line]
+    assert ["exposure or gain changes" in line for line in views] == [False] + [True] * 8
 
 
 def test_a_device_that_shows_no_target_is_told_so(tmp_path, target, capsys):

@@ -36,6 +36,7 @@ def opened(tmp_path) -> Survey:
 def test_perfect_tracks_have_no_error(tmp_path):
     survey = opened(tmp_path)
     result = evaluate(survey, Flat())
+    assert result["length_mean"] == pytest.approx(survey.tracks().length_frames.mean())
     assert result["within_1px"] == 1.0 and result["p95_px"] < 1e-3  # Q16.16 positions
     assert result["observations"] == 12 * 40 - len(survey.tracks().id)
 

@@ -29,6 +29,7 @@ static struct {
     uint8_t memory[MAPS][BYTES]; /* a fresh one for each mapping: what is unmapped is never seen again */
     bool is_mapped[MAPS], is_kept[MAPS];
     uint32_t n_maps, base;
+    int32_t exposure_auto;         /* a control that outlives the program, as all do */
     int calls, fail_at, fail_with; /* the call number that fails; 0 = none */
 } k;
 
@@ -151,6 +152,24 @@ static int enumerate(unsigned long request, void *argument)
     return -1;
 }
 
+/* A USB camera's: the exposure, and who sets it. */
+static int control_call(unsigned long request, void *argument)
+{
+    struct v4l2_queryctrl *q = argument;
+    struct v4l2_control *c = argument;
+    errno = EINVAL;
+    if (request == VIDIOC_QUERYCTRL && q->id == V4L2_CID_EXPOSURE_ABSOLUTE) {
+        q->maximum = 5000;
+        q->minimum = q->step = 1;
+        q->flags = 0;
+        return 0;
+    }
+    if (request != VIDIOC_S_CTRL || c->id != V4L2_CID_EXPOSURE_AUTO || c->value == V4L2_EXPOSURE_AUTO)
+        return -1;
+    k.exposure_auto = c->value;
+    return 0;
+}
+
 static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
 {
     (void)self;
@@ -200,9 +219,8 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
         k.is_silent = k.is_silent && !k.restart_helps;
         stop();
         return 0;
-    default: /* controls: it has none */
-        errno = EINVAL;
-        return -1;
+    default:
+        return control_call(request, argument);
     }
 }
 
@@ -546,6 +564,19 @@ static void test_another_camera_under_the_same_name_is_not_taken(void)
     release(&frame);
 }
 
+/* Proves: a camera whose automatics one run has switched off has them again in the next that leaves them to it. */
+static void test_exposure_is_given_back_to_the_camera(void)
+{
+    static const pf_exposure_mode modes[] = {PF_EXPOSURE_AUTO, PF_EXPOSURE_DEVICE, PF_EXPOSURE_HOLD,
+                                             PF_EXPOSURE_DEVICE};
+    for (size_t i = 0; i < 4; i++) {
+        const pf_camera_config config = {.device = "/dev/video0", .mode = modes[i]};
+        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_v4l2_open_with(&camera, &config, &io, error, sizeof error), error);
+        close_camera();
+        TEST_ASSERT_EQUAL_INT32(i % 2 ? V4L2_EXPOSURE_APERTURE_PRIORITY : V4L2_EXPOSURE_MANUAL, k.exposure_auto);
+    }
+}
+
 static void test_damaged_frames_are_left_out_with_a_gap(void)
 {
     pf_camera_stats stats;
@@ -612,6 +643,7 @@ int main(void)
     RUN_TEST(test_a_failed_queue_is_restarted_at_once);
     RUN_TEST(test_held_frames_outlive_an_unplugged_camera);
     RUN_TEST(test_another_camera_under_the_same_name_is_not_taken);
+    RUN_TEST(test_exposure_is_given_back_to_the_camera);
     RUN_TEST(test_damaged_frames_are_left_out_with_a_gap);
     RUN_TEST(test_any_single_call_may_fail_and_frames_still_come);
     return UNITY_END();
