@@ -21,6 +21,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.cloudfile import read_columns, read_points
 from pipefish.measure import measure
+from pipefish.measured_files import write_measurement
 from pipefish.readings import DEFAULT_ATTITUDE_SIGMA, attitude_of
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
@@ -135,6 +136,17 @@ def test_an_inclinometer_that_does_not_know_its_sigma_has_the_usual_one(drive: D
     write_survey(tmp_path / "survey.mcap", objects=objects)
     values, sigma = attitude_of(Survey.open(tmp_path / "survey.mcap"))
     assert np.isfinite(values).all() and sigma == DEFAULT_ATTITUDE_SIGMA
+
+
+def test_files_are_the_same_for_any_number_of_threads(drive: Drive, tmp_path: Path) -> None:
+    path = survey_of(drive, tmp_path / "survey.mcap", attitude=True, frames=np.arange(20))
+    for threads in (1, 8):
+        write_measurement(measure(Survey.open(path), threads=threads), tmp_path / str(threads))
+    names = sorted(p.relative_to(tmp_path / "1") for p in (tmp_path / "1").rglob("*") if p.is_file())
+    assert len(names) > 8 and names == sorted(
+        p.relative_to(tmp_path / "8") for p in (tmp_path / "8").rglob("*") if p.is_file()
+    )
+    assert [n for n in names if (tmp_path / "1" / n).read_bytes() != (tmp_path / "8" / n).read_bytes()] == []
 
 
 def failure(capsys, *arguments: object) -> str:
