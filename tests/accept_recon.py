@@ -5,6 +5,7 @@ drives      20 simulated drives of 30 m through a DN300: keyframes every 5 cm, t
             degrees, with an encoder (0.5 mm a step) and without: errors beside their posterior, per section of 0.75 D
 tubes       the same drives through `fit_tube`: diameters and ovality of its stations
 draws       200 draws of noise on one drive of 1 m: scatter of points, rings, lengths, poses beside their posterior
+fits        500 sections' cylinders beside theory, 1000 circles
 two_view    400 pairs of views in a tube, errors beside the bound of Cramer and Rao
 long        time and memory of the whole command, 300 m against 30 m
 video       three pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
@@ -364,11 +365,14 @@ def check_draws() -> list[dict[str, Any]]:
     return [*rows, row("draws.pose_nees", nees, round(6 - spread, 3), round(6 + spread, 3))]
 
 
-def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, float]) -> list[float]:
-    """rms of the whitened errors of rotation and direction, failures."""
-    turns, directions, failed, runs = [], [], 0, 400
+def two_view_figures(
+    motion: tuple[float, float, float], limits: tuple[float, float], wrong: float
+) -> tuple[float, float, float, float]:
+    """rms of the whitened errors of rotation and direction, failures, points behind 90 degrees; shares."""
+    turns, directions, behind, failed, runs = [], [], [], 0, 400
     for seed in range(runs):
-        pair = tube_pair(seed, motion, limits=limits, camera=fisheye(105))
+        pair = tube_pair(seed, motion, outliers=wrong, limits=limits, camera=fisheye(105))
+        behind.append(np.mean(((pair.points - pair.centre) @ pair.rotation.T)[:, 2] < 0))
         found = pf.two_view(pair.camera, *pair.pixels, seed=seed)
         if found.status != "ok":
             failed += 1
@@ -380,18 +384,21 @@ def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, fl
         d = found.direction - t
         turns.append(w @ np.linalg.solve(bound, w) / 3)
         directions.append(d @ np.linalg.pinv(bound_direction, rcond=1e-6) @ d / 2)
-    return [math.sqrt(np.mean(turns)), math.sqrt(np.mean(directions)), failed / runs]
+    return math.sqrt(np.mean(turns)), math.sqrt(np.mean(directions)), failed / runs, float(np.mean(behind))
 
 
 def check_two_view() -> list[dict[str, Any]]:
-    """Errors over the bound of the right pairs; 30 % are wrong."""
+    """Errors over the bound of the right pairs; at least 99 of 100 are found. Of the widest views 15 % lie behind."""
     rows = []
     for name, motion in (("forward", (0.003, 0.002, 0.05)), ("sideways", (0.03, 0.0, 0.002))):
-        for high in (88, 103):
-            found = kept(FOLDER, f"two_view-{name}-{high}", lambda m=motion, h=high: two_view_figures(m, (15, h)))
+        for limits, wrong in (((15, 88), 0.3), ((15, 103), 0.3), ((15, 88), 0.4), ((40, 103), 0.4)):
+            case = f"{name}_{limits[1]}_{100 * wrong:.0f}_wrong"
+            found = kept(FOLDER, f"two_view-{case}", lambda m=motion, r=limits, w=wrong: two_view_figures(m, r, w))
             for quantity, value in zip(("rotation", "direction"), found[:2], strict=True):
-                rows.append(row(f"two_view.{name}_{high}.{quantity}_over_bound", value, high=1.1))
-            rows.append(row(f"two_view.{name}_{high}.failed", found[2], high=0.01))
+                rows.append(row(f"two_view.{case}.{quantity}_over_bound", value, high=1.1))
+            rows.append(row(f"two_view.{case}.failed", found[2], high=0.01))
+            if limits[0] == 40:
+                rows.append(row(f"two_view.{case}.behind", found[3], low=0.15))
     return rows
 
 
@@ -435,6 +442,48 @@ def check_long() -> list[dict[str, Any]]:
     ]
 
 
+def fit_figures(gap: float) -> list[list[float]]:
+    """Of 500 cylinders fitted to 500 points, 30 % of them gross, of noise 1 % of the diameter, over 0.75 D, with a gap
+    in the azimuth and an axis that starts 20 degrees off: errors in theory's sigmas for as many inliers all around."""
+    from test_tube_sections import trials
+
+    inliers = 350
+    radius, centre, ellipse, tilt = 1.0, math.sqrt(2), math.sqrt(2), math.sqrt(24) / 0.75
+    theory = 0.01 / math.sqrt(inliers) * np.array([radius, ellipse, ellipse, tilt, tilt, centre, centre])
+    error, _ = trials(500, *([gap] if gap else []))
+    return (error / theory).tolist()
+
+
+def circle_figures() -> list[list[float]]:
+    """Of 1000 circles: |e|^2 less its noise, and whether they were told oval."""
+    from test_tube_sections import fit, section
+
+    out = []
+    for seed in range(1000):
+        found = fit(section(np.random.default_rng(1000 + seed), 350, 0.01, (0.0, 0.0)), tilt=0.0)
+        noise = found["covariance"][5, 5] + found["covariance"][6, 6]
+        square = found["ec"] ** 2 + found["es"] ** 2
+        out.append([float(square - noise), float(square / (noise / 2) > 5.99)])
+    return out
+
+
+def check_fits() -> list[dict[str, Any]]:
+    """A section's cylinder against theory (R10). 500 draws tell a scatter to 3 % and a mean to 0.045 sigmas."""
+    error = np.array(kept(FOLDER, "fits", lambda: fit_figures(0.0)))
+    beside_gap = np.array(kept(FOLDER, "fits-gap", lambda: fit_figures(math.radians(60))))
+    square, oval = np.array(kept(FOLDER, "fits-circles", circle_figures)).T
+    names = ("radius", "ellipse_1", "ellipse_2", "tilt_1", "tilt_2", "centre_1", "centre_2")
+    rows = [row(f"fits.{name}_over_theory", s, 0.9, 1.2) for name, s in zip(names, error.std(0), strict=True)]
+    rows += [
+        row("fits.most_bias_sigmas", np.abs(error.mean(0)).max(), high=0.2),
+        row("fits.within_4_sigmas", (np.abs(error) <= 4).all(1).mean(), low=0.99),
+        row("fits.gap_most_over_theory", beside_gap.std(0)[:3].max(), high=1.5),
+        row("fits.circles_debiased_s_e", square.mean() / (square.std() / math.sqrt(len(square))), -2.0, 2.0),
+        row("fits.circles_told_oval", oval.mean(), 0.03, 0.07),
+    ]
+    return rows
+
+
 def check_video() -> list[dict[str, Any]]:
     """Rendered pipes; see accept_recon_video.py."""
     from accept_recon_video import SCENES, video_figures
@@ -454,6 +503,7 @@ CHECKS = {
     "tubes": check_tubes,
     "draws": check_draws,
     "two_view": check_two_view,
+    "fits": check_fits,
     "long": check_long,
     "video": check_video,
 }
