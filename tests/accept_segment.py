@@ -222,6 +222,7 @@ def check_real(_: int) -> Iterator[Row]:
         yield at_most(f"segment.{r['pair']}_outliers_by_labels_alone", r["same_layer"], least)
         yield at_least(f"segment.{r['pair']}_overlap_with_outline", min(r["overlap"]), 0.7)
         yield at_least(f"segment.{r['pair']}_round_trip_1px", r["back"], 0.95)
+        yield at_most(f"segment.{r['pair']}_energy_rise", r["rise"], 1e-6)
         yield at_most(f"segment.{r['pair']}_s_on_two_cores", max(r["main_s"], r["cpu_s"] / 2), 30)
 
 
