@@ -20,7 +20,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke fuzz-coverage cross proof size pytest hil
+.PHONY: build demo test bench peers accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke fuzz-coverage cross proof size pytest hil
 
 build: native $(STAMP)/python
 
@@ -101,10 +101,12 @@ hil: build deb-arm64
 	@mkdir -p build/hil; $(PY) -m pytest -q tests/hil --half 2 >build/hil/log-2 2>&1 & other=$$!; \
 	$(PY) -m pytest -q tests/hil --half 1; code=$$?; wait $$other || code=1; cat build/hil/log-2; exit $$code
 
-bench: build $(STAMP)/venv-peers
+peers: build $(STAMP)/venv-peers
 	@tools/install-packages bench
 	@test -f build/peers/build.ninja || cmake --preset peers
 	@cmake --build --preset peers
+
+bench: peers
 	@$(PY) tests/bench/run.py --out build/bench.json $(if $(ONLY),--only $(ONLY))
 
 # Debian packages in build/deb: the daemon, the C library and the host tools for this machine; the daemon and the library
@@ -131,7 +133,7 @@ fuzz-coverage: packages-test
 	@test -f build/coverage/build.ninja || cmake --preset coverage
 	@cmake --build --preset coverage
 
-accept: build unit fuzz-build fuzz-coverage cross $(STAMP)/venv-peers
+accept: build unit fuzz-build fuzz-coverage cross peers
 	@$(PY) tests/accept.py --out build/accept.json
 
 format: packages-test $(STAMP)/venv

@@ -15,6 +15,8 @@ from pathlib import Path
 
 from accept_rows import Row, at_least, at_most, exactly
 
+from pipefish.health import VERDICTS
+
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
 
@@ -96,6 +98,29 @@ def check_recon() -> list[Row]:
     return rows_of("accept_recon.py")
 
 
+def check_recon_peers() -> list[Row]:
+    """Reconstruction's times beside its peers' in the same run, as `make bench ONLY=recon` measures them; and the cost
+    of an adjustment beside what Ceres finds."""
+    if not (BUILD / "peers/tests/bench/bench_recon").exists():
+        raise SystemExit("build/peers is missing: `make bench` builds it")
+    peers_path()
+    out = BUILD / "accept/bench-recon.json"
+    done = run(sys.executable, "tests/bench/run.py", "--only", "recon", "--out", out)
+    if done.returncode != 0:
+        raise SystemExit(f"bench failed: {done.stderr.strip()}")
+    figures = json.loads(out.read_text())
+
+    def worst(name: str, key: str) -> float:
+        return max(f[key] for f in figures if f["name"] == name)
+
+    return [
+        at_most("recon.two_view_ms", worst("recon.two_view", "value"), 5.0),
+        at_most("recon.total_over_colmap", worst("recon.total_30m", "ratio"), 0.1),
+        at_most("recon.ba_over_ceres", worst("recon.ba", "ratio"), 0.15),
+        at_most("recon.ba_cost_off", worst("recon.ba_cost_off", "value"), 1e-5),
+    ]
+
+
 def check_dense() -> list[Row]:
     """The wall of a DN400, densely, after the device's program and the reconstruction."""
     return rows_of("accept_dense.py")
@@ -173,7 +198,14 @@ def check_demo() -> list[Row]:
     if done.returncode != 0:
         return [exactly("demo.exit_code", done.returncode, 0)]
     summary = json.loads((BUILD / "demo/summary.json").read_text())
+    if summary["report"] is None:
+        return [exactly("demo.not_measured", 1, 0)]
+    document = json.loads((BUILD / "demo/pipe/reconstruction.json").read_text())
     return [
+        exactly("demo.reports", int((ROOT / summary["report"]).is_file()), 1),
+        at_least("demo.diameter_held", summary["diameter_covered"], 0.9),
+        at_least("demo.ovality_held", summary["ovality_covered"], 0.9),
+        exactly("demo.profile_drifted", int(document["quality"]["profile"]["verdict"] == VERDICTS["drifted"]), 0),
         at_least("demo.within_1px", summary["within_1px"], 0.95),
         at_least("demo.survival", summary["evaluation"]["survival"], 0.7),
         exactly("demo.keyframes_missing", summary["keyframes_sent"] - summary["keyframes_received"], 0),
@@ -191,6 +223,7 @@ CHECKS: dict[str, Callable[[], list[Row]]] = {
     "selfcal": check_selfcal,
     "segment": check_segment,
     "recon": check_recon,
+    "recon_peers": check_recon_peers,
     "dense": check_dense,
     "link_seeds": check_link_seeds,
     "link": check_link,

@@ -5,8 +5,9 @@ drives      20 simulated drives of 30 m through a DN300: keyframes every 5 cm, t
             degrees, with an encoder (0.5 mm a step) and without: errors beside their posterior, per section of 0.75 D
 tubes       the same drives through `fit_tube`: diameters and ovality of its stations
 draws       200 draws of noise on one drive of 1 m: scatter of points, rings, lengths, poses beside their posterior
+fits        500 sections' cylinders beside theory, 1000 circles
 two_view    400 pairs of views in a tube, errors beside the bound of Cramer and Rao
-long        time and memory of 300 m against 30 m
+long        time and memory of the whole command, 300 m against 30 m
 video       four pipes rendered, through pipefishd and `measure` (accept_recon_video.py)
 
 Each piece's figures are kept in build/accept/recon/NAME.jsonl and taken from there while the package and its engine are
@@ -21,10 +22,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import resource
+import os
 import subprocess
 import sys
-import time
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -44,15 +45,19 @@ from tube_tracks import Drive, fisheye, pair_bound, tube_drive, tube_pair  # noq
 FOLDER = ROOT / "build/accept/recon"
 SEEDS, LENGTH, DIAMETER, OVALITY, SIGMA_STEP = 20, 30.0, 0.3, 0.03, 0.0005
 NORMAL_95 = 1.95996
+RING = 0.1  # m, of pipe
 
-# Of the specification, medians in mm: points along the radius, around, along the pipe; last camera sideways.
+# Of the specification, medians in mm: points along the radius, around, along the pipe; last camera sideways, and along
+# the pipe where the first baseline is the scale.
 REFERENCE = {
-    5: (0.89, 0.17, 1.25, 0.07),
-    10: (0.48, 0.12, 0.36, 0.06),
-    20: (0.31, 0.13, 0.30, 0.13),
-    40: (0.33, 0.20, 0.30, 0.38),
-    80: (0.56, 0.48, 0.57, 1.20),
+    5: (0.89, 0.17, 1.25, 0.07, 0.21),
+    10: (0.48, 0.12, 0.36, 0.06, 0.49),
+    20: (0.31, 0.13, 0.26, 0.13, 1.2),
+    40: (0.33, 0.20, 0.30, 0.38, 2.4),
+    80: (0.56, 0.48, 0.57, 1.20, 5.1),
 }
+# 20 views that see no further than so many degrees: points along the radius, radius of a ring in the middle.
+REFERENCE_THETA = {45: (0.63, 0.19), 60: (0.44, 0.10), 75: (0.36, 0.068), 85: (0.31, 0.055), 95: (0.29, 0.045)}
 
 
 def row(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> dict[str, Any]:
@@ -68,9 +73,10 @@ def row(name: str, value: float, low: float = -math.inf, high: float = math.inf)
     }
 
 
-def reference_medians(views: int, seed: int) -> list[float]:
-    """Medians of posterior sigmas, mm, in the reference's scene and gauge (first pose, distance to the last)."""
-    random, camera = np.random.default_rng(seed), fisheye(90, k2=0.0, k3=0.0)
+def reference_medians(views: int, seed: int, theta_max: float = 85.0) -> list[float]:
+    """Medians of posterior sigmas, mm, in the reference's scene and gauge (first pose, distance to the last), as in
+    REFERENCE; and the sigma of the radius of a ring in the middle."""
+    random, camera = np.random.default_rng(seed), fisheye(100, k2=0.0, k3=0.0)
     k = np.arange(views)
     centres = np.column_stack([0.02 * np.sin(0.3 * k), 0.02 * np.cos(0.23 * k), 0.05 * k])
     length = 0.05 * (views - 1)
@@ -81,7 +87,7 @@ def reference_medians(views: int, seed: int) -> list[float]:
     for i in range(views):
         x = points - centres[i]
         theta = np.arctan2(np.hypot(x[:, 0], x[:, 1]), x[:, 2])
-        seen = np.flatnonzero((np.radians(15) < theta) & (theta < np.radians(85)))
+        seen = np.flatnonzero((np.radians(15) < theta) & (theta < np.radians(theta_max)))
         frame.append(np.full(len(seen), i))
         track.append(seen)
         pixels.append(camera.project(x[seen])[0] + random.normal(0, 0.3, (len(seen), 2)))
@@ -94,19 +100,46 @@ def reference_medians(views: int, seed: int) -> list[float]:
     along = np.tile([0.0, 0.0, 1.0], (len(wall), 1))
     medians = [np.median(np.sqrt(np.einsum("ni,nij,nj->n", d, rec.covariance, d))) for d in (outwards, around, along)]
     last = math.sqrt(np.trace(rec.pose_covariance[-1, 3:5, 3:5]) / 2)
-    return [float(scale * value) for value in (*medians, last)]
+    # The distance to the last camera does not vary here: in units of the first baseline it does as that one does.
+    first = np.linalg.norm(rec.centres[1])
+    along_first = rec.centres[1] / first
+    by_first = math.sqrt(along_first @ rec.pose_covariance[1, 3:, 3:] @ along_first) / first
+    ring = np.flatnonzero(np.abs(wall[:, 2] - length / 2) < RING / 2)
+    rows = np.stack(
+        [
+            np.ones(len(ring)),
+            *(f(k * np.arctan2(wall[ring, 1], wall[ring, 0])) for k in (1, 2) for f in (np.cos, np.sin)),
+        ]
+    )
+    weight = 1 / np.einsum("ni,nij,nj->n", outwards[ring], rec.covariance[ring], outwards[ring])
+    radius = np.linalg.solve(rows * weight @ rows.T, rows * weight)[0]
+    ring_sigma = math.sqrt(rec.functions_covariance(ring, radius[None, :, None] * outwards[ring])[0, 0])
+    return [float(scale * value) for value in (*medians, last, by_first, ring_sigma)]
+
+
+def near_reference(name: str, value: float, expected: float, unit: float) -> dict[str, Any]:
+    """Within 15 % of a reference that is rounded to `unit`, mm: half of that is added."""
+    low, high = round(0.85 * (expected - unit / 2), 4), round(1.15 * (expected + unit / 2), 4)
+    return row(f"table.{name}_mm", value, low, high)
 
 
 def check_table() -> list[dict[str, Any]]:
-    """Within 15 % of the reference, which is given to two digits: half a unit of the last one is added."""
+    """Means of five drives' medians beside the reference."""
+
+    def medians(views: int, theta_max: float) -> list[float]:
+        return np.mean([reference_medians(views, seed, theta_max) for seed in range(5)], 0).tolist()
+
     rows = []
     for views, reference in REFERENCE.items():
-        found = kept(
-            FOLDER, f"table-{views}", lambda n=views: np.mean([reference_medians(n, s) for s in range(5)], 0).tolist()
-        )
-        for name, value, expected in zip(("radial", "tangential", "axial", "camera"), found, reference, strict=True):
-            low, high = round(0.85 * (expected - 0.005), 4), round(1.15 * (expected + 0.005), 4)
-            rows.append(row(f"table.{views}.{name}_mm", value, low, high))
+        found = kept(FOLDER, f"table-{views}", lambda n=views: medians(n, 85.0))
+        for name, value, expected in zip(("radial", "tangential", "axial", "camera"), found, reference, strict=False):
+            rows.append(near_reference(f"{views}.{name}", value, expected, 0.01))
+        expected = reference[4]
+        rows.append(near_reference(f"{views}.by_first_baseline", found[4], expected, 0.1 if expected > 1 else 0.01))
+    for theta_max, (radial, ring) in REFERENCE_THETA.items():
+        found = kept(FOLDER, f"table-theta-{theta_max}", lambda t=theta_max: medians(20, t))
+        rows.append(near_reference(f"theta_{theta_max}.radial", found[0], radial, 0.01))
+        rows.append(near_reference(f"theta_{theta_max}.ring", found[5], ring, 0.001 if ring < 0.1 else 0.01))
     return rows
 
 
@@ -332,11 +365,14 @@ def check_draws() -> list[dict[str, Any]]:
     return [*rows, row("draws.pose_nees", nees, round(6 - spread, 3), round(6 + spread, 3))]
 
 
-def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, float]) -> list[float]:
-    """rms of the whitened errors of rotation and direction, failures."""
-    turns, directions, failed, runs = [], [], 0, 400
+def two_view_figures(
+    motion: tuple[float, float, float], limits: tuple[float, float], wrong: float
+) -> tuple[float, float, float, float]:
+    """rms of the whitened errors of rotation and direction, failures, points behind 90 degrees; shares."""
+    turns, directions, behind, failed, runs = [], [], [], 0, 400
     for seed in range(runs):
-        pair = tube_pair(seed, motion, limits=limits, camera=fisheye(105))
+        pair = tube_pair(seed, motion, outliers=wrong, limits=limits, camera=fisheye(105))
+        behind.append(np.mean(((pair.points - pair.centre) @ pair.rotation.T)[:, 2] < 0))
         found = pf.two_view(pair.camera, *pair.pixels, seed=seed)
         if found.status != "ok":
             failed += 1
@@ -348,47 +384,104 @@ def two_view_figures(motion: tuple[float, float, float], limits: tuple[float, fl
         d = found.direction - t
         turns.append(w @ np.linalg.solve(bound, w) / 3)
         directions.append(d @ np.linalg.pinv(bound_direction, rcond=1e-6) @ d / 2)
-    return [math.sqrt(np.mean(turns)), math.sqrt(np.mean(directions)), failed / runs]
+    return math.sqrt(np.mean(turns)), math.sqrt(np.mean(directions)), failed / runs, float(np.mean(behind))
 
 
 def check_two_view() -> list[dict[str, Any]]:
-    """Errors over the bound of the right pairs; 30 % are wrong."""
+    """Errors over the bound of the right pairs; at least 99 of 100 are found. Of the widest views 15 % lie behind."""
     rows = []
     for name, motion in (("forward", (0.003, 0.002, 0.05)), ("sideways", (0.03, 0.0, 0.002))):
-        for high in (88, 103):
-            found = kept(FOLDER, f"two_view-{name}-{high}", lambda m=motion, h=high: two_view_figures(m, (15, h)))
+        for limits, wrong in (((15, 88), 0.3), ((15, 103), 0.3), ((15, 88), 0.4), ((40, 103), 0.4)):
+            case = f"{name}_{limits[1]}_{100 * wrong:.0f}_wrong"
+            found = kept(FOLDER, f"two_view-{case}", lambda m=motion, r=limits, w=wrong: two_view_figures(m, r, w))
             for quantity, value in zip(("rotation", "direction"), found[:2], strict=True):
-                rows.append(row(f"two_view.{name}_{high}.{quantity}_over_bound", value, high=1.1))
-            rows.append(row(f"two_view.{name}_{high}.failed", found[2], high=0.01))
+                rows.append(row(f"two_view.{case}.{quantity}_over_bound", value, high=1.1))
+            rows.append(row(f"two_view.{case}.failed", found[2], high=0.01))
+            if limits[0] == 40:
+                rows.append(row(f"two_view.{case}.behind", found[3], low=0.15))
     return rows
 
 
+def long_survey(length: float, path: Path) -> None:
+    """A drive's survey file."""
+    from test_reconstruct_cli import survey_of
+
+    survey_of(tube_drive(77, length), path)
+
+
 def long_figures(length: float) -> dict[str, float]:
-    """CPU seconds of one drive, without making its tracks, and the peak of this process's memory."""
-    drive = tube_drive(77, length)
-    chainage = readings(drive, 77)
-    started = time.process_time()
-    rec = pf.reconstruct(drive.tracks, drive.camera, chainage, threads=1)
-    seconds = time.process_time() - started
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return {"seconds": seconds, "frames": len(rec.frames), "ok": rec.status == "ok", "peak_gb": peak}
+    """CPU seconds and the peak of memory of `pipefish reconstruct` on one drive with an encoder, from the survey's file
+    to the last of its own."""
+    with tempfile.TemporaryDirectory() as name:
+        survey, out = Path(name) / "survey.mcap", Path(name) / "out"
+        # In a process of its own: this one's memory would count, for a child starts with what its parent has.
+        subprocess.run([sys.executable, __file__, "--long", str(length), survey], check=True)
+        command = [sys.executable, "-m", "pipefish", "reconstruct", str(survey), "-o", str(out)]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        _, code, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(code)
+        document = json.loads((out / "reconstruction.json").read_text()) if not process.returncode else {}
+    return {
+        "seconds": usage.ru_utime + usage.ru_stime,
+        "frames": 1 + round(length / 0.05),
+        "ok": document.get("status") == "ok",
+        "peak_gb": usage.ru_maxrss / 1e6,
+    }
 
 
 def check_long() -> list[dict[str, Any]]:
-    """Ten times as long: ten times the time. Each in a process of its own, for the memory's sake."""
-
-    def measured(length: float) -> dict[str, float]:
-        command = [sys.executable, __file__, "--long", str(length)]
-        return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-
-    short, long = (kept(FOLDER, f"long-{n}", lambda n=n: measured(float(n))) for n in (30, 300))
+    """Ten times as long: ten times the time."""
+    short, long = (kept(FOLDER, f"long-{n}", lambda n=n: long_figures(float(n))) for n in (30, 300))
     per_frame = (long["seconds"] / long["frames"]) / (short["seconds"] / short["frames"])
     return [
         row("long.failed", 2 - short["ok"] - long["ok"], high=0),
         row("long.seconds_300m", long["seconds"]),
         row("long.time_per_frame_ratio", per_frame, high=1.3),
+        row("long.memory_30m_gb", short["peak_gb"]),
         row("long.memory_gb", long["peak_gb"], high=4.0),
     ]
+
+
+def fit_figures(gap: float) -> list[list[float]]:
+    """Of 500 cylinders fitted to 500 points, 30 % of them gross, of noise 1 % of the diameter, over 0.75 D, with a gap
+    in the azimuth and an axis that starts 20 degrees off: errors in theory's sigmas for as many inliers all around."""
+    from test_tube_sections import trials
+
+    inliers = 350
+    radius, centre, ellipse, tilt = 1.0, math.sqrt(2), math.sqrt(2), math.sqrt(24) / 0.75
+    theory = 0.01 / math.sqrt(inliers) * np.array([radius, ellipse, ellipse, tilt, tilt, centre, centre])
+    error, _ = trials(500, *([gap] if gap else []))
+    return (error / theory).tolist()
+
+
+def circle_figures() -> list[list[float]]:
+    """Of 1000 circles: |e|^2 less its noise, and whether they were told oval."""
+    from test_tube_sections import fit, section
+
+    out = []
+    for seed in range(1000):
+        found = fit(section(np.random.default_rng(1000 + seed), 350, 0.01, (0.0, 0.0)), tilt=0.0)
+        noise = found["covariance"][5, 5] + found["covariance"][6, 6]
+        square = found["ec"] ** 2 + found["es"] ** 2
+        out.append([float(square - noise), float(square / (noise / 2) > 5.99)])
+    return out
+
+
+def check_fits() -> list[dict[str, Any]]:
+    """A section's cylinder against theory (R10). 500 draws tell a scatter to 3 % and a mean to 0.045 sigmas."""
+    error = np.array(kept(FOLDER, "fits", lambda: fit_figures(0.0)))
+    beside_gap = np.array(kept(FOLDER, "fits-gap", lambda: fit_figures(math.radians(60))))
+    square, oval = np.array(kept(FOLDER, "fits-circles", circle_figures)).T
+    names = ("radius", "ellipse_1", "ellipse_2", "tilt_1", "tilt_2", "centre_1", "centre_2")
+    rows = [row(f"fits.{name}_over_theory", s, 0.9, 1.2) for name, s in zip(names, error.std(0), strict=True)]
+    rows += [
+        row("fits.most_bias_sigmas", np.abs(error.mean(0)).max(), high=0.2),
+        row("fits.within_4_sigmas", (np.abs(error) <= 4).all(1).mean(), low=0.99),
+        row("fits.gap_most_over_theory", beside_gap.std(0).max(), high=1.5),
+        row("fits.circles_debiased_s_e", square.mean() / (square.std() / math.sqrt(len(square))), -2.0, 2.0),
+        row("fits.circles_told_oval", oval.mean(), 0.03, 0.07),
+    ]
+    return rows
 
 
 def check_video() -> list[dict[str, Any]]:
@@ -410,6 +503,7 @@ CHECKS = {
     "tubes": check_tubes,
     "draws": check_draws,
     "two_view": check_two_view,
+    "fits": check_fits,
     "long": check_long,
     "video": check_video,
 }
@@ -419,10 +513,10 @@ def main() -> int:
     """All pieces, or those whose name has the word in it."""
     parser = argparse.ArgumentParser()
     parser.add_argument("word", nargs="?", default="")
-    parser.add_argument("--long", type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--long", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.long is not None:
-        print(json.dumps(long_figures(arguments.long)))
+        long_survey(float(arguments.long[0]), Path(arguments.long[1]))
         return 0
     rows = [r for name, check in CHECKS.items() if arguments.word in name for r in check()]
     print_rows(rows)

@@ -94,20 +94,48 @@ def size_error(found: float, true: float) -> float:
     return abs(found - true) / max(0.2 * true, 0.002)
 
 
-def visible_length(scene: Scene, deposit: dict[str, Any]) -> float:
-    """Of a heap that falls off to nothing: as far as it is as high as what counts as one."""
-    pipe, places = bare(scene), deposit["s"] + np.linspace(-0.5, 0.5, 201) * deposit["length"]
-    height = [np.linalg.norm(scene.wall(s, deposit["clock"]) - pipe.wall(s, deposit["clock"])) for s in places]
-    high = places[np.array(height) > LEAST_HEIGHT * scene.spec["diameter"]]
-    return float(high[-1] - high[0])
+def visible_size(scene: Scene, deposit: dict[str, Any]) -> tuple[float, float]:
+    """Length and width of a heap that falls off to nothing: as far as it is as high as what counts as one."""
+    pipe, share, size = bare(scene), np.linspace(-0.5, 0.5, 201), []
+    for along, around in ((deposit["length"], 0.0), (0.0, deposit["extent"])):
+        at = [(deposit["s"] + x * along, deposit["clock"] + x * around) for x in share]
+        height = np.array([np.linalg.norm(scene.wall(*place) - pipe.wall(*place)) for place in at])
+        high = share[height > LEAST_HEIGHT * scene.spec["diameter"]]
+        size.append(float(high[-1] - high[0]) * (along or around * scene.spec["diameter"] / 2))
+    return size[0], size[1]
 
 
-def place_error(measured: Measurement, scene: Scene, deposit: dict[str, Any]) -> float:
-    """Metres along the wall by which the deposit that was found lies beside the true one."""
-    stretch, found = next((s, e) for s in measured.measured for e in s.tube.events if e["kind"] == "deposit")
-    along = true_place(measured, scene, stretch, found["s"]) - deposit["s"]
-    turn = (found["clock"] - deposit["clock"] + math.pi) % (2 * math.pi) - math.pi
-    return math.hypot(along, turn * scene.spec["diameter"] / 2)
+def true_bends(scene: Scene) -> list[float]:
+    """Where their middles are, along the axis."""
+    pieces = scene.spec["pieces"]
+    ends = np.cumsum([p["angle"] * p["radius"] if p["angle"] else p["length"] for p in pieces])
+    return [float(e - p["angle"] * p["radius"] / 2) for e, p in zip(ends, pieces, strict=True) if p["angle"]]
+
+
+def places(measured: Measurement, scene: Scene) -> list[Limits]:
+    """Metres by which what was found lies beside the truth, along the pipe and around it; bends, which have no edge, in
+    what their sigma allows them."""
+    found: dict[str, list[tuple[float, dict[str, Any]]]] = {"bend": [], "joint": [], "deposit": []}
+    for stretch in measured.measured:
+        for event in stretch.tube.events:
+            if event["kind"] in found:
+                found[event["kind"]].append((true_place(measured, scene, stretch, event["s"]), event))
+    rows: list[Limits] = []
+    bends, joints, deposits = true_bends(scene), scene.spec["joints"], scene.spec["deposits"]
+    if bends and len(found["bend"]) == len(bends):
+        pairs = zip(found["bend"], bends, strict=True)
+        worst = max(abs(s - true) / max(0.02, 2.5 * event["s_sigma"]) for (s, event), true in pairs)
+        rows.append(("bend_place_off", worst, -math.inf, 1.0))
+    if joints and len(found["joint"]) == len(joints):
+        worst = max(abs(s - true["s"]) for (s, _), true in zip(found["joint"], joints, strict=True))
+        rows.append(("joint_place_m", worst, -math.inf, 0.02))
+    if len(deposits) == len(found["deposit"]) == 1:
+        (s, event), true = found["deposit"][0], deposits[0]
+        turn = (event["clock"] - true["clock"] + math.pi) % (2 * math.pi) - math.pi
+        around = abs(turn) * scene.spec["diameter"] / 2
+        rows.append(("deposit_place_m", math.hypot(s - true["s"], around), -math.inf, 0.02))
+        rows.append(("deposit_clock_m", around, -math.inf, 0.02))
+    return rows
 
 
 def findings(measured: Measurement, scene: Scene) -> list[Limits]:
@@ -123,15 +151,14 @@ def findings(measured: Measurement, scene: Scene) -> list[Limits]:
         ("joint", "step", [math.hypot(j["step_down"], j["step_right"]) for j in scene.spec["joints"]]),
         ("joint", "gap", [j["gap"] for j in scene.spec["joints"]]),
         ("deposit", "height", [d["height"] for d in scene.spec["deposits"]]),
-        ("deposit", "length", [visible_length(scene, d) for d in scene.spec["deposits"]]),
+        ("deposit", "length", [visible_size(scene, d)[0] for d in scene.spec["deposits"]]),
+        ("deposit", "width", [visible_size(scene, d)[1] for d in scene.spec["deposits"]]),
     ):
         found = [e[sizes] or math.inf for e in events if e["kind"] == kind]
         if truth and len(found) == len(truth):
             worst = max(size_error(f, t) for f, t in zip(found, truth, strict=True))
             rows.append((f"{kind}_{sizes}_off", worst, -math.inf, 1.0))
-    if wanted["deposit"] and rows[2][1] == wanted["deposit"] == 1:
-        rows.append(("deposit_place_m", place_error(measured, scene, scene.spec["deposits"][0]), -math.inf, 0.02))
-    return rows
+    return rows + places(measured, scene)
 
 
 def of_tube(truth: dict[str, Any]) -> list[Limits]:

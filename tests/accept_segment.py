@@ -235,6 +235,7 @@ def check_real(_: int) -> Iterator[Row]:
         yield at_most(f"segment.{r['pair']}_outliers_by_labels_alone", r["same_layer"], least)
         yield at_least(f"segment.{r['pair']}_overlap_with_outline", min(r["overlap"]), 0.7)
         yield at_least(f"segment.{r['pair']}_round_trip_1px", r["back"], 0.95)
+        yield at_most(f"segment.{r['pair']}_energy_rise", r["rise"], 1e-6)
         # Of all threads: on two idle cores the clock's time is no longer, since a thread works all the while.
         yield at_most(f"segment.{r['pair']}_processor_s", r["cpu_s"], 30)
         told = f"main thread {r['main_s']:.1f} s, by the clock {r['wall_s']:.1f} s beside what else ran"

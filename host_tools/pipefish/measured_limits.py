@@ -59,6 +59,22 @@ def all_hold(verdicts: Iterable[dict[str, Any]]) -> bool:
     return all(v["state"] == "passed" for v in verdicts)
 
 
+def whole_sigma(document: dict[str, Any], quantity: str) -> np.ndarray:
+    """Of a column of the stations: repeatability and systematic error together."""
+    scale = document["summary"]
+    sigma = column(document, f"{quantity}_sigma")
+    camera = column(document, "ovality_systematic")  # of (max - min) / mean
+    if quantity.startswith("ovality"):
+        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
+        share = {"ovality": 1.0, "ovality_nominal": over_nominal}.get(quantity, 0.5)
+        return np.hypot(sigma, share * camera)
+    if quantity in ("d_max", "d_min"):
+        return np.hypot(sigma, column(document, f"{quantity}_systematic"))
+    if quantity == "reduction_nominal":
+        return np.sqrt(sigma**2 + scale["systematic"]["relative"] ** 2 + (0.5 * camera) ** 2)
+    return sigma
+
+
 def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
     """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
     together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""
@@ -68,16 +84,7 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
     if unit == "mm" and scale["unit"] != "metre":
         return _verdict(name, bound, unit, "not measured", "there is no scale")
     value = factor * column(document, quantity)
-    sigma = factor * column(document, f"{quantity}_sigma")
-    camera = column(document, "ovality_systematic")  # of (max - min) / mean
-    if quantity.startswith("ovality"):
-        over_nominal = column(document, "d_mean") / (scale["nominal"] or math.nan)
-        share = {"ovality": 1.0, "ovality_nominal": over_nominal}.get(quantity, 0.5)
-        sigma = np.hypot(sigma, factor * share * camera)
-    elif quantity in ("d_max", "d_min"):
-        sigma = np.hypot(sigma, factor * column(document, f"{quantity}_systematic"))
-    elif quantity == "reduction_nominal":
-        sigma = np.sqrt(sigma**2 + (factor * scale["systematic"]["relative"]) ** 2 + (0.5 * factor * camera) ** 2)
+    sigma = factor * whole_sigma(document, quantity)
     if not np.isfinite(value).any():
         return _verdict(name, bound, unit, "not measured", "no station has it")
     excess = (value - bound) * (1 if limit.side == "at most" else -1)

@@ -14,6 +14,7 @@ from pipefish.cloudfile import read_columns
 from pipefish.colours import DIVERGING
 from pipefish.errors import FormatError
 from pipefish.measured_files import COLOUR_SPAN, RING
+from pipefish.measured_limits import whole_sigma
 from pipefish.measured_texts import OVALITIES, Z95, column, events_text, read_measured
 from pipefish.page import Chart
 
@@ -173,7 +174,7 @@ class Charts:
             if name == "ovality":
                 low, high = (100 * column(self.document, n) for n in ("ovality_lo", "ovality_hi"))
             else:
-                reach = Z95 * 100 * column(self.document, name + "_sigma")
+                reach = Z95 * 100 * whole_sigma(self.document, name)
                 low, high = value - reach, value + reach
             colour = COLOURS[0]
             data += _band(self.x, value, low, high, self.stretch, words, colour, visible=not names)
@@ -183,8 +184,8 @@ class Charts:
         return {
             "id": "ovality",
             "title": "Ovality along the pipe",
-            "text": "Choose the definition. Noise makes any circle look oval: its share is taken off, and the "
-            "lower end of an "
+            "text": "Choose the definition. Bands: 95 % intervals of repeatability and systematic error together, as "
+            "for the limits. Noise makes any circle look oval: its share is taken off, and the lower end of an "
             "interval may be zero.",
             "data": data,
             "layout": {

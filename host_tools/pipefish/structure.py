@@ -28,6 +28,9 @@ Floats = npt.NDArray[np.float64]
 #: sharpened, and enough for what it adds to be told from rounding. What it adds is divided by it.
 HELD = 1e-4
 
+#: Observations of which derivatives are there at a time: by all of a camera's parameters they take as much as the rest.
+AT_ONCE = 20_000
+
 #: Why a stretch was not measured, in words.
 REASONS = {
     "weak_texture": "too few tracks in common",
@@ -330,7 +333,7 @@ class _Asked:
     def run(self, numbers: npt.NDArray[Any], end: int) -> dict[str, Any]:
         """What the engine finds of the frames before one, with these numbers of the observations' tracks."""
         tracks, drift, shutter = self.tracks, self.drift, self.shutter
-        kept = tracks.frame < end
+        kept = slice(None) if not len(tracks.frame) or tracks.frame.max() < end else tracks.frame < end
         return _engine_run(
             self.camera._profile,
             end,
@@ -509,7 +512,29 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
     number = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     here &= keys[number] == wanted
     item = np.flatnonzero(here)
-    number, place = number[item], place[item]
+    information = np.zeros((len(rec.points), 3, 3))
+    for start in range(0, len(item), AT_ONCE):
+        some = item[start : start + AT_ONCE]
+        _add_information(information, rec, tracks, cameras, sigma, some, number[some], place[some])
+    # A point that keeps too few observations keeps the whole covariance.
+    sound = np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.einsum("nii->n", information)
+    own = rec.covariance.copy()
+    own[sound] = np.linalg.inv(information[sound])
+    return own
+
+
+def _add_information(
+    information: Floats,
+    rec: Reconstruction,
+    tracks: Tracks,
+    cameras: list[Camera],
+    sigma: float,
+    item: npt.NDArray[np.int64],
+    number: npt.NDArray[np.int64],
+    place: npt.NDArray[np.int64],
+) -> None:
+    """Adds to `information` (N,3,3) what observations `item` (n,) tell of points `number` (n,) from frames in `place`
+    (n,)."""
     poses = rec.poses_at(place, tracks.pixels[item])
     turn = poses[:, :, :3]
     seen = np.einsum("nij,nj->ni", turn, rec.points[number]) + poses[:, :, 3]
@@ -525,13 +550,8 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
     factor = np.array(rec.variance_factor)[rec.segment[place]]
     ok = ok & (np.einsum("ni,nij,nj->n", off, weight, off) < 3.5**2 * np.maximum(factor, 0.25))
     by_point = slope[ok] @ turn[ok]
-    information = np.zeros((len(rec.points), 3, 3))
-    np.add.at(information, number[ok], by_point.transpose(0, 2, 1) @ weight[ok] @ by_point / factor[ok, None, None])
-    # A point that keeps too few observations keeps the whole covariance.
-    sound = np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.einsum("nii->n", information)
-    own = rec.covariance.copy()
-    own[sound] = np.linalg.inv(information[sound])
-    return own
+    told = by_point.transpose(0, 2, 1) @ weight[ok] @ by_point / factor[ok, None, None]
+    np.add.at(information, number[ok], told)
 
 
 def _wheel_sigma(segment: dict[str, Any] | None) -> float | None:

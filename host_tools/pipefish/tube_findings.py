@@ -1,7 +1,8 @@
 """What departs from the smooth tube: joints, bends, deposits, holes, laterals.
 
 An event is a dictionary: kind ("joint", "bend", "deposit", "hole", "lateral", "recess"), s (chainage, m), s_sigma, and
-  joint    step (m, across), step_sigma, clock (of the step), diameter_step, angle (rad), gap (m or None), gap_sigma
+  joint    step (m, across), step_sigma, clock (of the step; of a kink without one, towards which it turns),
+           diameter_step, angle (rad), gap (m or None), gap_sigma
   bend     start, end, angle (rad; over pi where it turns back), angle_sigma, radius (m) of its axis, radius_sigma (both
            None where it is shorter than can be told from a kink, or turns unevenly), clock (towards which it turns)
   others   clock, length (along), width (around, m), height (m; how far in or out), height_sigma, points, area (m^2)
@@ -31,6 +32,8 @@ JOINT = ["step", "step_sigma", "diameter_step", "diameter_step_sigma", "gap", "g
 COLUMNS = [*PLACE, *SIZE, *JOINT, "angle", "angle_sigma", "radius", "radius_sigma"]
 FALSE_ALARMS = 0.01  # of one fit
 CHI2_7_MEDIAN = 6.346
+# Of a joint, by the two ends of the surface that meet there.
+TESTED = ("chi2", "step", "step_sigma", "diameter_step", "diameter_step_sigma", "angle", "angle_sigma")
 GROSS = 4.0  # standard deviations
 # Of the diameter. Neighbouring tracks see the same relief in the same changing light and go astray together, which no
 # point's own sigma knows: heaps of 0.7 to 1.2 mm were found in a smooth DN300.
@@ -42,6 +45,9 @@ LEAST_S = math.radians(5)
 # an arc's length beside its fit's own scatter falls as the bend grows: 60 fits, 15 to 90 degrees, noise 0.5 to 3 mm.
 BEND_ENDS = 0.05
 BEND_SHORTEST = 0.6  # shorter ones are kinks for all that can be told
+# A turn that short is two pipes at an angle in their joint, as far as joints go: of the bends that are made the least
+# turns by 11.25 degrees, and spigots leave their sockets before that.
+KINK_MOST = math.radians(11)
 # Of the whole turn, rms: one arc between straights is left by the tangent by 0.004 to 0.06 of it, an S that is
 # taken for one by 0.2 and more.
 BEND_UNEVEN = 0.1
@@ -160,7 +166,8 @@ def confirmed(surface: Any, diameter: float, breaks: list[float], common: Common
 def events(tube: Tube, common: Common) -> list[dict[str, Any]]:
     """All findings, along the pipe; common: what the points share."""
     rings = _rings(tube)
-    found = _joints(tube, rings, common) + _bends(tube, common) + _patches(tube, rings)
+    bends, kinks = _bends(tube, common)
+    found = _joints(tube, rings, kinks, common) + bends + _patches(tube, rings)
     return sorted(found, key=lambda e: e["s"])
 
 
@@ -217,50 +224,43 @@ def _poisson_limit(mean: float, p: float) -> int:
     return max(4, n)
 
 
-def _joints(tube: Tube, rings: list[dict[str, Any]], common: Common) -> list[dict[str, Any]]:
+def _joints(
+    tube: Tube, rings: list[dict[str, Any]], kinks: list[dict[str, Any]], common: Common
+) -> list[dict[str, Any]]:
+    """Where the surface's pieces end, where it kinks, where a gap shows; a gap beside another one is its own."""
     d, found, free = tube.summary["d_mean"], [], list(rings)
     for k in range(len(tube.surface.pieces) - 1):
         test = _joint_test(tube.surface, k, common)
         f = tube.frames([test["s"]], [k])
         shift = test["across"] @ np.stack([f["first"][0], f["second"][0]])
-        near = [r for r in free if abs(r["s"] - test["s"]) < 0.3 * d]
-        event: dict[str, Any] = {
-            "kind": "joint",
-            "s": test["s"],
-            "s_sigma": 0.05 * d,
-            "clock": float(math.atan2(shift @ f["right"][0], shift @ f["up"][0]) % (2 * math.pi)),
-            **{n: v for n, v in test.items() if n not in ("s", "across")},
-            "gap": None,
-            "gap_sigma": None,
-        }
+        clock = float(math.atan2(shift @ f["right"][0], shift @ f["up"][0]) % (2 * math.pi))
+        found.append(_joint(test["s"], 0.05 * d, clock=clock, **{n: test[n] for n in TESTED}))
+    for kink in kinks:
+        found.append(_joint(**{n: kink[n] for n in ("s", "s_sigma", "clock", "angle", "angle_sigma")}))
+    for event in found:
+        near = [r for r in free if abs(r["s"] - event["s"]) < 0.3 * d]
         if near:
-            ring = min(near, key=lambda r: abs(r["s"] - test["s"]))
+            ring = min(near, key=lambda r: abs(r["s"] - event["s"]))
             free.remove(ring)
             event.update(s=ring["s"], s_sigma=ring["gap"] / math.sqrt(12), gap=ring["gap"], gap_sigma=ring["gap_sigma"])
-        found.append(event)
     for ring in free:
-        found.append(
-            {
-                "kind": "joint",
-                "s": ring["s"],
-                "s_sigma": max(ring["gap"] / math.sqrt(12), 1e-4),
-                "gap": ring["gap"],
-                "gap_sigma": ring["gap_sigma"],
-                "step": None,
-                "step_sigma": None,
-                "diameter_step": None,
-                "angle": None,
-                "angle_sigma": None,
-                "clock": None,
-                "points": ring["points"],
-            }
-        )
+        sigma = max(ring["gap"] / math.sqrt(12), 1e-4)
+        found.append(_joint(ring["s"], sigma, **{n: ring[n] for n in ("gap", "gap_sigma", "points")}))
     return found
 
 
-def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
-    """Stretches whose curvature is more than 3 sigma and that turn by more than 2 degrees."""
-    d, found = tube.summary["d_mean"], []
+def _joint(s: float, s_sigma: float, **known: Any) -> dict[str, Any]:
+    """The event; None for what is not known of it."""
+    unknown = dict.fromkeys(
+        ("step", "step_sigma", "diameter_step", "angle", "angle_sigma", "clock", "gap", "gap_sigma")
+    )
+    return {"kind": "joint", "s": s, "s_sigma": s_sigma, **unknown, **known}
+
+
+def _bends(tube: Tube, common: Common) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Stretches whose curvature is more than 3 sigma and that turn by more than 2 degrees: bends, and what is so short
+    and turns so little that it is a joint's kink."""
+    d, found, kinks = tube.summary["d_mean"], [], []
     for k, (start, end) in enumerate(tube.surface.pieces):
         s = np.linspace(start, end, max(3, int((end - start) / (0.05 * d)) + 1))
         f = tube.frames(s, [k] * len(s))
@@ -297,7 +297,8 @@ def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
             if arc.length > BEND_SHORTEST * d and arc.uneven < BEND_UNEVEN:
                 radius = arc.length / arc.angle
             relative = math.hypot(arc.length_sigma, ends) / arc.length
-            found.append(
+            kink = arc.length <= BEND_SHORTEST * d and arc.angle < KINK_MOST
+            (kinks if kink else found).append(
                 {
                     "kind": "bend",
                     "s": arc.middle,
@@ -311,7 +312,7 @@ def _bends(tube: Tube, common: Common) -> list[dict[str, Any]]:
                     "clock": float(math.atan2(toward @ f["right"][at], toward @ f["up"][at]) % (2 * math.pi)),
                 }
             )
-    return found
+    return found, kinks
 
 
 class _Arc(NamedTuple):

@@ -36,6 +36,12 @@ def size(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def calipers(shape: np.ndarray) -> dict[str, np.ndarray]:
     """Widest and narrowest caliper width of each section, their direction and the parameters where they touch."""
+    # A section's reaches in all directions are half a megabyte: of a long pipe only so many are there at a time.
+    parts = [_calipers_of(shape[i : i + 32]) for i in range(0, max(1, len(shape)), 32)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _calipers_of(shape: np.ndarray) -> dict[str, np.ndarray]:
     direction = np.arange(180) * np.pi / 180
     y = section_points(shape, AROUND)
     reach = y @ np.stack([np.cos(direction), np.sin(direction)])

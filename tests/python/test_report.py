@@ -17,6 +17,9 @@ from pipefish.cli import main
 from pipefish.dense import DenseWall
 from pipefish.dense_files import strips_of, write_dense
 from pipefish.dense_findings import fingerprint
+from pipefish.measured_limits import whole_sigma
+from pipefish.measured_texts import OVALITIES, Z95
+from pipefish.report_charts import Charts
 from pipefish.wall import read_wall
 from rendered_survey import MARKS
 from test_page import Outline, data_of
@@ -70,6 +73,28 @@ def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path):
     out, close = tmp_path / "report.html", f"ovality={100 * summary['ovality_most']:.3f}"
     assert main(["report", str(measured / "out"), "-o", str(out), "--limit", close]) == 1
     assert "Undecided: the 95 % interval" in out.read_text()
+
+
+def test_bands_of_ovality_hold_what_the_limits_count(measured):
+    """Repeatability and systematic error, of each definition: bands were drawn without what the camera leaves open."""
+    charts = Charts(measured / "out")
+    stations = charts.document["stations"]
+    stations["ovality_systematic"] = [None if v is None else 0.01 for v in stations["ovality_systematic"]]
+    chart = charts.chart_ovality()
+    bands = [trace["y"] for trace in chart["data"] if trace.get("fill") == "toself"]
+    seen = 0
+    for band, name in zip(bands, chart["choice"]["names"], strict=True):
+        quantity = next(key for key, words in OVALITIES.items() if words == name)
+        if quantity == "ovality":
+            continue  # has an interval of its own
+        first = band[: band.index(None)]
+        half = (np.array(first[: len(first) // 2]) - first[: len(first) // 2 - 1 : -1]) / 2
+        sigma = whole_sigma(charts.document, quantity)
+        start = int(np.flatnonzero(np.isfinite(sigma))[0])
+        assert half == pytest.approx(100 * Z95 * sigma[start : start + len(half)], abs=0.002)
+        assert half.min() > 100 * Z95 * 0.0049  # half of the camera's part at least
+        seen += 1
+    assert seen >= 3
 
 
 def test_commands_in_texts_are_shown_as_code(measured, tmp_path):

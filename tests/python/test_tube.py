@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from pipe_cloud import Pipe
 from pipefish import cli_tube
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_points
+from pipefish.tube import _calipers
 
 
 def turned(seed: int) -> np.ndarray:
@@ -415,3 +417,15 @@ def test_a_sigma_that_is_none_is_named_before_the_cloud(tmp_path, capsys, sigma)
 def test_ovality_is_told_with_its_interval():
     station = {"ovality": 0.0402, "ovality_lo": -0.001, "ovality_hi": 0.045}
     assert cli_tube.ovality_text(station) == "4.02 %, 95 % from 0.00 to 4.50 %"
+
+
+def test_a_long_pipes_diameters_take_no_room_for_all_of_it_at_a_time() -> None:
+    """Half a megabyte a section: 2 GB for 300 m."""
+    shape = np.tile([0.15, 0.002, 0.001], (1000, 1)) * np.linspace(1, 1.1, 1000)[:, None]
+    tracemalloc.start()
+    many = _calipers(shape)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    one = _calipers(shape[777:778])
+    assert all((many[name][777] == one[name][0]).all() for name in one)

@@ -98,10 +98,58 @@ def test_what_turns_unevenly_has_no_radius() -> None:
 
 
 def test_a_bend_too_short_to_be_told_from_a_kink_has_no_radius() -> None:
-    pipe = Pipe(length=4, bend=(1.5, math.radians(8), 0.3), seed=3)
+    pipe = Pipe(length=4, bend=(1.5, math.radians(15), 0.3), seed=3)
     bend = of_kind(pf.fit_tube(pipe.points(2400), pipe.noise, pipe.cameras()), "bend")
-    assert abs(math.degrees(bend["angle"]) - 8) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
-    assert abs(bend["s"] - 1.52) < 0.03 and bend["radius"] is None and bend["radius_sigma"] is None
+    assert abs(math.degrees(bend["angle"]) - 15) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
+    assert abs(bend["s"] - 1.54) < 0.03 and bend["radius"] is None and bend["radius_sigma"] is None
+
+
+def test_a_long_bend_that_turns_no_more_than_a_joint_is_a_bend() -> None:
+    pipe = Pipe(length=4, bend=(1.5, math.radians(9), 3.0), seed=3)
+    tube = pf.fit_tube(pipe.points(2400), pipe.noise, pipe.cameras())
+    bend = of_kind(tube, "bend")
+    assert len(tube.events) == 1
+    assert abs(math.degrees(bend["angle"]) - 9) < max(0.5, 2.5 * math.degrees(bend["angle_sigma"]))
+
+
+@pytest.mark.parametrize(("degrees", "step"), [(3.0, 0.0), (5.0, 0.0), (3.0, 0.012), (5.0, 0.012)])
+def test_a_kink_is_a_joint_with_its_angle(degrees: float, step: float) -> None:
+    """Not a bend of a third of a diameter."""
+    pipe = Pipe(joint=(1.5, step, math.radians(degrees)), seed=1)
+    tube = pf.fit_tube(pipe.points(2000), pipe.noise, pipe.cameras())
+    joint = of_kind(tube, "joint")
+    assert len(tube.events) == 1 and abs(joint["s"] - 1.5) < max(0.03, 2 * joint["s_sigma"])
+    assert abs(math.degrees(joint["angle"]) - degrees) < max(0.1, 2.5 * math.degrees(joint["angle_sigma"]))
+    if step:
+        assert abs(joint["step"] - step) < max(0.002, 2.5 * joint["step_sigma"])
+    else:
+        assert joint["step"] is None
+        assert joint["clock"] == pytest.approx(math.pi / 2, abs=0.1)  # to the right
+
+
+def test_an_open_joint_that_kinks_is_one_joint() -> None:
+    pipe = Pipe(joint=(1.5, 0.0, math.radians(5)), ring=(1.5, 0.03), seed=4)
+    tube = pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras())
+    joint = of_kind(tube, "joint")
+    assert abs(math.degrees(joint["angle"]) - 5) < 0.3
+    assert abs(joint["s"] - 1.5) < 0.015 and joint["gap"] is not None
+
+
+def test_beside_a_joint_nothing_swings() -> None:
+    """The smooth surface ends there: neither diameter nor axis nor ovality overshoots."""
+    pipe = Pipe(joint=(1.5, 0.012, 0.0), ovality=0.02, seed=1)
+    tube = pf.fit_tube(pipe.points(2000), pipe.noise, pipe.cameras())
+    of_kind(tube, "joint")
+    table = tube.stations
+    beside = np.abs(table["s"] - 1.5) < pipe.diameter
+    off = np.hypot(table["x"], table["y"] + 0.012 * table["piece"])
+    for error, sigma in (
+        (table["d_mean"] - pipe.diameter, table["d_mean_sigma"]),
+        (table["ovality"] - 0.02, table["ovality_sigma"]),
+        (off, table["centre_sigma"]),
+    ):
+        assert beside.sum() >= 6 and (np.abs(error[beside]) < 3.5 * sigma[beside]).all()
+        assert np.sqrt(np.mean(error[beside] ** 2)) < 2 * np.sqrt(np.mean(error[~beside] ** 2)) + sigma.mean()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -161,6 +209,25 @@ def test_deposits_and_holes_have_place_height_and_kind(clock: float, height: flo
     assert abs((found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi) * 0.15 < 0.02
     assert abs(found["height"] - abs(height)) < max(0.2 * abs(height), 0.002)
     assert abs(found["length"] - 0.15) < 0.05 and abs(found["width"] - 0.15) < 0.05
+
+
+@pytest.mark.parametrize(("size", "clock"), [(0.15, 1.5), (0.1, 4.5)])
+def test_laterals_have_place_size_and_depth(size: float, clock: float) -> None:
+    """Half a ball that is hollow, 50 and 60 mm deep: as much of a pipe's mouth as is seen."""
+    depth = 0.05 if size > 0.12 else 0.06
+    pipe = Pipe(deposit=(1.4, clock, size, -depth), seed=5)
+    tube = pf.fit_tube(pipe.points(5000), pipe.noise, pipe.cameras())
+    found = of_kind(tube, "lateral")
+    turn = (found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi
+    for error, sigma in (
+        (found["s"] - 1.4, found["s_sigma"]),
+        (turn, found["clock_sigma"]),
+        (found["length"] - size, found["size_sigma"]),
+        (found["width"] - size, found["size_sigma"]),
+        (found["height"] - depth, found["height_sigma"]),
+    ):
+        assert abs(error) < 2.5 * sigma
+    assert found["s_sigma"] < 0.02 and found["size_sigma"] < 0.03 and found["height_sigma"] < 0.3 * depth
 
 
 def test_a_heap_whose_far_flank_shows_few_points_is_told_at_its_middle() -> None:

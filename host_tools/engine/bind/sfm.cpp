@@ -323,12 +323,12 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     int outside = 0, repeated = 0;
     {
         const nb::gil_scoped_release release;
-        const sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
-                                    {track.data(), track.shape(0)}, uv.data(),
-                                    covariance ? covariance->data() : nullptr, sigma);
+        sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
+                              {track.data(), track.shape(0)}, uv.data(), covariance ? covariance->data() : nullptr,
+                              sigma);
         outside = table.outside();
         repeated = table.repeated();
-        found = sfm::reconstruct(table, profile.camera, options);
+        found = sfm::reconstruct(std::move(table), profile.camera, options);
     }
     nb::dict out;
     nb::list segments, gaps;

@@ -551,11 +551,13 @@ std::vector<int> moving_frames(const TrackTable &table, double still)
     return frames;
 }
 
-Reconstruction reconstruct(const TrackTable &whole, const pf_camera &camera, const ReconstructOptions &options)
+Reconstruction reconstruct(TrackTable table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Reconstruction out;
-    out.frames = moving_frames(whole, options.still);
-    TrackTable table = whole.only(out.frames);
+    out.frames = moving_frames(table, options.still);
+    if (out.frames.size() < static_cast<size_t>(table.frames())) {
+        table = table.only(out.frames);
+    }
     ReconstructOptions inner = options;
     Odometry odometry;
     if (options.odometry) { // steps between the frames used

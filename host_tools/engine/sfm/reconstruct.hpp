@@ -56,7 +56,7 @@ struct Reconstruction {
     std::vector<Gap> gaps;         // numbers in `frames`
 };
 
-Reconstruction reconstruct(const TrackTable &table, const pf_camera &camera, const ReconstructOptions &options);
+Reconstruction reconstruct(TrackTable table, const pf_camera &camera, const ReconstructOptions &options);
 
 // Frames to use: those whose tracks moved since the last.
 std::vector<int> moving_frames(const TrackTable &table, double still);
