@@ -68,6 +68,29 @@ def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
     end(survey, note, "serial adapter unplugged", recovery)
 
 
+def test_a_16550_that_overruns_and_a_line_that_loses_bytes_lose_nothing(crawl, note):
+    """For a moment the 16550 hears itself beside the host: its FIFO overflows, the kernel counts that and the daemon
+    tells. Noise comes in meanwhile, and all the time every 5,000th byte to the host is lost."""
+    survey = crawl(**{**SERIAL, **SIZE, "link__device": "/dev/ttyS0", "link__baud": "115200"})
+    board = survey.board
+    board.uart.lose_every = 5000
+    board.run(LOOPBACK)
+    survey.start_receiver(f"serial:{board.uart.device}@115200")
+    survey.start_daemon()
+    survey.wait_for("begins")
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(12), "12 frames")
+    overrun = board.spawn("exec /mnt/pipefish-world --overrun /dev/ttyS0", "overrun.log")
+    board.uart.flood(bytes(range(256)) * 400)
+    survey.wait_for("bytes dropped so far before they could be read", 60)
+    board.wait(overrun)
+    board.wait(world)
+    link = board.status()["link"]
+    assert link["overruns"] > 0 and link["crc_errors"] + link["malformed"] > 0 and link["fragments_resent"] > 0, link
+    end(survey, note, "16550 overrun, bytes lost")
+    assert int(survey.received.metadata["crc_errors_host"]) > 0
+
+
 def begin_tls(crawl):
     """A survey over the network that is waiting for its camera, with a host that was let in."""
     survey = crawl(**{**TLS, **SIZE})
