@@ -20,7 +20,7 @@ ENGINE_SOURCES := $(shell find lib host_tools/engine cmake CMakeLists.txt -type 
 CROSS = aarch64 cortex-m0 cortex-m4 cortex-m7
 C_FILES = $(shell find lib drivers firmware host_tools/engine tests examples -name '*.[ch]' -o -name '*.[ch]pp')
 
-.PHONY: build demo test bench peers accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke fuzz-coverage cross proof size pytest hil
+.PHONY: build demo test bench peers accept deb deb-arm64 format clean packages-build packages-test packages-board native unit lint fuzz-build fuzz-smoke fuzz-coverage cross proof size pytest hil hil-halves
 
 build: native $(STAMP)/python
 
@@ -98,7 +98,11 @@ pytest: build
 # Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
 # scenarios are skipped and say so. An emulated board keeps one core busy: two halves at once.
 hil: build deb-arm64
-	@mkdir -p build/hil; $(PY) -m pytest -q tests/hil --half 2 >build/hil/log-2 2>&1 & other=$$!; \
+	@$(MAKE) hil-halves
+
+# Alone: for what is built already. Each half adds its rows to build/hil/summary.json.
+hil-halves:
+	@mkdir -p build/hil; rm -f build/hil/summary*.json; $(PY) -m pytest -q tests/hil --half 2 >build/hil/log-2 2>&1 & other=$$!; \
 	$(PY) -m pytest -q tests/hil --half 1; code=$$?; wait $$other || code=1; cat build/hil/log-2; exit $$code
 
 peers: build $(STAMP)/venv-peers

@@ -15,10 +15,11 @@
 #include "requests.h"
 #include "session.h"
 
-#define MS         UINT64_C(1000000) /* ns */
-#define PUBLISH_NS (50 * MS)         /* the link's counters go to the status at most so often */
-#define LINGER_NS  (300 * MS)        /* time for the host to take in the last status and ask its last question */
-#define SILENCES   4u                /* keepalives after which a peer counts as gone */
+#define MS          UINT64_C(1000000) /* ns */
+#define OVERRUNS_NS (1000 * MS)       /* a flood is one line in the log */
+#define PUBLISH_NS  (50 * MS)         /* the link's counters go to the status at most so often */
+#define LINGER_NS   (300 * MS)        /* time for the host to take in the last status and ask its last question */
+#define SILENCES    4u                /* keepalives after which a peer counts as gone */
 
 /* One that looks on while another host has the device: it sees status and previews. */
 typedef struct visitor {
@@ -32,6 +33,8 @@ struct pf_courier {
     _Atomic bool is_quitting;
     pf_session host;
     visitor visitors[PF_VISITORS_MAX];
+    uint32_t overruns; /* of the transport, as they were last logged */
+    uint64_t overruns_due;
     char failure[256]; /* of the transport, as it was last logged; "" since it is connected */
     uint64_t status_due, publish_due;
     uint32_t refused;                   /* strangers and hosts, when it was last looked at */
@@ -42,6 +45,20 @@ struct pf_courier {
     uint8_t preview[PF_PREVIEW_MAX];
     size_t preview_n; /* 0 = none waits */
 };
+
+/* Bytes come too fast for this machine: the link sends again what they were part of, and somebody should know. */
+static void tell_overruns(pf_courier *c, uint64_t now)
+{
+    const pf_transport *t = &c->daemon->transport;
+    const uint32_t overruns = t->ops->overruns != NULL ? t->ops->overruns(t->self) : 0;
+    if (overruns != c->overruns && now >= c->overruns_due) {
+        pf_log(PF_LOG_WARNING, "%s: overrun: %u bytes dropped so far before they could be read", t->ops->name(t->self),
+               overruns);
+        c->overruns = overruns;
+        c->overruns_due = now + OVERRUNS_NS;
+    }
+    c->daemon->counters.overruns = overruns;
+}
 
 static void publish(pf_courier *c, uint64_t now)
 {
@@ -59,6 +76,7 @@ static void publish(pf_courier *c, uint64_t now)
     }
     k->link_up = pf_link_is_up(c->host.link);
     k->link = *pf_link_get_stats(c->host.link);
+    tell_overruns(c, now);
     k->visitors = 0;
     for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
         k->visitors += c->visitors[i].session.transport.ops != NULL;

@@ -164,7 +164,7 @@ static void print_network(FILE *out, const pf_msg_network *w)
 }
 
 static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats *store, const pf_camera_stats *camera,
-                         const pf_gpio_state *gpio, const char *problem)
+                         const pf_gpio_state *gpio, uint32_t overruns, const char *problem)
 {
     (void)fprintf(out, "{\n  \"software\": \"%s\",\n  \"boot_id\": \"%016" PRIx64 "\",\n  \"survey_id\": \"",
                   PF_SOFTWARE, s->time.boot_id);
@@ -191,14 +191,15 @@ static void print_status(FILE *out, const pf_msg_status *s, const pf_store_stats
     print_camera(out, camera);
     print_gpio(out, gpio);
     print_tracking(out, &s->tracking);
-    (void)fprintf(out,
-                  "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64
-                  ", \"frames_out\": %" PRIu64 ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64
-                  ", \"malformed\": %" PRIu64 ", \"fragments_sent\": %" PRIu64 ", \"fragments_resent\": %" PRIu64
-                  ", \"objects_sent\": %" PRIu64 ", \"sessions\": %" PRIu64 ", \"rtt_us\": %u, \"visitors\": %u}",
-                  s->link_up ? "true" : "false", s->link.bytes_out, s->link.bytes_in, s->link.frames_out,
-                  s->link.frames_in, s->link.crc_errors, s->link.malformed, s->link.fragments_sent,
-                  s->link.fragments_resent, s->link.objects_sent, s->link.sessions, s->link.rtt_us, s->visitors);
+    (void)fprintf(
+        out,
+        "  \"link\": {\"up\": %s, \"bytes_out\": %" PRIu64 ", \"bytes_in\": %" PRIu64 ", \"frames_out\": %" PRIu64
+        ", \"frames_in\": %" PRIu64 ", \"crc_errors\": %" PRIu64 ", \"malformed\": %" PRIu64
+        ", \"fragments_sent\": %" PRIu64 ", \"fragments_resent\": %" PRIu64 ", \"objects_sent\": %" PRIu64
+        ", \"sessions\": %" PRIu64 ", \"rtt_us\": %u, \"visitors\": %u, \"overruns\": %u}",
+        s->link_up ? "true" : "false", s->link.bytes_out, s->link.bytes_in, s->link.frames_out, s->link.frames_in,
+        s->link.crc_errors, s->link.malformed, s->link.fragments_sent, s->link.fragments_resent, s->link.objects_sent,
+        s->link.sessions, s->link.rtt_us, s->visitors, overruns);
     print_text(out, "spool_trouble", store->trouble);
     if (s->telemetry.has_encoder)
         (void)fprintf(out, ",\n  \"encoder_count\": %" PRId64, s->telemetry.encoder_count);
@@ -229,6 +230,7 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
     pf_keeper_texts texts = {.problem = ""};
     pf_camera_stats camera;
     pf_gpio_state gpio;
+    uint32_t overruns;
     FILE *out;
     bool ok;
     (void)snprintf(draft, sizeof draft, "%s.new", path);
@@ -240,10 +242,11 @@ bool pf_daemon_write_status(pf_daemon *d, const char *path, char *error, size_t 
             pf_keeper_state(d->keeper, &profile, &texts);
         pthread_mutex_lock(&d->counters.mutex);
         camera = d->counters.camera;
+        overruns = d->counters.overruns;
         pthread_mutex_unlock(&d->counters.mutex);
         d->gpio.ops->state(d->gpio.self, &gpio);
         pf_utf8_clean(gpio.encoder);
-        print_status(out, &status, &store, &camera, &gpio, texts.problem);
+        print_status(out, &status, &store, &camera, &gpio, overruns, texts.problem);
         ok = ferror(out) == 0;
         ok = fclose(out) == 0 && ok;
         if (ok && rename(draft, path) == 0)

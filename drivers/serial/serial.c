@@ -7,6 +7,7 @@
 #include <asm/termbits.h> /* termios2; glibc's termios.h knows fixed rates only, and the two exclude each other */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/serial.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -30,6 +31,7 @@ typedef struct serial {
     int fd; /* -1 = not there now */
     bool fresh;
     bool is_pty;
+    uint32_t overruns, counted; /* bytes that came and were dropped; the kernel's count of them when last asked */
     /* What a pty's line would still have to send; a real device is asked. */
     double pty_queue;
     uint64_t pty_time_ns;
@@ -111,6 +113,14 @@ static pf_status configure(serial *s, int fd)
     return PF_OK;
 }
 
+/* Bytes that the kernel knows were dropped before anybody read them: by the device, its FIFO full, or for want of room
+ * in the terminal's buffer. It counts from the device's first start on. 0 for a driver that does not count. */
+static uint32_t count_dropped(int fd)
+{
+    struct serial_icounter_struct c;
+    return ioctl(fd, TIOCGICOUNT, &c) == 0 ? (uint32_t)c.overrun + (uint32_t)c.buf_overrun : 0;
+}
+
 /* *is_absent: nothing is plugged in under this path. */
 static pf_status open_device(serial *s, bool *is_absent)
 {
@@ -125,6 +135,7 @@ static pf_status open_device(serial *s, bool *is_absent)
     }
     s->fd = fd;
     s->fresh = true;
+    s->counted = count_dropped(fd);
     s->pty_queue = 0;
     s->pty_time_ns = pf_now();
     return PF_OK;
@@ -238,6 +249,17 @@ static pf_role serial_peer(void *self, const char **name, const pf_transport_sta
     return PF_ROLE_CALIBRATOR;
 }
 
+static uint32_t serial_overruns(void *self)
+{
+    serial *s = self;
+    if (s->fd >= 0) {
+        const uint32_t now = count_dropped(s->fd);
+        s->overruns += now - s->counted;
+        s->counted = now;
+    }
+    return s->overruns;
+}
+
 static const char *serial_name(void *self)
 {
     serial *s = self;
@@ -268,6 +290,7 @@ pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config
         .write = serial_write,
         .room = serial_room,
         .peer = serial_peer,
+        .overruns = serial_overruns,
         .name = serial_name,
         .error = serial_error,
         .close = serial_close,

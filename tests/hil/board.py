@@ -39,10 +39,14 @@ def find_daemon(folder: Path) -> Path:
     return folder / "package/usr/bin/pipefishd"
 
 
-class UsbSerial:
-    """The host's end of the board's USB serial adapter: a pseudo-terminal that stays while the adapter is unplugged."""
+class SerialLine:
+    """The host's end of one of the board's serial lines: a pseudo-terminal that stays while the line is unplugged.
 
-    def __init__(self, socket_path: Path) -> None:
+    lose_every   of so many bytes from the board one is lost on the way; 0 = none
+    """
+
+    def __init__(self, socket_path: Path, lose_every: int = 0) -> None:
+        self.lose_every, self._passed = lose_every, 0
         self.socket_path = socket_path
         self.master, slave = pty.openpty()
         tty.setraw(self.master)
@@ -90,12 +94,27 @@ class UsbSerial:
                     data = line.recv(65536)
                     if not data:
                         raise OSError
+                    data = self._damage(data)
                     while data:
                         data = data[os.write(self.master, data) :]
             except (OSError, ValueError):
                 if line is not None:
                     with self._lock:
                         self._line = None if self._line is line else self._line
+
+    def _damage(self, data: bytes) -> bytes:
+        if not self.lose_every:
+            return data
+        first = -self._passed % self.lose_every
+        self._passed += len(data)
+        lost = range(first, len(data), self.lose_every)
+        return bytes(byte for i, byte in enumerate(data) if i not in lost)
+
+    def flood(self, data: bytes) -> None:
+        """Sends the board what nobody asked for, as fast as its device takes it, among what the host sends."""
+        with self._lock:
+            line = self._line
+        line.sendall(data)
 
     def close(self) -> None:
         self._over.set()
@@ -130,7 +149,8 @@ class Board:
         )
         packed = (CACHE / "initramfs").read_bytes()
         self.initramfs.write_bytes(packed + bytes(-len(packed) % 4) + init.stdout)
-        self.usb = UsbSerial(folder / "usb.sock")
+        self.usb = SerialLine(folder / "usb.sock")
+        self.uart = SerialLine(folder / "uart.sock")
         self.boots = 0
         self.up_s = 0.0  # of the board's time, from the kernel's start until it took commands
         self._qemu: subprocess.Popen[bytes] | None = None
@@ -161,16 +181,19 @@ class Board:
             ),
             *("-device", "qemu-xhci", "-chardev", f"socket,id=usb,path={self.folder}/usb.sock,server=on,wait=off"),
             *("-device", "usb-serial,chardev=usb"),
+            *("-chardev", f"socket,id=uart,path={self.folder}/uart.sock,server=on,wait=off"),
+            *("-device", "pci-serial,chardev=uart"),  # a 16550: /dev/ttyS0
             *("-device", "i6300esb"),  # a watchdog; with -no-reboot a reset ends QEMU
         ]
 
     def power_on(self) -> None:
         """Boots until it takes commands."""
-        for name in ("agent.sock", "usb.sock"):
+        for name in ("agent.sock", "usb.sock", "uart.sock"):
             (self.folder / name).unlink(missing_ok=True)
         with (self.folder / "qemu.log").open("ab") as log:
             self._qemu = subprocess.Popen(self._command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         self.usb.plug()
+        self.uart.plug()
         agent = socket.socket(socket.AF_UNIX)
         agent.settimeout(BOOT_S * (3 if self.has_system else 1))
         agent.connect(str(self.folder / "agent.sock"))
@@ -225,6 +248,7 @@ class Board:
     def power_cut(self) -> None:
         """As if the plug were pulled: what the board had not written is gone."""
         self.usb.unplug()
+        self.uart.unplug()
         if self._agent is not None:
             self._input.close()
             self._agent.close()
@@ -264,6 +288,7 @@ class Board:
     def close(self) -> None:
         self.power_cut()
         self.usb.close()
+        self.uart.close()
 
     def console(self) -> str:
         """The end of what the kernel said."""

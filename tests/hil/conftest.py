@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import subprocess
 import warnings
@@ -13,8 +12,10 @@ from pathlib import Path
 import pytest
 from board import CACHE, PROGRAMS, ROOT, Board
 from crawl import HOST_DAEMON, PIPEFISH, Crawl, Recording, Result, free_port
+from summary import add_rows
 
 RESULTS: list[Result] = []
+SUMMARY = ROOT / "build" / "hil" / "summary.json"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -74,14 +75,12 @@ def note() -> Callable[[Result], None]:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """The table of scenarios, also as build/hil/summary.json (-1 and -2: each half's)."""
+    """The table of scenarios, also as build/hil/summary.json: a half adds its own to the other's."""
     if not RESULTS:
         return
-    folder = ROOT / "build" / "hil"
-    folder.mkdir(parents=True, exist_ok=True)
-    half = config.getoption("half", None)
-    rows = json.dumps([dataclasses.asdict(r) for r in RESULTS], indent=1)
-    (folder / f"summary{f'-{half}' if half else ''}.json").write_text(rows + "\n")
+    if not config.getoption("half", None):
+        SUMMARY.unlink(missing_ok=True)
+    add_rows(SUMMARY, [dataclasses.asdict(r) for r in RESULTS])
     terminalreporter.section("emulated board")
     terminalreporter.write_line(
         f"{'scenario':34}{'frames in':>10}{'keyframes':>10}{'lost':>6}{'twice':>6}{'recovery':>10}"

@@ -179,7 +179,8 @@ class Crawl:
             sections.setdefault(section, []).append(rest.replace("=", " = ", 1))
         text = "".join(f"[{name}]\n" + "\n".join(lines) + "\n" for name, lines in sections.items())
         (board.share / "pipefishd.ini").write_text(text)
-        log = "[Service]\nStandardError=append:/mnt/daemon0.log\n"
+        # A watchdog that barks sooner than the unit's 30 s.
+        log = "[Service]\nStandardError=append:/mnt/daemon0.log\nWatchdogSec=10\n"
         (board.share / "log.conf").write_text(log)
         folder = "/etc/systemd/system/pipefishd.service.d"
         board.run(f"mkdir -p {folder} && cp /mnt/log.conf {folder} && systemctl daemon-reload")

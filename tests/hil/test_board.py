@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from crawl import Result
 from usb_camera import ADDRESS, UsbCamera
 
@@ -55,6 +56,18 @@ def test_a_survey_from_v4l2_over_usb_serial_equals_its_replay(crawl, note):
     assert result.frames_in >= 30 and result.keyframes_out >= 15
 
 
+@pytest.mark.parametrize("pixels", ["YUYV", "NV12"])
+def test_a_camera_of_another_pixel_format_gives_the_tracks_of_its_grey(crawl, note, pixels):
+    survey = begin(crawl, camera__format=pixels)
+    board = survey.board
+    world = survey.show(0, 20, RATE, "/dev/video0", pixels)
+    survey.wait_until(frames(3), "3 frames", 100)
+    assert f"'{pixels:4}'" in board.run("v4l2-ctl -d0 --get-fmt-video"), "another format than was asked for"
+    board.wait(world)
+    result = end(survey, note, f"camera that gives {pixels}")
+    assert result.frames_in >= 12 and result.keyframes_out >= 6
+
+
 def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
     survey = begin(crawl)
     world = survey.show(0, 45, RATE, "/dev/video0")
@@ -66,6 +79,29 @@ def test_the_serial_adapter_unplugged_loses_nothing(crawl, note):
     survey.board.usb.plug()
     recovery = survey.wait_until(lambda s: s["link"]["up"], "the link up again")
     end(survey, note, "serial adapter unplugged", recovery)
+
+
+def test_a_16550_that_overruns_and_a_line_that_loses_bytes_lose_nothing(crawl, note):
+    """For a moment the 16550 hears itself beside the host: its FIFO overflows, the kernel counts that and the daemon
+    tells. Noise comes in meanwhile, and all the time every 5,000th byte to the host is lost."""
+    survey = crawl(**{**SERIAL, **SIZE, "link__device": "/dev/ttyS0", "link__baud": "115200"})
+    board = survey.board
+    board.uart.lose_every = 5000
+    board.run(LOOPBACK)
+    survey.start_receiver(f"serial:{board.uart.device}@115200")
+    survey.start_daemon()
+    survey.wait_for("begins")
+    world = survey.show(0, 45, RATE, "/dev/video0")
+    survey.wait_until(frames(12), "12 frames")
+    overrun = board.spawn("exec /mnt/pipefish-world --overrun /dev/ttyS0", "overrun.log")
+    board.uart.flood(bytes(range(256)) * 400)
+    survey.wait_for("bytes dropped so far before they could be read", 60)
+    board.wait(overrun)
+    board.wait(world)
+    link = board.status()["link"]
+    assert link["overruns"] > 0 and link["crc_errors"] + link["malformed"] > 0 and link["fragments_resent"] > 0, link
+    end(survey, note, "16550 overrun, bytes lost")
+    assert int(survey.received.metadata["crc_errors_host"]) > 0
 
 
 def begin_tls(crawl):
@@ -166,26 +202,37 @@ GPIO = {
     "gpio__led": "LED",
     "gpio__stop": "ESTOP",
     "gpio__limit_front": "!FRONT",
+    "gpio__limit_rear": "!REAR",
     "gpio__encoder": "auto",
     "gpio__encoder_a": "ENC_A",
     "gpio__encoder_b": "ENC_B",
     "encoder__metres_per_count": "0.002",
     "keyframe__step_mm": "5",
 }
-LINES = ("ENC_A", "ENC_B", "LAMP", "ESTOP", "FRONT", "LED")
+LINES = ("ENC_A", "ENC_B", "LAMP", "ESTOP", "FRONT", "REAR", "LED")
+CHIP = "/sys/kernel/config/gpio-sim/crawler"
 
 
 def make_lines(board) -> str:
     """A chip of gpio-sim with the crawler's lines; the folder of their world side. The stop is a normally closed switch
     to ground: open, or its wire broken, it is high and means stop. The limit switch closes to ground."""
-    chip = "/sys/kernel/config/gpio-sim/crawler"
+    chip = CHIP
     board.run("modprobe gpio-sim")
     names = "; ".join(f"mkdir {chip}/b/line{i}; echo {name} > {chip}/b/line{i}/name" for i, name in enumerate(LINES))
     board.run(f"mkdir {chip}; mkdir {chip}/b; echo {len(LINES)} > {chip}/b/num_lines; {names}; echo 1 > {chip}/live")
     name = board.run(f"echo $(cat {chip}/dev_name)/$(cat {chip}/b/chip_name)").strip()
     world = f"/sys/devices/platform/{name}"
-    board.run(f"echo pull-up > {world}/sim_gpio{LINES.index('FRONT')}/pull")
+    for name in ("FRONT", "REAR"):
+        pull(board, world, name, "up")
     return world
+
+
+def pull(board, world: str, name: str, way: str) -> None:
+    board.run(f"echo pull-{way} > {world}/sim_gpio{LINES.index(name)}/pull")
+
+
+def level(board, world: str, name: str) -> str:
+    return board.run(f"cat {world}/sim_gpio{LINES.index(name)}/value").strip()
 
 
 def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
@@ -194,34 +241,29 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     board.run(LOOPBACK)
     world = make_lines(board)
 
-    def level(name: str) -> str:
-        return board.run(f"cat {world}/sim_gpio{LINES.index(name)}/value").strip()
-
-    def pull(name: str, way: str) -> None:
-        board.run(f"echo pull-{way} > {world}/sim_gpio{LINES.index(name)}/pull")
-
     # A quarter of the wheel's edges: gpio-sim under emulation merges edges that are less than some milliseconds apart.
     counts = [count // 4 for count in survey.recording.counts]
     (board.share / "quarter.txt").write_text("".join(f"{count}\n" for count in counts))
     survey.start_receiver(usb(survey))
     survey.start_daemon()
     survey.wait_for("begins")
-    assert level("LAMP") == "1"
+    assert level(board, world, "LAMP") == "1"
     encoder = f"--encoder {world}/sim_gpio0/pull {world}/sim_gpio1/pull /mnt/quarter.txt"
     process = survey.show(0, 45, RATE, "/dev/video0", encoder=encoder)
     survey.wait_until(frames(25), "25 frames")
-    pull("FRONT", "down")
+    assert [level(board, world, "LED") for _ in range(5)] == ["1"] * 5, "on: a survey"
+    pull(board, world, "FRONT", "down")
     survey.wait_for("front limit switch pressed")
-    pull("ESTOP", "up")
+    pull(board, world, "ESTOP", "up")
     start = time.monotonic()
-    while level("LAMP") != "0":
+    while level(board, world, "LAMP") != "0":
         assert time.monotonic() - start < 60
     recovery = time.monotonic() - start
-    pull("ESTOP", "down")
+    pull(board, world, "ESTOP", "down")
     board.wait(process)
     status = survey.board.status()
     assert status["gpio"]["stop"] and status["gpio"]["limit_front"], "latched, though the button is released"
-    assert level("LAMP") == "0"
+    assert level(board, world, "LAMP") == "0"
     assert status["gpio"]["encoder"] == "lines"
     assert (status["gpio"]["missed"], status["gpio"]["illegal"]) == (0, 0)
     # The lines are let go when the daemon has ended; its count is what the wheel was turned by.
@@ -236,6 +278,43 @@ def test_encoder_lamp_and_stop_of_gpio_lines(crawl, note):
     assert received.keyframes[-1].telemetry["limit_front"] and "limit_front" not in received.keyframes[0].telemetry
     assert received.keyframes[0].telemetry["lamp"] == 1 and received.keyframes[-1].telemetry["lamp"] == 0
     assert result.keyframes_out > 10
+
+
+def test_lost_edges_are_told_and_a_chip_that_vanishes_is_a_pressed_stop(crawl):
+    """The wheel turns while the daemon stands still: the kernel keeps 1,024 edges and drops the older ones. Then the
+    rear limit switch, and the chip with all lines goes, as that of an expander whose plug comes off."""
+    lamp = {"gpio__lamp": "/mnt/lamp", "gpio__lamp_level": "0.5", "daemon__drain_s": "0"}
+    survey = crawl(**{**SERIAL, **SIZE, **GPIO, **lamp})
+    board = survey.board
+    board.run(f"{LOOPBACK}; mkdir /mnt/lamp; echo 255 > /mnt/lamp/max_brightness; : > /mnt/lamp/brightness")
+    world = make_lines(board)
+    survey.start_daemon()
+    survey.wait_for("begins")
+    assert (board.share / "lamp/brightness").read_text() == "128"
+    # No camera: it blinks at five a second.
+    seen = board.run(f"for i in 1 2 3 4 5 6 7 8; do cat {world}/sim_gpio{LINES.index('LED')}/value; sleep 0.07; done")
+    assert {"0", "1"} == set(seen.split()), seen
+    (board.share / "far.txt").write_text("0\n8\n1308\n")
+    encoder = f"--encoder {world}/sim_gpio0/pull {world}/sim_gpio1/pull /mnt/far.txt"
+    board.wait(survey.show(0, 2, 1, "/dev/video0", encoder=encoder))
+    assert board.status()["gpio"]["missed"] == 0
+    board.run(f"kill -STOP {survey.daemon}")
+    board.wait(survey.show(2, 1, 1, "/dev/video0", encoder=encoder))
+    board.run(f"kill -CONT {survey.daemon}")
+    survey.wait_for("wheel encoder: ", 60)
+    gpio = survey.board.status()["gpio"]
+    assert 0 < gpio["missed"] <= 1300 - 1024 and not gpio["stop"] and not gpio["broken"], gpio
+    pull(board, world, "REAR", "down")
+    survey.wait_for("rear limit switch pressed", 60)
+    assert not board.status()["gpio"]["limit_front"]
+    board.run(f"echo 0 > {CHIP}/live")
+    survey.wait_for("emergency stop: the lamp is off")
+    survey.wait_for("a chip or device of [gpio] has gone")
+    survey.wait_until(lambda s: s["gpio"]["stop"] and s["gpio"]["broken"], "stop and a broken chip in the status", 60)
+    assert (board.share / "lamp/brightness").read_text()[:1] == "0"
+    assert board.is_running(survey.daemon)
+    survey.stop_daemon()
+    board.wait(survey.daemon)
 
 
 VIVID = "modprobe vivid n_devs=1 node_types=0x101 num_inputs=1 input_types=0x3 num_outputs=1 output_types=0x1"

@@ -1,11 +1,13 @@
 /* The world of the emulated board: shows recorded frames to a V4L2 camera and turns its wheel encoder with them.
  *
  *   pipefish-world FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT [--encoder PULL_A PULL_B COUNTS.txt | --rotary COUNTS.txt]
+ *   pipefish-world --overrun TTY
  *
  * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
  * capturing side's differ). FORMAT: GREY, YUYV, NV12 or Y10. COUNTS.txt has the encoder's count at each frame, one a
  * line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
- * Frame i is shown when the encoder has reached its count.
+ * Frame i is shown when the encoder has reached its count. --overrun makes a 16550 hear itself for 64 kB: beside what
+ * the other end sends at that time that is more than its 16 bytes hold.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -228,8 +230,26 @@ static void drive(world *w, uint32_t i, double begin, double seconds)
     }
 }
 
+/* Its loopback bit: what it sends comes in again, whether there is room or not. */
+static int overrun(const char *tty)
+{
+    const int loop = 0x8000; /* TIOCM_LOOP: the kernel's header that has it and glibc's exclude each other */
+    static const uint8_t bytes[4096];
+    int fd = open(tty, O_RDWR | O_NOCTTY);
+    if (fd < 0 || ioctl(fd, TIOCMBIS, &loop) != 0)
+        fail(tty);
+    for (int i = 0; i < 16; i++)
+        if (write(fd, bytes, sizeof bytes) < 0)
+            fail("write");
+    if (ioctl(fd, TCSBRK, 1) != 0 || ioctl(fd, TIOCMBIC, &loop) != 0) /* TCSBRK 1: wait until it is sent */
+        fail(tty);
+    return 0;
+}
+
 int main(int argc, char **argv)
 {
+    if (argc == 3 && strcmp(argv[1], "--overrun") == 0)
+        return overrun(argv[2]);
     world w = {.fd = -1};
     if (argc < 7) {
         (void)fprintf(stderr, "usage: pipefish-world Y4M DEVICE FORMAT RATE FIRST COUNT [--encoder A B COUNTS]\n");

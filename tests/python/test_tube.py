@@ -17,7 +17,7 @@ from pipe_cloud import Pipe
 from pipefish import cli_tube
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_points
-from pipefish.tube import _calipers
+from pipefish.tube_section import calipers
 
 
 def turned(seed: int) -> np.ndarray:
@@ -423,9 +423,9 @@ def test_a_long_pipes_diameters_take_no_room_for_all_of_it_at_a_time() -> None:
     """Half a megabyte a section: 2 GB for 300 m."""
     shape = np.tile([0.15, 0.002, 0.001], (1000, 1)) * np.linspace(1, 1.1, 1000)[:, None]
     tracemalloc.start()
-    many = _calipers(shape)
+    many = calipers(shape)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6
-    one = _calipers(shape[777:778])
+    one = calipers(shape[777:778])
     assert all((many[name][777] == one[name][0]).all() for name in one)

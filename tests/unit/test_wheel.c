@@ -95,6 +95,17 @@ static void test_what_is_no_encoder_is_refused_by_name(void)
     TEST_ASSERT_EQUAL_INT(PF_WHEEL_NONE, wheel.kind);
 }
 
+/* A device that knows nothing of the second interface stands in for a kernel before 5.10. */
+static void test_edges_of_a_kernel_without_numbers_are_refused_and_the_kernel_is_named(void)
+{
+    pf_line_place place = {.chip = "/dev/null", .offset = 3};
+    pf_edges *edges = NULL;
+    uint32_t levels;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, pf_edges_open(&edges, &place, 1, PF_PULL_NONE, &levels, &failure));
+    TEST_ASSERT_NOT_NULL(strstr(failure.text, "line 3: the kernel is older than 5.10"));
+    TEST_ASSERT_NULL(edges);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -102,5 +113,6 @@ int main(void)
     RUN_TEST(test_a_counter_without_an_end_counts_all_64_bits);
     RUN_TEST(test_a_counter_that_vanishes_is_noticed);
     RUN_TEST(test_what_is_no_encoder_is_refused_by_name);
+    RUN_TEST(test_edges_of_a_kernel_without_numbers_are_refused_and_the_kernel_is_named);
     return UNITY_END();
 }
