@@ -5,6 +5,7 @@ the frames that the daemon says it took. Not proved: anything about a real senso
 
 from __future__ import annotations
 
+import itertools
 import time
 
 import pytest
@@ -323,9 +324,11 @@ FAULTS = (
     "inject_v4l2_buf_flag_error",
     "inject_vidioc_qbuf_error",
     "percentage_of_dropped_buffers",
+    "dv_timings_signal_mode",  # 1: no signal, and noise as long as that lasts
     "inject_fatal_streaming_error",
     "inject_vidioc_streamon_error inject_fatal_streaming_error",
     "inject_vidioc_reqbufs_error inject_vidioc_streamon_error inject_fatal_streaming_error",
+    "wrap_sequence_number inject_fatal_streaming_error",  # the stream begins anew 128 frames before its number wraps
 )
 
 
@@ -353,7 +356,9 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     for fault in FAULTS:
         before = board.status()["frames"]
         board.run("; ".join(f"v4l2-ctl -d0 -c {name}=1" for name in fault.split()))
-        survey.wait_until(frames(before + 5), f"frames after {fault}")
+        survey.wait_until(frames(before + (150 if "wrap" in fault else 5)), f"frames after {fault}")
+        if "signal" in fault:
+            board.run(f"v4l2-ctl -d0 -c {fault}=0")
     board.run("rm /run/camera; v4l2-ctl -d0 -c disconnect=1")
     survey.wait_for("no camera")
     board.run(f"kill {world}", check=False)
@@ -366,6 +371,9 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     status = board.status()
     assert status["camera"]["damaged"] >= 1 and status["camera"]["restarts"] >= 1 and status["camera"]["reopens"] >= 1
     end(survey, note, "camera faults, unplugged", recovery, with_noise=True)
+    numbers = [int(row["sequence"]) for _, rows in survey.indices() for row in rows]
+    steps = [after - before for before, after in itertools.pairwise(numbers)]
+    assert min(steps) > 0 and max(steps) < 10_000, "numbers that go on over the wrap, with gaps as long as the pauses"
 
 
 VHCI = "/sys/devices/platform/vhci_hcd.0"
