@@ -372,14 +372,15 @@ def _with_diameter(
 ) -> tuple[_Seen, str, bool]:
     """The known diameter and its sigma as one more measurement of the profile; whether one was measured beside it."""
     about, spread = np.zeros(len(prior)), prior
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
         seen, end = _together(found, about, spread), about + found.drift[0]["camera"]
         off = _diameter_off(found, *known)
         if isinstance(off, str):
             return seen, f"bends and turns of the drive; no diameter ({off})", False
         value, variance = off[0] + slope @ end, off[1]
         seen = _Seen(seen.information + np.outer(slope, slope) / variance, seen.weighed + slope * value / variance)
-        if abs(slope @ (_inverse(seen.information + _inverse(prior)) @ seen.weighed - end)) < NEAR:
+        step = _inverse(seen.information + _inverse(prior)) @ seen.weighed - end
+        if abs(slope @ step) < NEAR or turn == ROUNDS - 1:
             break
         gain = prior @ slope / (slope @ prior @ slope + variance)
         again = adjusted(gain * value, prior - np.outer(gain, prior @ slope))
