@@ -191,8 +191,10 @@ def video_figures(name: str) -> list[Limits]:
     truth = against_truth(measured, scene)
     if truth is None:
         return [("stations_measured", 0, 1, math.inf)]
+    accused = ("profile_called_drifted", float(measured.health.verdict.startswith("drifted")), -math.inf, 0)
     if name == "tube":
-        return [*of_tube(truth), ("seconds_after_rendering", seconds, -math.inf, 180), *findings(measured, scene)]
+        after = ("seconds_after_rendering", seconds, -math.inf, 180)
+        return [*of_tube(truth), after, accused, *findings(measured, scene)]
     if name == "pvc":  # hardly a corner: what is measured must hold its intervals, what is not must be said
         gaps = not_measured(measured)
         silent = truth["stations"] - truth["stations_measured"] if not gaps else 0
@@ -202,6 +204,7 @@ def video_figures(name: str) -> list[Limits]:
             ("diameter_held", truth["diameter_covered"], 0.9, math.inf),
             ("stations_missing_in_silence", silent, -math.inf, 0),
             ("findings", sum(len(s.tube.events) for s in measured.measured), -math.inf, 0),
+            accused,
         ]
     rows: list[Limits] = [
         ("diameter_rms_pct", truth["diameter_rms_pct"], -math.inf, 0.5),
@@ -211,6 +214,7 @@ def video_figures(name: str) -> list[Limits]:
         ("ovality_rms_points", truth["ovality_rms_points"], -math.inf, 0.3),
         ("ovality_held", truth["ovality_covered"], 0.9, math.inf),
         ("share_measured", truth["stations_measured"] / truth["stations"], 0.95, math.inf),
+        accused,
     ]
     if truth["bend_degrees"] is not None:
         rows.append(("bend_degrees", truth["bend_degrees"], -math.inf, 0.5))

@@ -14,7 +14,7 @@ from pipefish import _engine
 from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
-from pipefish.health import ProfileCheck, check_profile, drift_prior
+from pipefish.health import ProfileCheck, check_profile, doubted, drift_prior
 from pipefish.jitter import smoothed
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.pupil import pupil_sigma
@@ -93,7 +93,7 @@ def measure(
 
     Raises PipefishError where nothing can be measured, with the reason; ArgumentError."""
     from pipefish.joint_gaps import tell_gaps
-    from pipefish.measured_remarks import remark
+    from pipefish.measured_remarks import bent, bent_text, remark
 
     tell = tell or (lambda fraction, word: None)
     known = beforehand(diameter, joint_spacing, target)
@@ -124,6 +124,9 @@ def measure(
     _sigmas(m)
     _check_diameter(m, known.diameter)
     m.health = _health(m, used, structure, known, threads, tell)
+    row = bent(m)
+    if row:
+        m.health = doubted(m.health, bent_text(row))
     if pictures:
         tell_gaps(m)
     remark(m)
@@ -224,6 +227,8 @@ def _health(
             diameter=known.diameter.value if known.diameter and m.scale.source == "encoder" else None,
             threads=threads,
             shutter=readings.shutter,
+            sag_sigma=TRACK_SAG_PX2,
+            common_errors=True,
         ),
         lambda: tell(0.9, "profile"),
     )

@@ -53,6 +53,20 @@ def trend(residuals: Residuals, camera: Camera, tracks: Tracks) -> list[dict[str
     return rows
 
 
+def bent(m: Measurement) -> dict[str, Any] | None:
+    """The row of trend() that is furthest off, where that is more than a profile that fits leaves."""
+    rows = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
+    most = max(rows, key=lambda b: abs(b["mean_radial_px"]), default=None)
+    return most if most and abs(most["mean_radial_px"]) > TREND_PX else None
+
+
+def bent_text(row: dict[str, Any]) -> str:
+    return (
+        f"residuals have a trend: {row['mean_radial_px']:+.2f} px outwards between {row['low_deg']:.0f} and "
+        f"{row['high_deg']:.0f} degrees from the axis"
+    )
+
+
 def remark(m: Measurement) -> None:
     """What one should know, most serious first."""
     told = disagreement(m.scale)
@@ -80,14 +94,11 @@ def remark(m: Measurement) -> None:
             "has moved, or "
             "a wall that does?"
         )
-    bins = [b for b in trend(m.residuals, m.camera, m.tracks) if b["count"] >= BIN_LEAST]
-    bent = max(bins, key=lambda b: abs(b["mean_radial_px"]), default=None)
-    if bent and abs(bent["mean_radial_px"]) > TREND_PX:
+    row = bent(m)
+    if row:
         remarks.append(
-            f"Residuals have a trend: {bent['mean_radial_px']:+.2f} px outwards between {bent['low_deg']:.0f} and "
-            f"{bent['high_deg']:.0f} degrees from the axis. The profile does not quite fit the camera (or its "
-            "pupil moves), "
-            "and diameters may be off by more than their intervals."
+            f"R{bent_text(row)[1:]}. The profile does not quite fit the camera (or its pupil moves), and diameters may "
+            "be off by more than their intervals."
         )
     if m.health is not None and m.health.verdict not in (VERDICTS["drifted"], VERDICTS["valid"]):
         remarks.append(m.health.text)

@@ -84,6 +84,24 @@ class Gap:
         return f"frames {self.first} to {self.last}: {REASONS[self.reason]}"
 
 
+def changed_camera(camera: Camera, names: Sequence[str], change: Floats) -> Camera:
+    """The camera with a change (n,) of those of PARAMETERS, without a covariance."""
+    values: dict[str, Any] = {}
+    for name, by in zip(names, change, strict=True):
+        key, _, index = name.partition("[")
+        if index:
+            values.setdefault(key, list(getattr(camera, key)))[int(index[:-1])] += float(by)
+        else:
+            values[key] = getattr(camera, key) + float(by)
+    for kind in ("asym_radial_phi", "asym_tangential_phi"):  # of unit norm: a factor belongs to the part in theta
+        norm = float(np.linalg.norm(values.get(kind, ())))
+        if norm > 0:
+            along = kind.replace("phi", "theta")
+            values[kind] = [v / norm for v in values[kind]]
+            values[along] = [v * norm for v in values.get(along, getattr(camera, along))]
+    return dataclasses.replace(camera, covariance=None, covariance_parameters=(), **values)
+
+
 @dataclass
 class Reconstruction:
     """Poses and points.
@@ -226,20 +244,7 @@ class Reconstruction:
         """The camera with which a segment's poses and points agree: as estimated with its prior."""
         if self.camera_change is None:
             return camera
-        values: dict[str, Any] = {}
-        for name, change in zip(self.camera_parameters, self.camera_change[segment], strict=True):
-            key, _, index = name.partition("[")
-            if index:
-                values.setdefault(key, list(getattr(camera, key)))[int(index[:-1])] += float(change)
-            else:
-                values[key] = getattr(camera, key) + float(change)
-        for kind in ("asym_radial_phi", "asym_tangential_phi"):  # of unit norm: a factor belongs to the part in theta
-            norm = float(np.linalg.norm(values.get(kind, ())))
-            if norm > 0:
-                along = kind.replace("phi", "theta")
-                values[kind] = [v / norm for v in values[kind]]
-                values[along] = [v * norm for v in values.get(along, getattr(camera, along))]
-        return dataclasses.replace(camera, covariance=None, covariance_parameters=(), **values)
+        return changed_camera(camera, self.camera_parameters, self.camera_change[segment])
 
     @property
     def length(self) -> float:

@@ -12,7 +12,7 @@ from pipefish.health import check_profile
 from pipefish.structure import Encoder
 from tube_tracks import fisheye, tube_drive
 
-CASES = ("straight", "bend", "radius")
+CASES = ("straight", "bend", "radius", "axial")  # the last two with a known diameter, "radius" sways
 ENCODER = Encoder(noise_m_per_sqrt_m=0.001, scale_sigma=0.001)
 DIAMETER = 0.3
 
@@ -45,7 +45,7 @@ def survey(
     step: float = 0.05,
     camera: Camera | None = None,
 ) -> tuple[Any, np.ndarray]:
-    """Tracks and the encoder's readings. A straight drive has no wobble at all: a crawler's own panning would tell."""
+    """Tracks and the encoder's readings. Straight and axial drives have no wobble: a crawler's own panning tells."""
     drive = tube_drive(
         seed,
         length=length,
@@ -56,7 +56,7 @@ def survey(
         sigma=sigma,
         limits=(20.0, 89.0),
         camera=camera or fisheye(100),
-        wobble=0.0 if case == "straight" else 1.0,
+        wobble=0.0 if case in ("straight", "axial") else 1.0,
         bend=0.4 if case == "bend" else 0.0,
     )
     random = np.random.default_rng([seed, 5])
@@ -73,7 +73,7 @@ def health_of(seed: int, case: str, change: str, **more: float) -> dict[str, Any
         drifted(drive.camera, change),
         readings,
         encoder=ENCODER,
-        diameter=DIAMETER if case == "radius" else None,
+        diameter=DIAMETER if case in ("radius", "axial") else None,
         sigma=more.get("sigma", 0.2),
         threads=1,
     )

@@ -113,6 +113,16 @@ def test_a_sag_that_differs_around_the_picture_makes_no_oval() -> None:
     assert oval[0] < 0.006 and oval[1] > 0.012  # points of the diameter
 
 
+def test_noise_is_not_read_as_a_sag() -> None:
+    """Of noise and the same with the other sign the mean is what it is read as in truth: it was -30 px^2."""
+    drive, sag = tube_drive(5, 5.0, sigma=0.0), []
+    for sigma in (0.6, -0.6):
+        noise = sigma * np.random.default_rng(2).normal(size=drive.tracks.pixels.shape)
+        tracks = dataclasses.replace(drive.tracks, pixels=drive.tracks.pixels + noise)
+        sag.append(pf.reconstruct(tracks, drive.camera, drive.driven, sigma=0.6, sag_sigma=100.0).sag[0])
+    assert (np.abs(np.mean(sag, axis=0)) < 3).all() and np.abs(sag).max() > 5
+
+
 def test_a_sag_that_nothing_tells_is_as_open_as_was_said() -> None:
     """All around alike up to 90 px^2 were found, what differs around the picture is less."""
     drive = tube_drive(11, 1.0)

@@ -15,11 +15,13 @@ import pytest
 from PIL import Image
 
 import pipefish as pf
-from pipefish import _engine, health, selfcal_input
+from pipefish import _engine, health, measured_remarks, selfcal_input
 from pipefish.cli import main
 from pipefish.health import _chi2_tail
+from pipefish.measure import measure
 from pipefish.selfcal import _reason, _status, self_calibrate, stored_alpha_sigma
 from pipefish.structure import reconstruct
+from pipefish.survey import Survey
 from selfcal_drives import ENCODER, health_of, survey
 from selfcal_scenes import DEGENERATE, KINDS, bearing_error, make_setup, random_lens
 from test_reconstruct_cli import survey_of
@@ -334,13 +336,15 @@ def test_a_survey_with_panning_calibrates_and_a_straight_one_is_refused(tmp_path
 # ---------------------------------------------------------------------- health
 
 
-@pytest.mark.parametrize("case", ["bend", "radius"])
+@pytest.mark.parametrize("case", ["bend", "radius", "axial"])
 def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
     assert health_of(1, case, "", density=300.0, length=5.0)["verdict"] == "profile still valid"
     for change, name, size in (("scale", "angle scale", -1.0), ("centre", "centre u", -3.0)):
         found = health_of(1, case, change, density=300.0, length=5.0)
         assert found["verdict"] == "drifted, recalibrate"
         assert f"{name} changed by" in found["text"] and "if nothing else changed" in found["text"]
+        # A straight drive tells the angles' scale and alpha apart by nothing but their curves.
+        assert ("alpha changed" not in found["text"]) or (case == "axial" and change == "scale")
         value, sigma = found["changes"][name]
         assert abs(value - size) < 3 * sigma < abs(size)
 
@@ -370,6 +374,27 @@ def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius(change):
     assert found["verdict"] == "cannot tell"
     assert 0.02 < found["alpha_sigma"] < 0.2  # all that a lens may drift
     assert f"leaves the diameter open by {100 * found['alpha_sigma']:.2g} %" in found["text"]
+
+
+def test_a_valid_profile_is_told_with_what_would_have_shown():
+    """ "Valid" is no word on what the survey does not see."""
+    found = judged([0, 0, 0, 0, 0], 0.01)
+    blind = judged([0, 0, 0, 0, 0], 0.6).text
+    least = 4 * found.changes["angle scale"][1]
+    assert f"angle scale by {least:.2g} %" in found.text and "no change" not in found.text
+    assert "would have shown: none. Of angle scale and alpha and bend and centre u and centre v no change" in blind
+
+
+def test_residuals_with_a_trend_take_back_that_a_profile_is_valid(tmp_path, monkeypatch):
+    """And nothing else: what has drifted stays so."""
+    file = survey_of(tube_drive(3, 2.0, density=300.0), tmp_path / "survey.mcap")
+    right = measure(Survey.open(file), diameter=0.3, pictures=False, threads=1)
+    assert right.health.verdict == health.VERDICTS["valid"]
+    monkeypatch.setattr(measured_remarks, "TREND_PX", 1e-9)
+    found = measure(Survey.open(file), diameter=0.3, pictures=False, threads=1)
+    assert found.health.verdict == health.VERDICTS["unknown"] and "residuals have a trend" in found.health.text
+    drifted = judged([-1 / 3, 0, 0, 0, 0], 0.01)
+    assert health.doubted(drifted, "why") is drifted
 
 
 def test_a_known_diameter_without_an_encoder_tells_nothing_of_a_straight_drive():

@@ -86,6 +86,9 @@ public:
         start_length_ = (state_.centre.back() - state_.centre.front()).norm();
         saved_ = state_;
         project_all();
+        if (sag_at_ >= 0) {
+            set_sag();
+        }
     }
 
     int eliminated() const { return static_cast<int>(state_.point.size()); }
@@ -119,7 +122,7 @@ public:
                 continue;
             }
             const Eigen::Matrix2d whiten = o.whiten / options_.noise;
-            const Vector2d r = whiten * (uv + sag_columns(o.sag) * state_.sag - o.sight.uv);
+            const Vector2d r = whiten * (uv + sagged(k) - o.sight.uv);
             const Rows<2, 3> whitened = whiten * slope / yardstick();
             const Rows<2, 3> j_point = whitened * turn.r;
             Rows<2, 3> j_turn;
@@ -140,7 +143,7 @@ public:
                 j_border.col(0) = -whitened * x;
             }
             if (sag_at_ >= 0) {
-                j_border.middleCols<3>(sag_at_) = whiten * sag_columns(o.sag);
+                j_border.middleCols<3>(sag_at_) = whiten * sag_columns(sag_[k]);
             }
             if (late_at_ >= 0) { // further on the way: turned more, and moved
                 const size_t f = static_cast<size_t>(frames[0]), other = static_cast<size_t>(frames[1]);
@@ -172,8 +175,7 @@ public:
                 return std::numeric_limits<double>::infinity();
             }
             const Observation &o = table_[place_[k]];
-            const Vector2d error =
-                Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + sag_columns(o.sag) * state_.sag - o.sight.uv;
+            const Vector2d error = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) + sagged(k) - o.sight.uv;
             sum += 0.5 * options_.loss((o.whiten * error).squaredNorm() / noise_squared).rho;
         }
         return sum;
@@ -250,6 +252,36 @@ private:
 
     // One over the sigmas of the sag's parts.
     Vector3d sag_root() const { return Vector3d(1.0, 2.0, 2.0) / options_.sag_sigma; }
+
+    // How far the sag moves observation k.
+    Vector2d sagged(size_t k) const
+    {
+        return sag_at_ >= 0 ? Vector2d(sag_columns(sag_[k]) * state_.sag) : Vector2d(Vector2d::Zero());
+    }
+
+    // From where the points are seen by the map, not from the pixels: their noise would be in both the sag's columns
+    // and the residuals, and 0.3 px were read as -8 px^2 of sag, 0.6 px as -30, and with it as a drift of the profile.
+    void set_sag()
+    {
+        const Vector2d centre(original_.c_u, original_.c_v);
+        const int end = first_ + banded();
+        sag_.assign(place_.size(), Vector2d::Zero());
+        for (size_t p = 0; p < state_.point.size(); p++) {
+            const Observation &start = table_.of_track(track_[p]).front();
+            double first = polar_angle(start.sight.ray);
+            if (start.frame >= first_ && start.frame < end) {
+                const size_t f = static_cast<size_t>(start.frame - first_);
+                first = polar_angle(state_.rotation[f] * (state_.point[p] - state_.centre[f]));
+            }
+            for (size_t k = offset_[p]; k < offset_[p + 1]; k++) {
+                if (seen_[k]) {
+                    const double now = polar_angle(Eigen::Map<const Vector3d>(in_camera_.data() + 3 * k));
+                    const Vector2d out = Eigen::Map<const Vector2d>(pixel_.data() + 2 * k) - centre;
+                    sag_[k] = sag_of(first, now, original_.f_u) * out.stableNormalized();
+                }
+            }
+        }
+    }
 
     bool rolls() const { return !moment_.empty(); }
     double share_at(size_t k) const { return rolls() ? state_.late * moment_[k].share : 0.0; }
@@ -555,7 +587,8 @@ private:
     std::vector<int> coupled_;              // blocks of each point
     std::vector<double> in_camera_, pixel_; // of all observations, at the state
     std::vector<uint8_t> seen_;
-    std::vector<int> wanted_; // ascending
+    std::vector<Vector2d> sag_; // where it is estimated: pixels by which each is off for each px^2 of it
+    std::vector<int> wanted_;   // ascending
     int border_ = 0, down_at_ = 0, sag_at_ = -1, late_at_ = -1, camera_columns_ = 0;
     double start_length_ = 1.0;
 };

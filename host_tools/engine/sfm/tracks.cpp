@@ -8,16 +8,6 @@
 namespace pipefish::sfm
 {
 
-namespace
-{
-
-double polar_angle(const Vector3d &ray)
-{
-    return std::atan2(ray.head<2>().norm(), ray.z());
-}
-
-} // namespace
-
 double sag_of(double first, double now, double f)
 {
     const auto potential = [](double theta) {
@@ -37,7 +27,7 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
             outside_++;
             continue;
         }
-        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse(), Vector2d::Zero()});
+        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse()});
     }
     const auto before = [](const Observation &a, const Observation &b) {
         return a.track != b.track ? a.track < b.track : a.frame < b.frame;
@@ -52,11 +42,6 @@ TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::spa
     repeated_ = static_cast<int>(all_.end() - end);
     all_.erase(end, all_.end());
     index(frames, tracks);
-    for (Observation &o : all_) {
-        const double first = polar_angle(of_track(o.track).front().sight.ray), now = polar_angle(o.sight.ray);
-        const Vector2d out = o.sight.uv - Vector2d(camera.c_u, camera.c_v);
-        o.sag = sag_of(first, now, camera.f_u) * out.stableNormalized();
-    }
 }
 
 TrackTable TrackTable::only(std::span<const int> kept) const

@@ -3,6 +3,7 @@
 
 #include "geometry/sight.hpp"
 
+#include <cmath>
 #include <cstdint>
 #include <span>
 #include <vector>
@@ -21,9 +22,8 @@ using geometry::Vector3d;
 struct Observation {
     int frame, track;
     Sight sight;
-    Eigen::Matrix2d whiten;          // of a pixel error: root^-1
-    Vector2d sag = Vector2d::Zero(); // pixels by which it is off for each px^2 of the sag, see sag_of()
-    double late = 0.0;               // seconds after its frame's time: of its row, where the shutter rolls
+    Eigen::Matrix2d whiten; // of a pixel error: root^-1
+    double late = 0.0;      // seconds after its frame's time: of its row, where the shutter rolls
 };
 
 // A rolling shutter exposes row v line_time (v - middle_row) after the frame's time.
@@ -50,6 +50,12 @@ Moment moment_of(double late, int frame, int first, int end, std::span<const dou
 // cot(theta) + 2 theta. All tracks share it, so that it does not average out: it bends the scale along the pipe.
 // Radians to px per px^2 of the moment, for a lens of f pixels a radian.
 double sag_of(double first, double now, double f);
+
+// Of a ray from the axis, radians.
+inline double polar_angle(const Vector3d &ray)
+{
+    return std::atan2(ray.head<2>().norm(), ray.z());
+}
 
 // What the sag's three parts, px^2, do to a pixel that is off by `sag` for each px^2: all around alike, and along the
 // image's axes and its diagonals. They are the window's second moment as a tensor: along a radius at phi it is
