@@ -5,7 +5,6 @@ o'clock; hours = clock * 6 / pi. Lengths are metres."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
 from collections.abc import Callable
@@ -237,10 +236,7 @@ def fit_tube(
         return _none("not_determined", str(error), nominal)
     if tube_shape.much_off(tube):
         tell(0.7, "trying another shape")
-        with contextlib.suppress(ValueError):
-            other, its = fit.on(*tube_shape.wide_circles(np.asarray(points, float), tube, len(nodes)))
-            if tube_shape.likelier(other, tube):
-                tube, common = other, its
+        tube, common = _of_another_shape(fit, np.asarray(points, float), tube, len(nodes)) or (tube, common)
     if not np.isin(tube.stations["status"], MEASURED).any():
         statuses, count = np.unique(tube.stations["status"], return_counts=True)
         return _none(str(statuses[count.argmax()]), "", nominal)  # of most of it
@@ -295,6 +291,19 @@ class _Fit:
             tube.summary = _summary(tube, by_shape, self.used)
         tube.summary["points_apart"] = float(np.mean(tube.points["piece"][self.used] < 0))
         return tube, common
+
+
+def _of_another_shape(fit: _Fit, points: np.ndarray, tube: Tube, count: int) -> tuple[Tube, Common] | None:
+    """The surface from circles through all points around a tube that leaves many of them off its wall (an egg's crown
+    is exactly round), where that is likelier."""
+    nodes, rho = tube_shape.wide_circles(points, tube, count)
+    if not tube_shape.is_even(rho):
+        return None
+    try:
+        other, common = fit.on(nodes, rho)
+    except ValueError:  # the normal matrix is singular
+        return None
+    return (other, common) if tube_shape.likelier(other, tube) else None
 
 
 def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any, Any, np.ndarray]:

@@ -23,6 +23,7 @@ SURE = 10.0  # of the likelihood's logarithm
 NO_ELLIPSE = 0.0025  # of the diameter, of a departure: it makes diameters 0.5 % larger or smaller
 # Of the departure: what the egg of 2 to 3 has beyond the sixth harmonic is up to 8 % of what it has up to it.
 BEYOND = 0.1
+EVEN = 1.1  # nine of ten circles over one of ten: wider than joints, eggs and wear make it
 
 
 def much_off(tube: Tube) -> bool:
@@ -59,6 +60,12 @@ def wide_circles(cloud: np.ndarray, tube: Tube, count: int) -> tuple[np.ndarray,
             nodes[k] += a * frame["right"][k] + b * frame["up"][k]
             radii[k] = radius
     return np.ascontiguousarray(nodes), radii.tolist()
+
+
+def is_even(radii: list[float]) -> bool:
+    """Whether circles along the pipe are of one size, as a pipe's are: others are of what stands around it."""
+    least, most = np.percentile(radii, (10, 90))
+    return bool(most < EVEN * least)
 
 
 def _likelihood(tube: Tube, among: np.ndarray, mirrored: np.ndarray, width: float) -> float:

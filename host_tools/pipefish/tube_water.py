@@ -20,6 +20,7 @@ TOLERANCE = 0.02  # of the diameter, of a level
 BARE = 0.1  # of the wall's points that would be below the level if it were dry: more, and it is
 TWIN = 0.01  # of the diameter: how far from each other's images twins may be
 TWIN_REACH = 1.5  # diameters each way in which they are counted: a fifth of the wall's points in pictures is enough
+TWIN_MOST = 6000  # points of a window among which they are looked for: a dense cloud has 10^8 pairs
 TWIN_SHARE = 0.1  # of the points under the surface that must have a twin
 TURN = math.radians(2)  # from one direction that is tried to the next
 # How far down may be from six o'clock: an inclinometer's error and a pipe that falls; a crawler's roll at its start
@@ -125,6 +126,7 @@ def _twins(
 ) -> tuple[tuple[float, float] | None, bool]:
     """How far below the axis the level is about which points have twins, and the clock of down; None without one; and
     whether that is sure by itself. Down is within `turn` of six o'clock."""
+    rows = rows[:: -(-len(rows) // TWIN_MOST) or 1]
     rows = rows[np.argsort(p["s"][rows], kind="stable")]
     s, r, clock = p["s"][rows], p["r"][rows], p["clock"][rows]
     last = np.searchsorted(s, s + TWIN * d, side="right")
