@@ -104,7 +104,7 @@ pf_status pf_edges_open(pf_edges **edges, const pf_line_place *places, uint32_t 
     int result = ioctl(chip, GPIO_V2_GET_LINE_IOCTL, &r), why = errno;
     (void)close(chip);
     if (result != 0)
-        return pf_line_fail_edges(&places[0], why, failure);
+        return pf_line_fail_edges(places, n, why, failure);
     pf_edges *e = calloc(1, sizeof *e);
     if (e == NULL || fcntl(r.fd, F_SETFL, O_NONBLOCK) != 0) {
         (void)close(r.fd);

@@ -131,7 +131,7 @@ pf_status pf_edges_open(pf_edges **edges, const pf_line_place *places, uint32_t 
                            places[0].chip, places[i].chip);
     struct gpiod_line_request *request = request_lines(places, n, true, pull);
     if (request == NULL)
-        return pf_line_fail_edges(&places[0], errno, failure);
+        return pf_line_fail_edges(places, n, errno, failure);
     pf_edges *e = calloc(1, sizeof *e);
     struct gpiod_edge_event_buffer *buffer = gpiod_edge_event_buffer_new(PF_EDGES_READ_MAX);
     if (e == NULL || buffer == NULL || fcntl(gpiod_line_request_get_fd(request), F_SETFL, O_NONBLOCK) != 0) {

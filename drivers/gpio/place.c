@@ -30,23 +30,42 @@ pf_status pf_line_parse(const char *name, pf_line_place *place, const char **pla
     return PF_OK;
 }
 
-/* Asks about a line what every kernel with the second interface answers: older ones say EINVAL to all of it, as they do
- * to what is wrong about a request. */
-static bool has_second_interface(const pf_line_place *place)
+/* Lines of an open chip; 0 = it does not tell. */
+static uint32_t count_lines(int chip)
 {
-    struct gpio_v2_line_info info = {.offset = place->offset};
-    int chip = open(place->chip, O_RDWR | O_CLOEXEC);
-    bool has = chip < 0 || ioctl(chip, GPIO_V2_GET_LINEINFO_IOCTL, &info) == 0;
-    if (chip >= 0)
-        (void)close(chip);
-    return has;
+    struct gpiochip_info info = {0};
+    return ioctl(chip, GPIO_GET_CHIPINFO_IOCTL, &info) == 0 ? info.lines : 0;
 }
 
-pf_status pf_line_fail_edges(const pf_line_place *place, int why, pf_failure *failure)
+/* Asks about a line that is there what every kernel with the second interface answers: older ones say EINVAL to all of
+ * it, as they do to what is wrong about a request. */
+static bool has_second_interface(int chip, uint32_t offset)
 {
-    if ((why == ENOTTY || why == EINVAL) && !has_second_interface(place))
+    struct gpio_v2_line_info info = {.offset = offset};
+    return ioctl(chip, GPIO_V2_GET_LINEINFO_IOCTL, &info) == 0;
+}
+
+static pf_status fail_refused(int chip, const pf_line_place *places, uint32_t n, int why, pf_failure *failure)
+{
+    const char *name = places[0].chip;
+    const uint32_t lines = count_lines(chip);
+    for (uint32_t i = 0; i < n && lines > 0; i++)
+        if (places[i].offset >= lines)
+            return pf_fail(failure, PF_ERR_IO, "gpio: %s line %u: has only %u lines, the first is 0", name,
+                           places[i].offset, lines);
+    if (!has_second_interface(chip, places[0].offset))
         return pf_fail(failure, PF_ERR_UNSUPPORTED,
                        "gpio: %s line %u: the kernel is older than 5.10: its edges vanish silently, and none are taken",
-                       place->chip, place->offset);
-    return pf_fail(failure, PF_ERR_IO, "gpio: %s line %u: %s", place->chip, place->offset, strerror(why));
+                       name, places[0].offset);
+    return pf_fail(failure, PF_ERR_IO, "gpio: %s line %u: %s", name, places[0].offset, strerror(why));
+}
+
+pf_status pf_line_fail_edges(const pf_line_place *places, uint32_t n, int why, pf_failure *failure)
+{
+    int chip = why == ENOTTY || why == EINVAL ? open(places[0].chip, O_RDWR | O_CLOEXEC) : -1;
+    if (chip < 0)
+        return pf_fail(failure, PF_ERR_IO, "gpio: %s line %u: %s", places[0].chip, places[0].offset, strerror(why));
+    pf_status status = fail_refused(chip, places, n, why, failure);
+    (void)close(chip);
+    return status;
 }

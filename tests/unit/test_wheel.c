@@ -1,9 +1,13 @@
 /* The wheel encoder's sources, as far as files can stand in for them. Proves: a counter of the kernel's is followed
  * over its end and back, and a name that is none of ours, or a file that is no counter, is refused by name. Not: lines
  * and input devices, which need a kernel (tests/hil). */
+#include "gpio/place.h"
 #include "gpio/wheel.h"
 #include "unity.h"
 
+#include <errno.h>
+#include <linux/gpio.h>
+#include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -95,15 +99,54 @@ static void test_what_is_no_encoder_is_refused_by_name(void)
     TEST_ASSERT_EQUAL_INT(PF_WHEEL_NONE, wheel.kind);
 }
 
-/* A device that knows nothing of the second interface stands in for a kernel before 5.10. */
-static void test_edges_of_a_kernel_without_numbers_are_refused_and_the_kernel_is_named(void)
+/* A kernel made up here: how many lines its chip has (0 = it does not tell), and whether it knows of the second
+ * interface. As the real one, it says EINVAL to a line that is not there, and the old one to everything it does not
+ * know. */
+static struct {
+    uint32_t lines;
+    bool is_old;
+} kernel;
+
+int __wrap_ioctl(int fd, unsigned long request, ...);
+
+int __wrap_ioctl(int fd, unsigned long request, ...)
 {
-    pf_line_place place = {.chip = "/dev/null", .offset = 3};
-    pf_edges *edges = NULL;
-    uint32_t levels;
-    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, pf_edges_open(&edges, &place, 1, PF_PULL_NONE, &levels, &failure));
-    TEST_ASSERT_NOT_NULL(strstr(failure.text, "line 3: the kernel is older than 5.10"));
-    TEST_ASSERT_NULL(edges);
+    va_list arguments;
+    va_start(arguments, request);
+    void *argument = va_arg(arguments, void *);
+    va_end(arguments);
+    TEST_ASSERT_TRUE(fd >= 0);
+    errno = EINVAL;
+    if (request == GPIO_GET_CHIPINFO_IOCTL && kernel.lines > 0) {
+        ((struct gpiochip_info *)argument)->lines = kernel.lines;
+        return 0;
+    }
+    return request == GPIO_V2_GET_LINEINFO_IOCTL && !kernel.is_old &&
+                   ((const struct gpio_v2_line_info *)argument)->offset < kernel.lines
+               ? 0
+               : -1;
+}
+
+static void expect_refusal(uint32_t second_line, int why, pf_status status, const char *words)
+{
+    const pf_line_place places[] = {{.chip = "/dev/null", .offset = 3}, {.chip = "/dev/null", .offset = second_line}};
+    TEST_ASSERT_EQUAL_INT(status, pf_line_fail_edges(places, 2, why, &failure));
+    TEST_ASSERT_NOT_NULL_MESSAGE(strstr(failure.text, words), failure.text);
+}
+
+static void test_why_there_are_no_edges_is_told_apart(void)
+{
+    kernel.lines = 54;
+    kernel.is_old = true;
+    expect_refusal(4, EINVAL, PF_ERR_UNSUPPORTED, "line 3: the kernel is older than 5.10");
+    expect_refusal(99, EINVAL, PF_ERR_IO, "line 99: has only 54 lines");
+    kernel.is_old = false;
+    expect_refusal(99, EINVAL, PF_ERR_IO, "line 99: has only 54 lines");
+    expect_refusal(54, EINVAL, PF_ERR_IO, "line 54: has only 54 lines");
+    expect_refusal(53, EINVAL, PF_ERR_IO, strerror(EINVAL)); /* a bad request */
+    expect_refusal(4, EBUSY, PF_ERR_IO, strerror(EBUSY));
+    kernel.lines = 0; /* no chip at all */
+    expect_refusal(4, ENOTTY, PF_ERR_UNSUPPORTED, "older than 5.10");
 }
 
 int main(void)
@@ -113,6 +156,6 @@ int main(void)
     RUN_TEST(test_a_counter_without_an_end_counts_all_64_bits);
     RUN_TEST(test_a_counter_that_vanishes_is_noticed);
     RUN_TEST(test_what_is_no_encoder_is_refused_by_name);
-    RUN_TEST(test_edges_of_a_kernel_without_numbers_are_refused_and_the_kernel_is_named);
+    RUN_TEST(test_why_there_are_no_edges_is_told_apart);
     return UNITY_END();
 }
