@@ -3,6 +3,7 @@
  * whatever its level, and no request turns it on again. Real lines: tests/hil. */
 #include "gpio/lines.h"
 #include "pipefish/drivers/gpio.h"
+#include "temporary.h"
 #include "unity.h"
 
 #include <poll.h>
@@ -14,7 +15,7 @@
 #include <unistd.h>
 
 static pf_gpio gpio;
-static char folder[256], error[256];
+static char error[256];
 static atomic_bool is_pressed, has_gone;
 static int event = -1;
 
@@ -97,32 +98,21 @@ void pf_edges_close(pf_edges *edges)
 
 /* ---- the kernel's LED */
 
-static void put(const char *name, const char *text)
-{
-    char path[300];
-    (void)snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE *out = fopen(path, "w");
-    TEST_ASSERT_NOT_NULL(out);
-    TEST_ASSERT_TRUE(fputs(text, out) >= 0);
-    TEST_ASSERT_EQUAL_INT(0, fclose(out));
-}
-
 /* What was written last: sysfs takes each write as a whole, a file keeps what is longer. */
 static long brightness(void)
 {
-    char path[300], text[16] = "";
-    (void)snprintf(path, sizeof path, "%s/brightness", folder);
-    FILE *in = fopen(path, "r");
+    char text[16] = "";
+    FILE *in = fopen(temporary_path("brightness"), "r");
     TEST_ASSERT_NOT_NULL(in);
     TEST_ASSERT_NOT_NULL(fgets(text, sizeof text, in));
     (void)fclose(in);
-    put("brightness", "");
+    (void)temporary_text("brightness", "");
     return strtol(text, NULL, 10);
 }
 
 static void open_lamp(double level)
 {
-    pf_gpio_config config = {.lamp = folder, .stop = "ESTOP", .lamp_level = level};
+    pf_gpio_config config = {.lamp = temporary_root, .stop = "ESTOP", .lamp_level = level};
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_gpio_board_open(&gpio, &config, error, sizeof error), error);
 }
 
@@ -140,13 +130,12 @@ static void expect_dark_for_good(void)
 {
     double level = 1;
     TEST_ASSERT_EQUAL_INT(0, brightness());
-    put("brightness", "untouched");
+    (void)temporary_text("brightness", "untouched");
     TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, gpio.ops->set_lamp(gpio.self, 0.5));
     TEST_ASSERT_EQUAL_INT(PF_OK, gpio.ops->lamp(gpio.self, &level));
     TEST_ASSERT_EQUAL_DOUBLE(0, level);
-    char path[300], text[16] = "";
-    (void)snprintf(path, sizeof path, "%s/brightness", folder);
-    FILE *in = fopen(path, "r");
+    char text[16] = "";
+    FILE *in = fopen(temporary_path("brightness"), "r");
     TEST_ASSERT_NOT_NULL(in);
     TEST_ASSERT_NOT_NULL(fgets(text, sizeof text, in));
     (void)fclose(in);
@@ -155,24 +144,18 @@ static void expect_dark_for_good(void)
 
 void setUp(void)
 {
-    (void)snprintf(folder, sizeof folder, "/tmp/test_gpio_board.XXXXXX");
-    TEST_ASSERT_NOT_NULL(mkdtemp(folder));
-    put("max_brightness", "255\n");
-    put("brightness", "");
+    temporary_make();
+    (void)temporary_text("max_brightness", "255\n");
+    (void)temporary_text("brightness", "");
     is_pressed = has_gone = false;
 }
 
 void tearDown(void)
 {
-    char path[300];
     if (gpio.self != NULL)
         gpio.ops->close(gpio.self);
     gpio.self = NULL;
-    (void)snprintf(path, sizeof path, "%s/max_brightness", folder);
-    (void)unlink(path);
-    (void)snprintf(path, sizeof path, "%s/brightness", folder);
-    (void)unlink(path);
-    (void)rmdir(folder);
+    temporary_remove();
 }
 
 static void test_a_lamp_is_dimmed_to_the_nearest_step_of_its_brightness(void)
@@ -213,7 +196,7 @@ static void test_a_stop_whose_chip_vanishes_counts_as_pressed(void)
 
 static void test_a_lamp_stays_dark_that_starts_with_the_stop_pressed(void)
 {
-    put("brightness", "0");
+    (void)temporary_text("brightness", "0");
     is_pressed = true;
     open_lamp(1);
     expect_dark_for_good();

@@ -3,43 +3,30 @@
  * and input devices, which need a kernel (tests/hil). */
 #include "gpio/place.h"
 #include "gpio/wheel.h"
+#include "temporary.h"
 #include "unity.h"
 
 #include <errno.h>
 #include <linux/gpio.h>
 #include <stdarg.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 static pf_wheel wheel;
 static pf_failure failure;
-static char folder[256], count_path[300], ceiling_path[300];
-
-static void put(const char *path, const char *text)
-{
-    FILE *out = fopen(path, "w");
-    TEST_ASSERT_NOT_NULL(out);
-    TEST_ASSERT_TRUE(fputs(text, out) >= 0);
-    TEST_ASSERT_EQUAL_INT(0, fclose(out));
-}
+static const char *count_path, *ceiling_path;
 
 void setUp(void)
 {
     memset(&wheel, 0, sizeof wheel);
-    (void)snprintf(folder, sizeof folder, "/tmp/test_wheel.XXXXXX");
-    TEST_ASSERT_NOT_NULL(mkdtemp(folder));
-    (void)snprintf(count_path, sizeof count_path, "%s/count", folder);
-    (void)snprintf(ceiling_path, sizeof ceiling_path, "%s/ceiling", folder);
+    temporary_make();
+    count_path = temporary_path("count");
+    ceiling_path = temporary_path("ceiling");
 }
 
 void tearDown(void)
 {
     pf_wheel_close(&wheel);
-    (void)unlink(count_path);
-    (void)unlink(ceiling_path);
-    (void)rmdir(folder);
+    temporary_remove();
 }
 
 static pf_status open_it(const char *encoder)
@@ -50,15 +37,15 @@ static pf_status open_it(const char *encoder)
 static int64_t count_after(const char *text)
 {
     static uint64_t now;
-    put(count_path, text);
+    (void)temporary_text("count", text);
     pf_wheel_read(&wheel, now += 1000);
     return wheel.decoder.count;
 }
 
 static void test_a_counter_is_followed_over_its_end_and_back(void)
 {
-    put(count_path, "65530\n");
-    put(ceiling_path, "65535\n");
+    (void)temporary_text("count", "65530\n");
+    (void)temporary_text("ceiling", "65535\n");
     TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, open_it(count_path), failure.text);
     TEST_ASSERT_EQUAL_INT(PF_WHEEL_COUNTER, wheel.kind);
     TEST_ASSERT_EQUAL_INT64(0, count_after("65530\n"));
@@ -71,7 +58,7 @@ static void test_a_counter_is_followed_over_its_end_and_back(void)
 
 static void test_a_counter_without_an_end_counts_all_64_bits(void)
 {
-    put(count_path, "18446744073709551615\n");
+    (void)temporary_text("count", "18446744073709551615\n");
     TEST_ASSERT_EQUAL_INT(PF_OK, open_it(count_path));
     TEST_ASSERT_EQUAL_INT64(6, count_after("5\n"));
     TEST_ASSERT_EQUAL_INT64(-4, count_after("18446744073709551611\n"));
@@ -79,7 +66,7 @@ static void test_a_counter_without_an_end_counts_all_64_bits(void)
 
 static void test_a_counter_that_vanishes_is_noticed(void)
 {
-    put(count_path, "5\n");
+    (void)temporary_text("count", "5\n");
     TEST_ASSERT_EQUAL_INT(PF_OK, open_it(count_path));
     TEST_ASSERT_EQUAL_INT64(0, count_after(""));
     TEST_ASSERT_TRUE(wheel.is_broken);
@@ -88,7 +75,7 @@ static void test_a_counter_that_vanishes_is_noticed(void)
 
 static void test_what_is_no_encoder_is_refused_by_name(void)
 {
-    put(count_path, "forward\n");
+    (void)temporary_text("count", "forward\n");
     TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, open_it(count_path));
     TEST_ASSERT_NOT_NULL(strstr(failure.text, count_path));
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_it("count"));
