@@ -62,9 +62,28 @@ static void detach(driver *c)
     c->is_open = c->is_streaming = false;
 }
 
-static bool sets_exposure(const driver *c)
+/* Whether a control is ours to set: what is fixed without a value stays as others set it. */
+static bool is_ours(const driver *c, double fixed)
 {
-    return c->mode != PF_EXPOSURE_DEVICE && (c->session.has_time || c->session.has_gain);
+    return c->mode != PF_EXPOSURE_DEVICE && (c->mode != PF_EXPOSURE_FIXED || fixed > 0);
+}
+
+static bool sets_time(const driver *c)
+{
+    return c->session.has_time && is_ours(c, c->exposure_us);
+}
+
+static bool sets_gain(const driver *c)
+{
+    return c->session.has_gain && is_ours(c, c->gain);
+}
+
+static void set_exposure(driver *c)
+{
+    const bool is_automatic = c->mode == PF_EXPOSURE_DEVICE;
+    if (is_automatic || sets_time(c) || sets_gain(c))
+        c->io.set(c->io.self, is_automatic, is_ours(c, c->exposure_us) ? c->exposure.time_now : PF_SESSION_AS_IS,
+                  is_ours(c, c->gain) ? c->exposure.gain_now : PF_SESSION_AS_IS);
 }
 
 static pf_status begin_exposure(driver *c)
@@ -74,7 +93,7 @@ static pf_status begin_exposure(driver *c)
     const bool can_time = s->has_time && s->time_unit_us > 0, is_fixed = c->mode == PF_EXPOSURE_FIXED;
     e->time = s->has_time ? s->time : (pf_exposure_range){1, 1, 1};
     e->gain = s->has_gain ? s->gain : (pf_exposure_range){1, 1, 1};
-    if (can_time && c->exposure_max_us > 0) {
+    if (can_time && !is_fixed && c->exposure_max_us > 0) {
         int64_t most = (int64_t)((double)c->exposure_max_us / s->time_unit_us);
         if (most < e->time.max)
             e->time.max = most > e->time.min ? most : e->time.min;
@@ -92,8 +111,7 @@ static pf_status begin_exposure(driver *c)
         pf_exposure_init(e, time, gain);
         c->has_exposure = true;
     }
-    if (c->mode == PF_EXPOSURE_DEVICE || sets_exposure(c))
-        c->io.set(c->io.self, c->mode == PF_EXPOSURE_DEVICE, e->time_now, e->gain_now);
+    set_exposure(c);
     return PF_OK;
 }
 
@@ -195,9 +213,8 @@ static pf_status copy_frame(driver *c, const pf_session_frame *f, uint8_t *to)
 static void report_exposure(const driver *c, const pf_session_frame *f, pf_telemetry *t)
 {
     const pf_session_info *s = &c->session;
-    bool is_set = sets_exposure(c);
-    t->has_exposure = f->exposure_us > 0 || (is_set && s->has_time && s->time_unit_us > 0);
-    t->has_gain = f->gain > 0 || (is_set && s->has_gain);
+    t->has_exposure = f->exposure_us > 0 || (sets_time(c) && s->time_unit_us > 0);
+    t->has_gain = f->gain > 0 || sets_gain(c);
     t->exposure_us = f->exposure_us;
     t->gain = f->gain;
     if (t->has_exposure && f->exposure_us == 0)
@@ -263,9 +280,9 @@ static pf_status wait_for_frame(driver *c, uint64_t end, held *h, pf_frame *fram
         now = now_ns(c);
         if (status == PF_OK) {
             pf_recovery_frame(&c->recovery, now);
-            bool is_ours = c->mode == PF_EXPOSURE_AUTO || c->mode == PF_EXPOSURE_HOLD;
-            if (is_ours && sets_exposure(c) && pf_exposure_judge(&c->exposure, &frame->image))
-                c->io.set(c->io.self, false, c->exposure.time_now, c->exposure.gain_now);
+            bool is_led = c->mode != PF_EXPOSURE_FIXED && (sets_time(c) || sets_gain(c));
+            if (is_led && pf_exposure_judge(&c->exposure, &frame->image))
+                set_exposure(c);
             return PF_OK;
         }
         if (status == PF_ERR_CHECKSUM) {

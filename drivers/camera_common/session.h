@@ -14,6 +14,8 @@ extern "C" {
 #define PF_SESSION_BUFFERS_MIN 2u /* one is copied from while the other is filled */
 #define PF_SESSION_BUFFERS_MAX 32u
 
+#define PF_SESSION_AS_IS INT64_MIN /* of a control: as whoever set it before */
+
 typedef struct pf_session_wish {
     const char *device;     /* V4L2: its path; libcamera: a part of the camera's id, "" = the first */
     uint32_t width, height; /* 0 = as the camera is set */
@@ -65,8 +67,8 @@ typedef struct pf_session_io {
     /* Gives a held buffer back to be filled. */
     void (*give)(void *self, uint32_t buffer);
 
-    /* Goes with the next frames to be begun. Whatever is not has_ in the info is left alone; is_automatic: the camera
-     * is to do it itself. */
+    /* Goes with the next frames to be begun. Whatever is not has_ in the info, or PF_SESSION_AS_IS, is left alone;
+     * is_automatic: the camera is to do it itself. */
     void (*set)(void *self, bool is_automatic, int64_t time, int64_t gain);
 
     /* Before close(): a held buffer's memory stays, as our own, until it is dropped. */

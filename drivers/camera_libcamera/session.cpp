@@ -410,9 +410,9 @@ void Session::set(bool isAutomatic, int64_t time, int64_t gain)
         next_.set(controls::AeEnable, isAutomatic);
     if (isAutomatic)
         return;
-    if (hasTime_)
+    if (hasTime_ && time != PF_SESSION_AS_IS)
         next_.set(controls::ExposureTime, static_cast<int32_t>(time));
-    if (hasGain_)
+    if (hasGain_ && gain != PF_SESSION_AS_IS)
         next_.set(controls::AnalogueGain, static_cast<float>(gain) / GAIN_UNIT);
 }
 

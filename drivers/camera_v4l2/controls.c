@@ -1,13 +1,20 @@
 /* Exposure and gain of a V4L2 camera. */
 #include "camera_v4l2/v4l2.h"
 
+/* False: there is no such control, or it cannot be set. */
+static bool ask(pf_v4l2 *c, uint32_t id, struct v4l2_queryctrl *q)
+{
+    *q = (struct v4l2_queryctrl){.id = id};
+    return c->io.ioctl(c->io.self, c->fd, VIDIOC_QUERYCTRL, q) == 0 &&
+           !(q->flags & (V4L2_CTRL_FLAG_DISABLED | V4L2_CTRL_FLAG_READ_ONLY));
+}
+
 static bool query(pf_v4l2 *c, uint32_t id, pf_v4l2_control *control, pf_exposure_range *range)
 {
-    struct v4l2_queryctrl q = {.id = id};
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_QUERYCTRL, &q) != 0 ||
-        (q.flags & (V4L2_CTRL_FLAG_DISABLED | V4L2_CTRL_FLAG_READ_ONLY)) || q.minimum >= q.maximum)
+    struct v4l2_queryctrl q;
+    if (!ask(c, id, &q) || q.minimum >= q.maximum)
         return false;
-    *control = (pf_v4l2_control){true, id};
+    *control = (pf_v4l2_control){.is_there = true, .id = id};
     *range = (pf_exposure_range){q.minimum, q.maximum, q.step};
     return true;
 }
@@ -37,8 +44,7 @@ static double line_us(pf_v4l2 *c, uint32_t width)
 
 void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info)
 {
-    c->time_control.is_there = c->gain_control.is_there = false;
-    c->is_manual = false;
+    c->time_control = c->gain_control = (pf_v4l2_control){0};
     info->time_unit_us = 0;
     info->gain_unit = 1;
     if (query(c, V4L2_CID_EXPOSURE_ABSOLUTE, &c->time_control, &info->time))
@@ -53,27 +59,38 @@ void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info)
     info->gain_now = info->has_gain ? get(c, c->gain_control.id, info->gain.min) : 0;
 }
 
+/* False: it has the control, and it did not take the value. */
+static bool settle(pf_v4l2 *c, uint32_t id, int64_t value)
+{
+    struct v4l2_queryctrl q;
+    return set(c, id, value) || !ask(c, id, &q);
+}
+
 /* Its own automatics, whichever it has. They stay as they are set when the device is closed, so what an earlier run
  * switched off must be switched on. The frame rate never gives way to the exposure. */
-static void set_automatics(pf_v4l2 *c, bool are_on)
+static bool set_automatic_time(pf_v4l2 *c, bool is_on)
 {
-    if (!are_on)
-        (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL);
-    else if (!set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_AUTO)) /* a fixed iris: most USB cameras */
-        (void)set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY);
-    (void)set(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0);
-    (void)set(c, V4L2_CID_AUTOGAIN, are_on);
-    c->is_manual = !are_on;
+    bool is_done;
+    if (!is_on)
+        is_done = settle(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL);
+    else /* a fixed iris: most USB cameras */
+        is_done = set(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_AUTO) ||
+                  settle(c, V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY);
+    return settle(c, V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0) && is_done;
 }
 
 void pf_v4l2_controls_set(pf_v4l2 *c, bool is_automatic, int64_t time, int64_t gain)
 {
-    if (is_automatic || !c->is_manual)
-        set_automatics(c, is_automatic);
-    if (is_automatic)
-        return;
-    if (c->time_control.is_there)
-        (void)set(c, c->time_control.id, time);
-    if (c->gain_control.is_there)
-        (void)set(c, c->gain_control.id, gain);
+    pf_v4l2_control *t = &c->time_control, *g = &c->gain_control;
+    const bool sets_time = !is_automatic && time != PF_SESSION_AS_IS,
+               sets_gain = !is_automatic && gain != PF_SESSION_AS_IS;
+    /* What it did not take, a device that is busy, is asked for again the next time. */
+    if (is_automatic || (sets_time && !t->is_manual))
+        t->is_manual = set_automatic_time(c, is_automatic) && !is_automatic;
+    if (is_automatic || (sets_gain && !g->is_manual))
+        g->is_manual = settle(c, V4L2_CID_AUTOGAIN, is_automatic) && !is_automatic;
+    if (sets_time && t->is_there)
+        (void)set(c, t->id, time);
+    if (sets_gain && g->is_there)
+        (void)set(c, g->id, gain);
 }

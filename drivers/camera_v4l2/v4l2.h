@@ -34,6 +34,7 @@ typedef struct pf_v4l2_buffer {
 
 typedef struct pf_v4l2_control {
     bool is_there;
+    bool is_manual; /* the camera's own automatics of it have been switched off */
     uint32_t id;
 } pf_v4l2_control;
 
@@ -48,7 +49,6 @@ typedef struct pf_v4l2 {
     pf_v4l2_buffer buffer[PF_SESSION_BUFFERS_MAX];
     pf_v4l2_buffer kept[PF_CAMERA_HELD_MAX]; /* of devices that were closed, our own memory by now */
     pf_v4l2_control time_control, gain_control;
-    bool is_manual;      /* its own automatics have been switched off */
     pf_failure *failure; /* of the call that is under way */
 } pf_v4l2;
 
@@ -59,7 +59,7 @@ pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const 
  * picture to give yet. */
 pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_info *info);
 
-/* controls.c: finds the controls of a negotiated device, and sets them; is_automatic: hands them to the camera. */
+/* controls.c: finds the controls of a negotiated device, and sets them as a session's set(). */
 void pf_v4l2_controls_find(pf_v4l2 *c, pf_session_info *info);
 void pf_v4l2_controls_set(pf_v4l2 *c, bool is_automatic, int64_t time, int64_t gain);
 

@@ -461,6 +461,40 @@ static void test_exposure_settles(void)
     TEST_ASSERT_NOT_NULL(strstr(error, "exposure"));
 }
 
+/* Proves: what is fixed without a value is neither set nor told, so that it stays as another program sets it, and the
+ * longest exposure of the automatics binds neither it nor a fixed one. */
+static void test_fixed_without_a_value_is_left_alone(void)
+{
+    static const struct {
+        uint32_t exposure_us;
+        double gain;
+        int64_t time_set, gain_set;
+    } cases[] = {{8000, 0, 8000, PF_SESSION_AS_IS}, {0, 2, PF_SESSION_AS_IS, 128}, {8000, 2, 8000, 128}};
+    pf_camera_config fixed = plain;
+    fixed.mode = PF_EXPOSURE_FIXED;
+    fixed.exposure_max_us = 500; /* less than the camera's 1000 */
+    k.has_controls = true;
+    open_and_start(&fixed);
+    pf_frame f = next();
+    TEST_ASSERT_FALSE(k.was_set || f.telemetry.has_exposure || f.telemetry.has_gain);
+    release(&f);
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        camera.ops->close(camera.self);
+        setUp();
+        k.has_controls = true;
+        fixed.exposure_us = cases[i].exposure_us;
+        fixed.gain = cases[i].gain;
+        open_and_start(&fixed);
+        f = next();
+        TEST_ASSERT_TRUE(k.was_set && !k.is_automatic);
+        TEST_ASSERT_EQUAL_INT64(cases[i].time_set, k.time);
+        TEST_ASSERT_EQUAL_INT64(cases[i].gain_set, k.gain);
+        TEST_ASSERT_EQUAL_INT(cases[i].exposure_us > 0, f.telemetry.has_exposure);
+        TEST_ASSERT_EQUAL_INT(cases[i].gain > 0, f.telemetry.has_gain);
+        release(&f);
+    }
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -471,5 +505,6 @@ int main(void)
     RUN_TEST(test_opening_without_a_camera);
     RUN_TEST(test_colours_become_grey);
     RUN_TEST(test_exposure_settles);
+    RUN_TEST(test_fixed_without_a_value_is_left_alone);
     return UNITY_END();
 }

@@ -564,16 +564,19 @@ static void test_another_camera_under_the_same_name_is_not_taken(void)
     release(&frame);
 }
 
-/* Proves: a camera whose automatics one run has switched off has them again in the next that leaves them to it. */
+/* Proves: a camera whose automatics one run has switched off has them again in the next that leaves them to it, and
+ * keeps them in one that sets nothing. */
 static void test_exposure_is_given_back_to_the_camera(void)
 {
-    static const pf_exposure_mode modes[] = {PF_EXPOSURE_AUTO, PF_EXPOSURE_DEVICE, PF_EXPOSURE_HOLD,
-                                             PF_EXPOSURE_DEVICE};
-    for (size_t i = 0; i < 4; i++) {
+    static const pf_exposure_mode modes[] = {PF_EXPOSURE_AUTO, PF_EXPOSURE_DEVICE, PF_EXPOSURE_HOLD, PF_EXPOSURE_DEVICE,
+                                             PF_EXPOSURE_FIXED};
+    for (size_t i = 0; i < 5; i++) {
         const pf_camera_config config = {.device = "/dev/video0", .mode = modes[i]};
         TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, pf_v4l2_open_with(&camera, &config, &io, error, sizeof error), error);
         close_camera();
-        TEST_ASSERT_EQUAL_INT32(i % 2 ? V4L2_EXPOSURE_APERTURE_PRIORITY : V4L2_EXPOSURE_MANUAL, k.exposure_auto);
+        /* The last, fixed with zeros, changes nothing. */
+        TEST_ASSERT_EQUAL_INT32(i % 2 || i == 4 ? V4L2_EXPOSURE_APERTURE_PRIORITY : V4L2_EXPOSURE_MANUAL,
+                                k.exposure_auto);
     }
 }
 

@@ -10,7 +10,7 @@
 typedef struct fake_control {
     uint32_t id;
     int64_t min, max, value;
-    uint32_t flags;
+    uint32_t flags, refusals; /* so many of the next writes it does not take */
 } fake_control;
 
 enum { CONTROLS = 8, WRITES = 32 };
@@ -53,6 +53,9 @@ static int write_control(const struct v4l2_control *v)
     TEST_ASSERT_TRUE(n_writes < WRITES);
     writes[n_writes].id = v->id;
     writes[n_writes++].value = v->value;
+    errno = EBUSY;
+    if (c->refusals > 0 && c->refusals--)
+        return -1;
     errno = ERANGE;
     if (v->value < c->min || v->value > c->max)
         return -1;
@@ -85,7 +88,7 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
 
 static void have(uint32_t id, int64_t min, int64_t max, int64_t value)
 {
-    controls[n_controls++] = (fake_control){id, min, max, value, 0};
+    controls[n_controls++] = (fake_control){id, min, max, value, 0, 0};
 }
 
 static void look(void)
@@ -207,6 +210,46 @@ static void test_automatics_go_off_once_and_on_when_asked(void)
     TEST_ASSERT_EQUAL_UINT32(4, n_writes);
 }
 
+static void test_automatics_that_did_not_go_off_are_asked_again(void)
+{
+    have(V4L2_CID_EXPOSURE_ABSOLUTE, 1, 5000, 100);
+    have(V4L2_CID_GAIN, 0, 255, 1);
+    have(V4L2_CID_EXPOSURE_AUTO, 0, 3, V4L2_EXPOSURE_AUTO);
+    have(V4L2_CID_AUTOGAIN, 0, 1, 1);
+    look();
+    find(V4L2_CID_EXPOSURE_AUTO)->refusals = 2;
+    find(V4L2_CID_AUTOGAIN)->refusals = 1;
+    for (int i = 0; i < 3; i++) {
+        TEST_ASSERT_EQUAL_INT64(V4L2_EXPOSURE_AUTO, find(V4L2_CID_EXPOSURE_AUTO)->value);
+        TEST_ASSERT_EQUAL_INT64(i < 2, find(V4L2_CID_AUTOGAIN)->value);
+        n_writes = 0;
+        pf_v4l2_controls_set(&camera, false, 200, 9);
+    }
+    TEST_ASSERT_EQUAL_INT64(V4L2_EXPOSURE_MANUAL, find(V4L2_CID_EXPOSURE_AUTO)->value);
+    n_writes = 0;
+    pf_v4l2_controls_set(&camera, false, 300, 9); /* no priority to set: one that is not there is not asked again */
+    expect_writes((const int32_t[][2]){{V4L2_CID_EXPOSURE_ABSOLUTE, 300}, {V4L2_CID_GAIN, 9}}, 2);
+}
+
+static void test_what_is_to_stay_keeps_its_automatics(void)
+{
+    have(V4L2_CID_EXPOSURE_ABSOLUTE, 1, 5000, 100);
+    have(V4L2_CID_GAIN, 0, 255, 1);
+    have(V4L2_CID_EXPOSURE_AUTO, 0, 3, V4L2_EXPOSURE_AUTO);
+    have(V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0, 1, 1);
+    have(V4L2_CID_AUTOGAIN, 0, 1, 1);
+    look();
+    pf_v4l2_controls_set(&camera, false, PF_SESSION_AS_IS, PF_SESSION_AS_IS);
+    TEST_ASSERT_EQUAL_UINT32(0, n_writes);
+    pf_v4l2_controls_set(&camera, false, PF_SESSION_AS_IS, 9);
+    expect_writes((const int32_t[][2]){{V4L2_CID_AUTOGAIN, 0}, {V4L2_CID_GAIN, 9}}, 2);
+    pf_v4l2_controls_set(&camera, false, 200, PF_SESSION_AS_IS);
+    expect_writes((const int32_t[][2]){{V4L2_CID_EXPOSURE_AUTO, V4L2_EXPOSURE_MANUAL},
+                                       {V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0},
+                                       {V4L2_CID_EXPOSURE_ABSOLUTE, 200}},
+                  3);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -215,5 +258,7 @@ int main(void)
     RUN_TEST(test_analogue_gain_comes_before_digital);
     RUN_TEST(test_what_cannot_be_set_is_no_control);
     RUN_TEST(test_automatics_go_off_once_and_on_when_asked);
+    RUN_TEST(test_automatics_that_did_not_go_off_are_asked_again);
+    RUN_TEST(test_what_is_to_stay_keeps_its_automatics);
     return UNITY_END();
 }
