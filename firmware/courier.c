@@ -47,17 +47,17 @@ struct pf_courier {
 };
 
 /* Bytes come too fast for this machine: the link sends again what they were part of, and somebody should know. */
-static void tell_overruns(pf_courier *c, uint64_t now)
+static uint32_t tell_overruns(pf_courier *c, uint64_t now)
 {
     const pf_transport *t = &c->daemon->transport;
     const uint32_t overruns = t->ops->overruns != NULL ? t->ops->overruns(t->self) : 0;
     if (overruns != c->overruns && now >= c->overruns_due) {
-        pf_log(PF_LOG_WARNING, "%s: overrun: %u bytes dropped so far before they could be read", t->ops->name(t->self),
-               overruns);
+        pf_log(PF_LOG_WARNING, "%s: overrun: at least %u bytes dropped so far before they could be read",
+               t->ops->name(t->self), overruns);
         c->overruns = overruns;
         c->overruns_due = now + OVERRUNS_NS;
     }
-    c->daemon->counters.overruns = overruns;
+    return overruns;
 }
 
 static void publish(pf_courier *c, uint64_t now)
@@ -67,6 +67,7 @@ static void publish(pf_courier *c, uint64_t now)
     const pf_transport_stats *network;
     const char *name;
     pf_role role = t->ops->peer(t->self, &name, &network);
+    const uint32_t overruns = tell_overruns(c, now); /* without the mutex: the log may wait, and frames for the mutex */
     pthread_mutex_lock(&k->mutex);
     k->has_network = network != NULL;
     if (network != NULL) {
@@ -76,7 +77,7 @@ static void publish(pf_courier *c, uint64_t now)
     }
     k->link_up = pf_link_is_up(c->host.link);
     k->link = *pf_link_get_stats(c->host.link);
-    tell_overruns(c, now);
+    k->overruns = overruns;
     k->visitors = 0;
     for (uint32_t i = 0; i < PF_VISITORS_MAX; i++)
         k->visitors += c->visitors[i].session.transport.ops != NULL;

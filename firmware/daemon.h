@@ -44,7 +44,7 @@ typedef struct pf_counters {
     bool link_up;
     pf_link_stats link;
     uint32_t visitors; /* hosts that look on */
-    uint32_t overruns; /* bytes that the line dropped before anybody read them */
+    uint32_t overruns; /* bytes, at least, that the line dropped before anybody read them */
     bool has_clock;
     pf_msg_clock_sync clock;
     bool has_network; /* the transport refuses whom it does not know */

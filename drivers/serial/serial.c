@@ -31,7 +31,8 @@ typedef struct serial {
     int fd; /* -1 = not there now */
     bool fresh;
     bool is_pty;
-    uint32_t overruns, counted; /* bytes that came and were dropped; the kernel's count of them when last asked */
+    uint32_t overruns, counted; /* bytes that came and were dropped; the kernel's count of them when last it told */
+    bool has_counted;           /* it has told since the device was opened */
     /* What a pty's line would still have to send; a real device is asked. */
     double pty_queue;
     uint64_t pty_time_ns;
@@ -113,12 +114,16 @@ static pf_status configure(serial *s, int fd)
     return PF_OK;
 }
 
-/* Bytes that the kernel knows were dropped before anybody read them: by the device, its FIFO full, or for want of room
- * in the terminal's buffer. It counts from the device's first start on. 0 for a driver that does not count. */
-static uint32_t count_dropped(int fd)
+/* Bytes that the kernel knows were dropped before anybody read them: by the device, its FIFO full (one is counted for
+ * each time), or for want of room in the terminal's buffer. It counts from the device's first start on. False: it does
+ * not tell. */
+static bool count_dropped(int fd, uint32_t *n)
 {
     struct serial_icounter_struct c;
-    return ioctl(fd, TIOCGICOUNT, &c) == 0 ? (uint32_t)c.overrun + (uint32_t)c.buf_overrun : 0;
+    if (ioctl(fd, TIOCGICOUNT, &c) != 0)
+        return false;
+    *n = (uint32_t)c.overrun + (uint32_t)c.buf_overrun;
+    return true;
 }
 
 /* *is_absent: nothing is plugged in under this path. */
@@ -135,7 +140,7 @@ static pf_status open_device(serial *s, bool *is_absent)
     }
     s->fd = fd;
     s->fresh = true;
-    s->counted = count_dropped(fd);
+    s->has_counted = count_dropped(fd, &s->counted);
     s->pty_queue = 0;
     s->pty_time_ns = pf_now();
     return PF_OK;
@@ -252,10 +257,11 @@ static pf_role serial_peer(void *self, const char **name, const pf_transport_sta
 static uint32_t serial_overruns(void *self)
 {
     serial *s = self;
-    if (s->fd >= 0) {
-        const uint32_t now = count_dropped(s->fd);
-        s->overruns += now - s->counted;
+    uint32_t now;
+    if (s->fd >= 0 && count_dropped(s->fd, &now)) {
+        s->overruns += s->has_counted ? now - s->counted : 0;
         s->counted = now;
+        s->has_counted = true;
     }
     return s->overruns;
 }

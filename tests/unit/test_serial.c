@@ -5,8 +5,12 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <limits.h>
+#include <linux/serial.h>
 #include <poll.h>
 #include <signal.h>
+#include <stdarg.h>
+#include <sys/ioctl.h>
 #include <sys/wait.h>
 #include <termios.h>
 #include <time.h>
@@ -425,6 +429,58 @@ static void test_cable_is_cut_and_comes_back(void)
     TEST_ASSERT_TRUE(number_in(stop_cable(), "cuts") >= 1);
 }
 
+/* ---- the kernel's count of what was dropped, made up here: a pseudo-terminal has none */
+
+static struct {
+    bool tells;
+    int fifo, room; /* it counts the two apart */
+} dropped;
+
+int __real_ioctl(int fd, unsigned long request, ...);
+int __wrap_ioctl(int fd, unsigned long request, ...);
+
+int __wrap_ioctl(int fd, unsigned long request, ...)
+{
+    va_list arguments;
+    va_start(arguments, request);
+    void *argument = va_arg(arguments, void *);
+    va_end(arguments);
+    if (request != TIOCGICOUNT || !dropped.tells)
+        return __real_ioctl(fd, request, argument);
+    *(struct serial_icounter_struct *)argument =
+        (struct serial_icounter_struct){.overrun = dropped.fifo, .buf_overrun = dropped.room};
+    return 0;
+}
+
+static uint32_t overruns(void)
+{
+    return line.ops->overruns(line.self);
+}
+
+/* Proves: only what was dropped since the device was opened counts, over the end of the kernel's counter, and a kernel
+ * that does not tell, at first or for a while, changes nothing. */
+static void test_dropped_bytes_are_counted_while_the_kernel_tells(void)
+{
+    for (int tells_first = 0; tells_first < 2; tells_first++) {
+        dropped.tells = tells_first;
+        dropped.fifo = INT_MAX;
+        dropped.room = INT_MAX;
+        open_line(&line, make_pty(), 115200);
+        TEST_ASSERT_EQUAL_UINT32(0, overruns());
+        dropped.tells = true;
+        TEST_ASSERT_EQUAL_UINT32(0, overruns()); /* what came before */
+        dropped.fifo = INT_MIN + 4;
+        TEST_ASSERT_EQUAL_UINT32(5, overruns());
+        dropped.tells = false;
+        TEST_ASSERT_EQUAL_UINT32(5, overruns());
+        dropped.tells = true;
+        dropped.room = INT_MIN + 1;
+        TEST_ASSERT_EQUAL_UINT32(7, overruns());
+        dropped.tells = false;
+        close_all();
+    }
+}
+
 int main(void)
 {
     temporary_make();
@@ -435,6 +491,7 @@ int main(void)
     RUN_TEST(test_flow_control_is_set_as_asked);
     RUN_TEST(test_full_pty_does_not_block);
     RUN_TEST(test_wrong_devices_are_refused);
+    RUN_TEST(test_dropped_bytes_are_counted_while_the_kernel_tells);
     RUN_TEST(test_clean_cable);
     RUN_TEST(test_cable_faults_are_seeded_and_counted);
     RUN_TEST(test_cable_damages_frames);

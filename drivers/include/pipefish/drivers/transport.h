@@ -60,8 +60,8 @@ typedef struct pf_transport_ops {
      * accepts nobody, PF_ERR_CLOSED: it is over. False: nobody new. NULL: a line that has room for one. */
     bool (*visitor)(void *self, struct pf_transport *visitor);
 
-    /* Bytes that came since it was opened and were dropped before read() could have them, as far as the kernel knows.
-     * NULL: a stream that loses none. */
+    /* Bytes, at least so many, that came since it was opened and were dropped before read() could have them, as far as
+     * the kernel knows. NULL: a stream that loses none. */
     uint32_t (*overruns)(void *self);
 
     const char *(*name)(void *self);  /* "serial /dev/ttyS0 3000000", "tcp 127.0.0.1:7447" */
