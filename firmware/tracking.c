@@ -271,7 +271,7 @@ static void expect(pf_tracking *p, const pf_motion_hints *hints)
 static void look_ahead(pf_tracking *p, const pf_motion_hints *hints)
 {
     const uint64_t counts = hints->has_encoder ? pf_keyframe_third(&p->choice_state, &p->choice, hints->encoder) : 0;
-    const int64_t way = pf_predictor_way(&p->predictor, counts);
+    const int64_t way = pf_predictor_way(&p->predictor, hints, counts);
     int64_t axis[4];
     pf_tracker_foresee(p->tracker, way > 0 ? way : PF_WAY_USUAL, pf_wall_axis_of(&p->wall, axis) ? axis : NULL);
 }

@@ -8,7 +8,6 @@
 #define YOUNG        2u  /* frames: noise of the sensor gives corners by the hundred, none of which lives so long */
 #define WAIT_MOST    64u /* frames between keyframes for want of common tracks, where the reference was poor */
 #define STATE_FRAMES 30u /* another state than the last keyframe's is a keyframe when it has lasted so long */
-#define LEAP         ((uint64_t)1 << 24) /* counts a frame: more is no reading */
 
 #define BLIND (PF_SCENE_DARK | PF_SCENE_COVERED | PF_SCENE_WEAK_TEXTURE)
 
@@ -175,7 +174,9 @@ uint64_t pf_keyframe_third(const pf_keyframe_state *state, const pf_keyframe_con
     if (!state->started || !state->have_encoder || !state->had_encoder || config->step_counts == 0)
         return 0;
     const uint64_t driven = counts_between(encoder, state->encoder), step = config->step_counts;
-    const uint64_t moved = counts_between(encoder, state->encoder_before), frame = moved < LEAP ? moved : LEAP;
+    const uint64_t frame = counts_between(encoder, state->encoder_before);
+    if (frame > PF_COUNTS_MOST)
+        return 0;
     const uint32_t apart = or_default(config->min_interval, 2), since = state->frames_since + 1u;
     return in_whole_frames(driven < step ? step - driven : 0, frame, since < apart ? apart - since : 0) +
            2u * in_whole_frames(step, frame, apart);

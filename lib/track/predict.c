@@ -89,12 +89,6 @@ void pf_predictor_assume(pf_predictor *p, int32_t radii_per_count_q27)
     p->has_per_count = true;
 }
 
-int64_t pf_predictor_way(const pf_predictor *p, uint64_t counts)
-{
-    const int64_t each = p->has_per_count ? pf_clamp_i64(p->per_count_q30, INT32_MAX) : 0;
-    return (int64_t)(counts < 1u << 24 ? counts : 1u << 24) * (each < 0 ? -each : each) >> 6;
-}
-
 /* Moves a ray to the cotangent `cot`. */
 static pf_ray_q30 with_cotangent(const pf_ray_q30 *v, int64_t cot)
 {
@@ -114,11 +108,20 @@ static int32_t frames_of(const pf_motion_hints *h)
 static bool counted(const pf_predictor *p, const pf_motion_hints *next, int64_t *step)
 {
     *step = (int64_t)((uint64_t)next->encoder - (uint64_t)p->last.encoder);
-    if (!p->last.has_encoder || !next->has_encoder || *step > 1 << 24 || *step < -(1 << 24))
+    if (!p->last.has_encoder || !next->has_encoder || *step > PF_COUNTS_MOST || *step < -PF_COUNTS_MOST)
         return false;
     const int64_t fall = (pf_clamp_i64(p->per_count_q30, INT32_MAX) * *step) >> 14;
     const int64_t most = (int64_t)LEAP * frames_of(next);
     return !p->has_per_count || (fall <= most && fall >= -most);
+}
+
+int64_t pf_predictor_way(const pf_predictor *p, const pf_motion_hints *next, uint64_t counts)
+{
+    const int64_t each = p->has_per_count ? pf_clamp_i64(p->per_count_q30, INT32_MAX) : 0;
+    int64_t step;
+    if (!counted(p, next, &step))
+        return 0;
+    return (int64_t)(counts < PF_COUNTS_MOST ? counts : PF_COUNTS_MOST) * (each < 0 ? -each : each) >> 6;
 }
 
 /* The common fall until the next frame. */

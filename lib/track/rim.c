@@ -82,7 +82,7 @@ void pf_tracker_foresee(pf_tracker *tracker, int64_t way_q24, const int64_t axis
 {
     tracker->way_q24 = way_q24 < 0 ? 0 : way_q24 < PF_WAY_MOST ? way_q24 : PF_WAY_MOST;
     for (uint32_t i = 0; i < 4u; i++)
-        tracker->axis[i] = axis ? axis[i] : 0;
+        tracker->axis[i] = axis ? pf_clamp_i64(axis[i], PF_TUBE_FARTHEST) : 0;
 }
 
 void pf_rim_set(pf_tracker *t)

@@ -17,6 +17,8 @@
 #define GAIN_MAX  (GAIN_ONE * 8)
 #define WARP_MOST (4 << 16) /* no entry of a warp is larger */
 
+#define PF_COUNTS_MOST (1 << 24) /* encoder counts a frame: more is no reading */
+
 /* Parameters and scratch of the aligners; one a tracker. Patches are window rows of PATCH_ROW. */
 typedef struct pf_klt {
     pf_track_lens lens;
@@ -143,6 +145,8 @@ typedef struct pf_bow {
 bool pf_bow_between(const pf_track_lens *lens, int32_t half, int32_t x, int32_t y, pf_point_q16 to, pf_bow *bow);
 
 /* --- the tube (wall.c) --- */
+
+#define PF_TUBE_FARTHEST ((1 << 24) * 6 / 10) /* off the axis: no camera stands nearer to the wall */
 
 /* A round tube of radius 1 whose axis runs through (o0, o1) + z (o2, o3) in the camera's frame, at most 0.6 off it. All
  * Q24. Distance from the camera's z axis of the wall in the direction (c, s) at z; */

@@ -130,7 +130,6 @@ pf_status pf_tracker_init(pf_tracker **tracker, const pf_tracker_config *config,
     t->klt.lens = c.lens;
     t->klt.circle = c.circle;
     t->klt.radius_q16 = (int32_t)c.circle_radius_q16;
-    pf_tracker_foresee(t, PF_WAY_USUAL, NULL);
     pf_mask_init(t, c.mask);
     t->config.mask = NULL;
     pf_tracker_reset(t);
@@ -145,6 +144,7 @@ void pf_tracker_reset(pf_tracker *tracker)
     tracker->stats = (pf_tracker_stats){0};
     tracker->frame = 0;
     tracker->drift_q16 = UINT32_MAX;
+    pf_tracker_foresee(tracker, PF_WAY_USUAL, NULL);
     tracker->spare_n = tracker->config.max_tracks;
     for (uint32_t i = 0; i < tracker->spare_n; i++)
         tracker->spare[i] = (uint16_t)(tracker->spare_n - 1u - i);

@@ -14,33 +14,32 @@
 
 _Static_assert(sizeof(pf_track) == 40, "what a track is settled by takes none of the memory");
 
-#define ONE      ((int64_t)1 << 24)
-#define UNKNOWN  10 /* w 0..2, t 3..5, o 6..9 */
-#define AXIS     6  /* the first of the axis */
-#define STEPS    4
-#define LEAST    12u                     /* tracks, for a fit */
-#define MOST     96u                     /* more tell no more */
-#define STEEP    ((int64_t)1 << 28)      /* Q30: sine of the polar angle below which the cotangent says nothing */
-#define NOISE    (ONE / 5000)            /* rad: 0.05 px where a pixel is 4 mrad */
-#define TURN     (ONE / 50)              /* rad a frame, expected */
-#define ASIDE    20                      /* a part of the way: how far the camera strays from the tube's direction */
-#define OFFSET   (ONE / 5)               /* of the radius, at the beginning */
-#define TILT     (ONE / 25)              /* rad */
-#define STRIDE   ((int32_t)ONE / 16)     /* of the axis, a step: as far as it is linear */
-#define FARTHEST ((int32_t)ONE * 6 / 10) /* no camera stands nearer to the wall */
-#define PRIOR    ((int64_t)1 << 37)      /* no prior is stronger: times what v may be off, 62 bits */
-#define FAINTLY  ((int64_t)1 << 10)      /* a pivot, Q30 */
-#define FADE     3                       /* tenths of a radius: on the way what is known of the axis fades to a third */
-#define ALIKE    4          /* strides in which the same tracks err alike: each adds such a part of what it says */
-#define WELL     (ONE / 32) /* of the radius: so well its place is known, once it is */
-#define AFAR     (ONE / 12) /* of the radius: a stride */
-#define RIM      (ONE / 4) /* a cotangent, of 76 degrees: beyond it the light moves most, and a track counts a quarter */
-#define TURNED   (ONE / 16) /* rad: with so much of a turn it ends too: its third power, 0.01 px, is left out */
-#define OFTEN    3          /* times the median: where the tube is none, all walk off */
-#define AGED     ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
-#define LIGHT    (ONE * 18 / 10000)  /* of a fall: the median of 0.27 % */
-#define GLANCE   4
-#define BESIDE   7u /* neighbours of whom it is asked whether they walk off alike */
+#define ONE     ((int64_t)1 << 24)
+#define UNKNOWN 10 /* w 0..2, t 3..5, o 6..9 */
+#define AXIS    6  /* the first of the axis */
+#define STEPS   4
+#define LEAST   12u                 /* tracks, for a fit */
+#define MOST    96u                 /* more tell no more */
+#define STEEP   ((int64_t)1 << 28)  /* Q30: sine of the polar angle below which the cotangent says nothing */
+#define NOISE   (ONE / 5000)        /* rad: 0.05 px where a pixel is 4 mrad */
+#define TURN    (ONE / 50)          /* rad a frame, expected */
+#define ASIDE   20                  /* a part of the way: how far the camera strays from the tube's direction */
+#define OFFSET  (ONE / 5)           /* of the radius, at the beginning */
+#define TILT    (ONE / 25)          /* rad */
+#define STRIDE  ((int32_t)ONE / 16) /* of the axis, a step: as far as it is linear */
+#define PRIOR   ((int64_t)1 << 37)  /* no prior is stronger: times what v may be off, 62 bits */
+#define FAINTLY ((int64_t)1 << 10)  /* a pivot, Q30 */
+#define FADE    3                   /* tenths of a radius: on the way what is known of the axis fades to a third */
+#define ALIKE   4          /* strides in which the same tracks err alike: each adds such a part of what it says */
+#define WELL    (ONE / 32) /* of the radius: so well its place is known, once it is */
+#define AFAR    (ONE / 12) /* of the radius: a stride */
+#define RIM     (ONE / 4) /* a cotangent, of 76 degrees: beyond it the light moves most, and a track counts a quarter */
+#define TURNED  (ONE / 16)          /* rad: with so much of a turn it ends too: its third power, 0.01 px, is left out */
+#define OFTEN   3                   /* times the median: where the tube is none, all walk off */
+#define AGED    ((int32_t)ONE / 20) /* a fall of the cotangent from which there is something to share */
+#define LIGHT   (ONE * 18 / 10000)  /* of a fall: the median of 0.27 % */
+#define GLANCE  4
+#define BESIDE  7u /* neighbours of whom it is asked whether they walk off alike */
 
 typedef struct pf_pair {
     int64_t c, s, cot;                /* of the ray before: azimuth and cotangent */
@@ -270,7 +269,7 @@ static void fit_motion(pf_wall *wall, const pf_pair *pair, uint32_t n, int64_t v
         solve(a, g, x, axis);
         for (int32_t k = 0; k < UNKNOWN; k++)
             v[k] = k < AXIS ? pf_clamp_i64(v[k] + x[k], (int32_t)ONE)
-                            : pf_clamp_i64(v[k] + pf_clamp_i64(x[k], STRIDE), FARTHEST);
+                            : pf_clamp_i64(v[k] + pf_clamp_i64(x[k], STRIDE), PF_TUBE_FARTHEST);
     }
     const int64_t way = v[5] < 0 ? -v[5] : v[5], fades = 10 * way / FADE;
     const int64_t keep = fades < ONE / 2 ? ONE - fades : ONE / 2;

@@ -185,7 +185,7 @@ static bool golden_replay(uint32_t frames, golden *out)
         }
         int64_t axis[4];
         const uint64_t third = hints.has_encoder ? pf_keyframe_third(&keyframes, &choice, hints.encoder) : 0;
-        const int64_t way = pf_predictor_way(&predictor, third);
+        const int64_t way = pf_predictor_way(&predictor, &hints, third);
         const bool is_known = pf_wall_axis_of(&wall, axis);
         out->crc = hash_u32(out->crc, (uint32_t)way);
         pf_tracker_foresee(tracker, way > 0 ? way : PF_WAY_USUAL, is_known ? axis : NULL);

@@ -95,6 +95,7 @@ static void test_the_third_keyframe_is_foreseen(void)
         }
     }
     TEST_ASSERT_EQUAL_UINT64(0, pf_keyframe_third(&state, &config, 5000));
+    TEST_ASSERT_EQUAL_UINT64(0, pf_keyframe_third(&state, &c, INT64_MAX)); /* no drive goes so far */
 }
 
 /* Proves: rotation alone is no parallax, about any axis and up to 15 degrees; it is compensated, not just ignored. */

@@ -127,22 +127,32 @@ static void test_driving_is_predicted_through_rays(void)
 }
 
 /* Proves: what an encoder count means in radii is learned, to 3 %, whichever way the encoder counts; before, and
- * without one, nothing is said. */
+ * without one, nothing is said; nor after a leap, which is no reading to foresee by, or of a frame without one. */
 static void test_a_count_is_so_many_radii(void)
 {
     const uint64_t radius = (uint64_t)lround(TUBE_RADIUS * 20); /* counts, as hints_of has them */
     for (int way = -1; way <= 1; way++) {
         setUp();
-        TEST_ASSERT_EQUAL_INT64(0, pf_predictor_way(&predictor, radius));
+        pf_motion_hints now = hints_of(&view, true);
+        TEST_ASSERT_EQUAL_INT64(0, pf_predictor_way(&predictor, &now, radius));
         for (int i = 0; i < 16; i++) {
             view.z += way < 0 ? -4 : 4;
             feed(true, way != 0);
         }
-        const int64_t said = pf_predictor_way(&predictor, radius);
+        now = hints_of(&view, true);
+        const int64_t said = pf_predictor_way(&predictor, &now, radius);
         TEST_ASSERT_INT64_WITHIN(way ? (1 << 24) / 33 : 0, way ? 1 << 24 : 0, said);
     }
     pf_predictor_assume(&predictor, -(1 << 20)); /* -1/128 of a radius */
-    TEST_ASSERT_EQUAL_INT64((1 << 24) / 128 * 10, pf_predictor_way(&predictor, 10));
+    pf_motion_hints next = hints_of(&view, true);
+    for (int i = 0; i < 3; i++, next.encoder += 256) /* four radii are no leap yet */
+        TEST_ASSERT_EQUAL_INT64((1 << 24) / 128 * 10, pf_predictor_way(&predictor, &next, 10));
+    next.encoder = hints_of(&view, true).encoder - 513;
+    TEST_ASSERT_EQUAL_INT64(0, pf_predictor_way(&predictor, &next, 10));
+    next.frames = 2; /* one was dropped */
+    TEST_ASSERT_EQUAL_INT64((1 << 24) / 128 * 10, pf_predictor_way(&predictor, &next, 10));
+    next.has_encoder = false;
+    TEST_ASSERT_EQUAL_INT64(0, pf_predictor_way(&predictor, &next, 10));
 }
 
 /* Proves: a steady roll is predicted from the pictures, a sudden one from the inclinometer. */

@@ -20,10 +20,13 @@ static const pf_camera_rays *table;
 static uint32_t height; /* of the picture: rows above and below are cut off, alike */
 static double axis[2];  /* where the tube's is beside the camera's, which it is parallel to */
 
+static bool breaks, is_absurd; /* once it was foreseen: all is forgotten; the axis told is none */
+
 void setUp(void)
 {
     height = SIDE;
     axis[0] = axis[1] = 0;
+    breaks = is_absurd = false;
 }
 void tearDown(void) {}
 
@@ -92,6 +95,10 @@ static void drive(double way, bool knows_axis, uint32_t most, births *b)
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_tracker_init(&t, &config, workspace, sizeof workspace));
     if (way >= 0)
         pf_tracker_foresee(t, lrint(way * (1 << 24)), knows_axis ? q24 : NULL);
+    if (is_absurd)
+        pf_tracker_foresee(t, INT64_MAX, (const int64_t[]){INT64_MAX, INT64_MIN, INT64_MIN, INT64_MAX});
+    if (breaks)
+        pf_tracker_reset(t);
     b->n = 0;
     for (uint32_t k = 0; k < FRAMES; k++) {
         uint32_t n;
@@ -154,6 +161,19 @@ static void test_the_way_foreseen_decides(void)
     TEST_ASSERT_TRUE(farthest <= 7.0 / 8 * CIRCLE && farthest > 7.0 / 8 * CIRCLE - 8);
 }
 
+/* Proves: after a break what was foreseen before it is forgotten, however absurd; that itself does no harm. */
+static void test_a_break_forgets_what_was_foreseen(void)
+{
+    static births b;
+    is_absurd = true;
+    drive(1.2, false, 300, &b);
+    TEST_ASSERT_GREATER_THAN_UINT32(10, b.n);
+    breaks = true;
+    drive(1.2, false, 300, &b);
+    TEST_ASSERT_DOUBLE_WITHIN(0.06, 0.54, least_left(&b, 1, 0));
+    TEST_ASSERT_DOUBLE_WITHIN(0.06, 0.54, least_left(&b, -1, 0));
+}
+
 /* Proves: where the picture cuts the circle off, what counts is the way to the picture's border. */
 static void test_a_cut_off_circle_ends_where_the_picture_does(void)
 {
@@ -179,6 +199,7 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_nothing_begins_that_will_be_gone);
     RUN_TEST(test_the_way_foreseen_decides);
+    RUN_TEST(test_a_break_forgets_what_was_foreseen);
     RUN_TEST(test_a_cut_off_circle_ends_where_the_picture_does);
     RUN_TEST(test_few_tracks_begin_anywhere);
     return UNITY_END();

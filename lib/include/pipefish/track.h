@@ -170,8 +170,9 @@ pf_status pf_tracker_expect(pf_tracker *tracker, const pf_expected *expected, ui
 
 /* Says what is foreseen from the next frame on: what of a tube's wall will have left the picture when the camera has
  * driven on by `way_q24` radii, PF_WAY_MOST at most, is too late for new tracks to begin on, as long as the wall comes
- * out towards the rim and 12 tracks at least were found again. The tube's axis as of pf_wall_axis_of; NULL: the optical
- * axis. It holds until it is called again; before: PF_WAY_USUAL, NULL. Needs a lens and a circle. */
+ * out towards the rim and 12 tracks at least were found again. The tube's axis as of pf_wall_axis_of, each number
+ * 0.6 at most; NULL: the optical axis. It holds until it is called again, or pf_tracker_reset; before: PF_WAY_USUAL,
+ * NULL. Needs a lens and a circle. */
 void pf_tracker_foresee(pf_tracker *tracker, int64_t way_q24, const int64_t axis[4]);
 
 /* The table after the last frame: live tracks (max_tracks at most) and those lost in it (as many again at most), by
@@ -183,8 +184,8 @@ const pf_tracker_stats *pf_tracker_last_stats(const pf_tracker *tracker);
  * PF_TRACK_DRIFT. Rows beyond the table and tracks already lost are left as they are. */
 void pf_tracker_give_up(pf_tracker *tracker, const uint16_t *rows, uint32_t n);
 
-/* Forgets all tracks (a break in the video). Ids go on; none is reused. The parts found to stand still stay masked:
- * dirt on the lens outlives a break; what is gone is released as the picture moves on. */
+/* Forgets all tracks, and what was foreseen (a break in the video). Ids go on; none is reused. The parts found to stand
+ * still stay masked: dirt on the lens outlives a break; what is gone is released as the picture moves on. */
 void pf_tracker_reset(pf_tracker *tracker);
 
 /* Bearings: unit rays of track positions, from the table of rays. Items outside the image or the camera's domain get
@@ -242,8 +243,9 @@ void pf_predictor_learn(pf_predictor *predictor, const pf_track *tracks, const p
 void pf_predictor_guess(const pf_predictor *predictor, const pf_track *tracks, const pf_ray_q30 *rays, uint32_t n,
                         const pf_motion_hints *next, pf_ray_project project, const void *camera, pf_expected *expected);
 
-/* The way, Q24 radii, of so many encoder counts; 0: it is not known what a count means. */
-int64_t pf_predictor_way(const pf_predictor *predictor, uint64_t counts);
+/* The way, Q24 radii, of so many encoder counts that are foreseen as of the frame that comes with `next`; 0: it is not
+ * known what a count means, or there is no reading to foresee by: none, or a leap of over four radii a frame. */
+int64_t pf_predictor_way(const pf_predictor *predictor, const pf_motion_hints *next, uint64_t counts);
 
 /* --- The wall -----------------------------------------------------------------------------------------------------
  * Tracks that walk off it. In a light that goes with the camera, relief that shines along with the paint moves like a
@@ -301,8 +303,10 @@ uint32_t pf_wall_check(pf_wall *wall, const pf_track *tracks, const pf_ray_q30 *
  * instructions. */
 void pf_wall_settle(const pf_wall *wall, pf_track *tracks, uint32_t n, pf_ray_project project, const void *camera);
 
-/* Where the tube's axis is in the camera's frame, Q24 radii: through (axis[0], axis[1]) + z (axis[2], axis[3]). False,
- * and nothing written, where it is not known to a 32nd. */
+/* Where the tube's axis is, Q24 radii: through (axis[0], axis[1]) + z (axis[2], axis[3]) in the camera's frame as that
+ * was where the last stride began that could be fitted, a twelfth of a radius or one frame ago; longer where the tracks
+ * have been too few since. False, and nothing written, where the offsets, the first two, were not known to a 32nd then;
+ * of the slopes nothing is claimed. */
 bool pf_wall_axis_of(const pf_wall *wall, int64_t axis[4]);
 
 /* --- States of the scene --------------------------------------------------------------------------------------------
@@ -394,7 +398,7 @@ pf_keyframe_cause pf_keyframe_decide(pf_keyframe_state *state, const pf_keyframe
                                      uint32_t *common);
 
 /* Encoder counts from the frame that comes, of that reading, until the third keyframe from then on, itself included;
- * as it drives now, and where the encoder alone decides. 0: there are none to decide by. */
+ * as it drives now, and where the encoder alone decides. 0: there are none to decide by, or more than 2^24 a frame. */
 uint64_t pf_keyframe_third(const pf_keyframe_state *state, const pf_keyframe_config *config, int64_t encoder);
 
 #ifdef __cplusplus
