@@ -203,9 +203,11 @@ def check_soak(minutes: float) -> list[Row]:
     done = list(pieces("soak", DAEMON, SOAK // PIECE, minutes, run_soak))
     rows = [exactly("soak.frames", sum(p["frames"] for p in done), SOAK)]
     if done:
-        # The spool's page cache (2 MB at most) grows once when the host lags: what leaks grows in every piece.
+        # The spool's page cache (2 MB at most) grows once when the host lags, in some pieces: what leaks grows in all.
+        # The second least, for one lucky piece would hide a leak.
+        growth = sorted(p["growth_bytes_per_frame"] for p in done)[:2][-1]
         rows += [
-            at_most("soak.growth_bytes_per_frame", min(p["growth_bytes_per_frame"] for p in done), GROWTH_BYTES),
+            at_most("soak.growth_bytes_per_frame", growth, GROWTH_BYTES),
             at_most("soak.growth_kb_most", max(p["growth_kb"] for p in done), 2560),
             at_least("soak.fps", min(p["fps"] for p in done), RATE),
             exactly("soak.surveys_wrong", sum(p["wrong"] for p in done), 0),
