@@ -237,6 +237,7 @@ def check_profile(
     shutter: RollingShutter | None = None,
     sag_sigma: float = 0.0,
     common_errors: bool = False,
+    common_scale: float = 0.0,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
@@ -246,11 +247,15 @@ def check_profile(
                      a straight drive cannot
     budget           sigma of the diameter, relative, above which the answer is "cannot tell"
     noise            factor on the sigmas of the tracks, where they are wider than noise to keep something else at bay
+    common_scale     what errors that tracks have in common look like in a straight drive beside a known diameter: a
+                     factor on all angles, one sigma, that is no drift
 
     Raises ArgumentError.
     """
     if not noise > 0:
         raise ArgumentError(f"noise: {noise} is not above 0")
+    if not common_scale >= 0:
+        raise ArgumentError(f"common_scale: {common_scale} is below 0")
     if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
         raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
     if camera.radial != "generic":
@@ -282,19 +287,22 @@ def check_profile(
         return _nothing(budget, f"nothing was measured: {found.reason}")
     slope = _diameter_slope(camera, tracks, _wall_radius(found.drift[0]))
     evidence = "bends and turns of the drive"
-    known = diameter is not None and found.unit == "metre"
+    known, straight = diameter is not None and found.unit == "metre", _largest_turn(found) < TURN_LEAST
     if known:
-        seen, evidence, known = _with_diameter(found, adjusted, prior, slope, (diameter, diameter_sigma))
+        with_it = _with_diameter(found, adjusted, prior, slope, (diameter, diameter_sigma))
+        if isinstance(with_it, str):
+            return _nothing(budget, with_it, math.sqrt(slope @ prior @ slope))
+        seen, evidence, known = with_it
     else:
         seen = _together(found, np.zeros(len(FREE)), prior)
-    if not known and _largest_turn(found) < TURN_LEAST:
+    if not known and straight:
         return _nothing(
             budget,
             "the camera never panned, tilted or went round a bend; a known diameter beside the encoder "
             "would show a drift",
             math.sqrt(slope @ prior @ slope),
         )
-    return _judge(seen, camera, end, slope, budget, evidence)
+    return _judge(seen, camera, end, slope, budget, evidence, common_scale if straight else 0.0)
 
 
 @dataclass(frozen=True)
@@ -369,8 +377,9 @@ def _with_diameter(
     prior: Floats,
     slope: Floats,
     known: tuple[float, float],
-) -> tuple[_Seen, str, bool]:
-    """The known diameter and its sigma as one more measurement of the profile; whether one was measured beside it."""
+) -> tuple[_Seen, str, bool] | str:
+    """The known diameter and its sigma as one more measurement of the profile; whether one was measured beside it.
+    Why nothing can be told where the adjustments with it do not end."""
     about, spread = np.zeros(len(prior)), prior
     for turn in range(ROUNDS):
         seen, end = _together(found, about, spread), about + found.drift[0]["camera"]
@@ -380,14 +389,20 @@ def _with_diameter(
         value, variance = off[0] + slope @ end, off[1]
         seen = _Seen(seen.information + np.outer(slope, slope) / variance, seen.weighed + slope * value / variance)
         step = _inverse(seen.information + _inverse(prior)) @ seen.weighed - end
-        if abs(slope @ step) < NEAR or turn == ROUNDS - 1:
+        if abs(slope @ step) < NEAR:
+            return seen, "the encoder and the known diameter, bends and turns of the drive", True
+        if turn == ROUNDS - 1:
             break
         gain = prior @ slope / (slope @ prior @ slope + variance)
         again = adjusted(gain * value, prior - np.outer(gain, prior @ slope))
         if not again.drift or again.unit != "metre":
-            break
+            why = again.reason or "the encoder no longer tells the scale"
+            return f"with the known diameter there is no adjustment: {why}"
         found, about, spread = again, gain * value, prior - np.outer(gain, prior @ slope)
-    return seen, "the encoder and the known diameter, bends and turns of the drive", True
+    return (
+        f"the adjustment with the known diameter did not settle: after {ROUNDS} it still changed the diameter by "
+        f"{100 * abs(slope @ step):.2g} %"
+    )
 
 
 @dataclass(frozen=True)
@@ -443,9 +458,19 @@ def _limits(known: Floats) -> str:
     return text + (f" Of {' and '.join(hidden)} no change could be seen." if hidden else "")
 
 
-def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget: float, evidence: str) -> ProfileCheck:
-    scaled = _directions(camera, theta_end) * np.array(list(DRIFT.values()))  # in units of the drift's sigmas
-    own = _inverse(_own_covariance(camera, theta_end))
+def _judge(
+    seen: _Seen,
+    camera: Camera,
+    theta_end: float,
+    slope: Floats,
+    budget: float,
+    evidence: str,
+    common_scale: float = 0.0,
+) -> ProfileCheck:
+    ways = _directions(camera, theta_end)
+    scaled = ways * np.array(list(DRIFT.values()))  # in units of the drift's sigmas
+    feigned = common_scale**2 * np.outer(ways[:, 0], ways[:, 0])
+    own = _inverse(_own_covariance(camera, theta_end) + feigned)
     left = _inverse(seen.information + _inverse(_prior(camera, theta_end)))
     open_sigma = math.sqrt(max(0.0, slope @ left @ slope))
     # Of the drift, with the profile's own uncertainty as noise.
@@ -480,6 +505,11 @@ def _judge(seen: _Seen, camera: Camera, theta_end: float, slope: Floats, budget:
         text = f"The profile has drifted: {what}; {open_text}. Recalibrate the camera."
     else:
         verdict, text = VERDICTS["valid"], f"The profile is still valid: {open_text}, by {evidence}. {_limits(known)}"
+    if common_scale:
+        text += (
+            f" Errors that tracks have in common look like {100 * common_scale:.2g} % (one sigma) of the angle scale "
+            "in a straight drive, and count as noise."
+        )
     if camera.source == "selfcal":
         text += " It is self-calibrated: if from this survey, its agreeing proves nothing."
     changes = {name: change for cause in causes for name, change in cause.changes.items()}

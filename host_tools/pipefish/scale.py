@@ -240,7 +240,8 @@ def joints_estimate(
     """The scale by the joints that were found in one stretch, the tube in the structure's unit; None where they make no
     row. unit: the spacing in the structure's unit as far as it is known, None: neighbours in the row are one pipe
     apart."""
-    joints = [e for e in tube.events if e["kind"] == "joint"]
+    # A kink alone, without step or gap, is a turn of the axis as others: it makes no row of pipes.
+    joints = [e for e in tube.events if e["kind"] == "joint" and (e["gap"] is not None or e["step"] is not None)]
     s, sigma = np.array([e["s"] for e in joints]), np.array([e["s_sigma"] for e in joints])
     found = _pattern(s, sigma, unit) if len(s) > 1 else None
     if found is None:

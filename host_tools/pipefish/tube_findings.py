@@ -48,6 +48,7 @@ BEND_SHORTEST = 0.6  # shorter ones are kinks for all that can be told
 # A turn that short is two pipes at an angle in their joint, as far as joints go: of the bends that are made the least
 # turns by 11.25 degrees, and spigots leave their sockets before that.
 KINK_MOST = math.radians(11)
+SURE_KINK = 2.0  # of its own sigmas by which a turn has to be less than that
 # Of the whole turn, rms: one arc between straights is left by the tangent by 0.004 to 0.06 of it, an S that is
 # taken for one by 0.2 and more.
 BEND_UNEVEN = 0.1
@@ -297,7 +298,7 @@ def _bends(tube: Tube, common: Common) -> tuple[list[dict[str, Any]], list[dict[
             if arc.length > BEND_SHORTEST * d and arc.uneven < BEND_UNEVEN:
                 radius = arc.length / arc.angle
             relative = math.hypot(arc.length_sigma, ends) / arc.length
-            kink = arc.length <= BEND_SHORTEST * d and arc.angle < KINK_MOST
+            kink = arc.length <= BEND_SHORTEST * d and arc.angle + SURE_KINK * sigma < KINK_MOST
             (kinks if kink else found).append(
                 {
                     "kind": "bend",

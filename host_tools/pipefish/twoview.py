@@ -31,8 +31,6 @@ class TwoView:
     covariance       (6,6): rotation by a small turn on the left (rad), then direction (rank 2)
     sigma            robust spread of the inliers' distances: 1 = noise as stated
     median_parallax  of the inliers after rotation, radians
-    sextants         of six sectors around the direction of motion that hold inliers
-    off_axis         inliers more than 20 degrees from the direction of motion
     iterations       samples drawn
     """
 
@@ -43,8 +41,6 @@ class TwoView:
     covariance: npt.NDArray[np.float64]
     sigma: float
     median_parallax: float
-    sextants: int
-    off_axis: int
     iterations: int
 
     @property

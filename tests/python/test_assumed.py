@@ -12,6 +12,7 @@ import pipefish as pf
 from pipefish import _engine
 from pipefish.assumed import ASYMMETRY, RESIDUAL_PX, assumed
 from pipefish.camera import PARAMETERS
+from pipefish.measure import _residuals
 from pipefish.measuretruth import _places
 from pipefish.simulate import Scene
 from tube_tracks import fisheye, tube_drive
@@ -146,3 +147,19 @@ def test_a_station_is_compared_with_the_section_before_its_keyframe() -> None:
     grown[:, :, 3] = -np.einsum("nij,nj->ni", poses[:, :, :3], stretched)
     places = _places(scene, origin + 1.006 * (axis - origin), grown, stretched, frames)
     assert np.abs(places - s).max() < 0.002
+
+
+def test_a_pixels_noise_is_all_in_its_residual_whatever_the_sag() -> None:
+    """The sag is taken at the angles of adjusted points: by the pixel's own a part of its noise went into it."""
+    drive = tube_drive(11, 1.0, sigma=0.1)
+    rec = pf.reconstruct(drive.tracks, drive.camera, drive.driven, sigma=0.1, sag_sigma=100.0)
+    rec.sag[0] = np.array([80.0, 0.0, 0.0])
+    covariance = np.broadcast_to(0.01 * np.eye(2), (len(drive.tracks.pixels), 2, 2)).copy()
+    residual = []
+    for along in (0.0, 0.5):
+        pixels = drive.tracks.pixels.copy()
+        outwards = pixels - [drive.camera.c_u, drive.camera.c_v]
+        pixels += along * outwards / np.linalg.norm(outwards, axis=1)[:, None]
+        tracks = dataclasses.replace(drive.tracks, pixels=pixels, covariance=covariance)
+        residual.append(_residuals(tracks, rec, drive.camera).pixels)
+    assert np.linalg.norm(residual[1] - residual[0], axis=1) == pytest.approx(0.5, abs=1e-9)

@@ -5,6 +5,7 @@ Simulated drives, no rendered pipe; the target's pictures are drawn by this file
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 from pathlib import Path
@@ -139,6 +140,19 @@ def test_a_wrong_spacing_is_another_scale_and_multiples_are_known_by_the_encoder
     assert found.used == ("encoder",) and found.chi2 > 100
     half = joints_estimate(both.structure, 0, tube, Known(SPACING / 2, 0.0005), SPACING / 2)
     assert half is not None and abs(half.log) < 0.01
+
+
+def test_kinks_alone_are_no_joints_of_a_row(both):
+    """Turns of the axis that nothing but themselves shows: as joints they outvoted those that are there."""
+    tube = both.measured[0].tube
+    alone = joints_estimate(both.structure, 0, tube, Known(SPACING, 0.0005), SPACING)
+    kink = {"kind": "joint", "s_sigma": 0.01, "angle": 0.05, "step": None, "gap": None}
+    places = np.random.default_rng(2).uniform(0.2, 2.8, 2 * len(tube.events))
+    events = sorted([*tube.events, *({**kink, "s": s} for s in places)], key=lambda e: e["s"])
+    assert (
+        joints_estimate(both.structure, 0, dataclasses.replace(tube, events=events), Known(SPACING, 0.0005), SPACING)
+        == alone
+    )
 
 
 def test_joints_that_make_no_row_tell_nothing():

@@ -6,6 +6,7 @@ not radially symmetric.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -349,14 +350,15 @@ def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
         assert abs(value - size) < 3 * sigma < abs(size)
 
 
-def judged(drift: list[float], noise: float) -> health.ProfileCheck:
+def judged(drift: list[float], noise: float, common_scale: float = 0.0) -> health.ProfileCheck:
     """What is said of a survey that sees `drift` of DRIFT with sigmas of `noise` times DRIFT's, and nothing else."""
     camera, end = fisheye(100), 1.5
     ways = health._directions(camera, end) * np.array(list(health.DRIFT.values()))
     onto = np.linalg.pinv(ways / np.abs(ways).max(axis=1, keepdims=True).clip(1e-12))
     onto /= np.abs(ways).max(axis=1).clip(1e-12)
     information = onto.T @ onto / noise**2
-    return health._judge(health._Seen(information, information @ ways @ drift), camera, end, np.zeros(23), 1.0, "")
+    seen = health._Seen(information, information @ ways @ drift)
+    return health._judge(seen, camera, end, np.zeros(23), 1.0, "", common_scale)
 
 
 def test_a_change_that_is_named_is_that_of_one_cause_and_wider_by_what_it_leaves():
@@ -383,6 +385,44 @@ def test_a_valid_profile_is_told_with_what_would_have_shown():
     least = 4 * found.changes["angle scale"][1]
     assert f"angle scale by {least:.2g} %" in found.text and "no change" not in found.text
     assert "would have shown: none. Of angle scale and alpha and bend and centre u and centre v no change" in blind
+
+
+def test_what_tracks_have_in_common_is_no_drift_and_hides_as_much():
+    """0.7 % of the angle scale to +- 0.17 % was a drift in a straight drive whose profile was right."""
+    drift = [0.7 / 3, 0, 0, 0, 0]
+    assert judged(drift, 0.04).verdict == health.VERDICTS["drifted"]
+    found = judged(drift, 0.04, 0.0045)
+    _, sigma = found.changes["angle scale"]
+    assert found.verdict == health.VERDICTS["valid"]
+    assert sigma == pytest.approx(math.hypot(0.45, judged(drift, 0.04).changes["angle scale"][1]), rel=0.1)
+    assert f"angle scale by {4 * sigma:.2g} %" in found.text and "0.45 % (one sigma)" in found.text
+    assert judged([0, 0, 0, 0.3, 0], 0.04, 0.0045).verdict == health.VERDICTS["drifted"], "the centre shows as before"
+
+
+@pytest.mark.parametrize(("wobble", "said"), [(0.0, True), (1.0, False)])
+def test_a_measurement_counts_what_tracks_have_in_common_where_the_drive_is_straight(wobble, said, tmp_path):
+    file = survey_of(tube_drive(3, 2.0, density=300.0, wobble=wobble), tmp_path / "survey.mcap")
+    health_text = measure(Survey.open(file), diameter=0.3, pictures=False, threads=1).health.text
+    assert ("have in common look like 0.45 %" in health_text) is said
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_an_adjustment_with_the_known_diameter_that_does_not_end_tells_nothing(fails, monkeypatch):
+    """Its last state was judged as if it had: the diameter by what the adjustment without it had made of the drive."""
+    drive, readings = survey(2, "axial", density=300.0, length=2.0)
+    known = {"encoder": ENCODER, "diameter": 0.3, "sigma": 0.2, "threads": 1}
+    made = []
+
+    def once(*args, **more):
+        made.append(reconstruct(*args, **more))
+        return dataclasses.replace(made[-1], drift=[], reason="no camera") if fails and len(made) > 1 else made[-1]
+
+    monkeypatch.setattr(health, "reconstruct", once)
+    monkeypatch.setattr(health, "NEAR", 1e-9)
+    monkeypatch.setattr(health, "ROUNDS", 2)
+    found = health.check_profile(drive.tracks, drive.camera, readings, **known)
+    assert found.verdict == "cannot tell" and len(made) == 2
+    assert ("no camera" if fails else "did not settle: after 2") in found.text
 
 
 def test_residuals_with_a_trend_take_back_that_a_profile_is_valid(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 import pipefish as pf
 from pipe_cloud import Pipe
 from pipefish import tube_findings
+from pipefish.tube_shared import Common
 
 
 def of_kind(tube: pf.Tube, kind: str) -> dict:
@@ -33,6 +34,26 @@ def test_a_wall_in_waves_raises_no_alarms() -> None:
     pipe = Pipe(length=4, waves=(0.2, 0.002), noise=0.0005, seed=1)
     tube = pf.fit_tube(pipe.points(2500), 0.001, pipe.cameras())
     assert tube.status == "ok" and tube.surface.correlation > 2 and not tube.events
+
+
+def test_rough_walls_with_relief_have_no_kinks() -> None:
+    """Waves of two thirds of a diameter, which do not make the axis wind; a kink without a step is a joint, too."""
+    alarms = []
+    for seed in range(20):
+        pipe = Pipe(length=3, waves=(0.2, 0.002), roughness=0.001, noise=0.0005, seed=300 + seed)
+        found = pf.fit_tube(pipe.points(1200), 0.001, pipe.cameras()).events
+        alarms += [e for e in found if e["kind"] in ("joint", "bend")]
+    assert not alarms
+
+
+def test_a_turn_that_may_be_more_than_a_joints_is_a_bend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10.4 degrees, short: to 0.1 degrees they are surely less than a bend's 11.25, to 1 degree they are not."""
+    pipe = Pipe(joint=(1.5, 0.0, math.radians(10.4)), seed=1)
+    points = pipe.points(2000)
+    assert of_kind(pf.fit_tube(points, pipe.noise, pipe.cameras()), "joint")["step"] is None
+    monkeypatch.setattr(Common, "turn", lambda *_: math.radians(1.0) ** 2)
+    bend = of_kind(pf.fit_tube(points, pipe.noise, pipe.cameras()), "bend")
+    assert bend["angle_sigma"] > math.radians(0.9) and bend["radius"] is None
 
 
 @pytest.mark.parametrize("degrees", [15.0, 45.0])

@@ -2,6 +2,7 @@
 // systems of its fields against a dense solver. That layers come of it is the subject of tests/python/test_segment.py.
 #include "segment/cut.hpp"
 #include "segment/expand.hpp"
+#include "segment/layer.hpp"
 #include "segment/system.hpp"
 
 #include "unity.h"
@@ -251,6 +252,37 @@ void test_a_system_without_a_minimum_is_refused()
 
 } // namespace
 
+// Of a layer that does not move, over noise, the cost at (20, 20) where `ties` lie on that pixel.
+int32_t cost_with(const Picture &picture, const std::vector<Tie> &ties)
+{
+    const cv::Rect box({0, 0}, picture.size());
+    Side side;
+    side.here = side.there = &picture;
+    side.ties = ties;
+    side.reach = cv::Mat_<uint8_t>(box.size(), uint8_t{1});
+    side.warp.lattice = side.light = Lattice(box, 16);
+    const auto points = static_cast<Eigen::Index>(side.light.points());
+    side.warp.d = Eigen::VectorXd::Zero(2 * points);
+    side.gain.assign(1, Eigen::VectorXd::Ones(points));
+    side.offset.assign(1, Eigen::VectorXd::Zero(points));
+    side.sigma.assign(1, kLeastNoise);
+    return look(side).cost(20, 20);
+}
+
+void test_matches_on_one_pixel_speak_for_it_as_the_best_of_them()
+{
+    Random random(3);
+    Image noise(48, 48);
+    for (float &v : noise)
+        v = static_cast<float>(upto(random, 255)) / 255;
+    const Picture picture(std::vector<Image>{noise});
+    const Tie exact{{20, 20}, {20, 20}, 0.9}, near{{20.2, 19.9}, {20.2, 20.9}, 0.9};
+    const int32_t none = cost_with(picture, {}), one = cost_with(picture, {exact});
+    TEST_ASSERT_EQUAL_INT32(900, none - one);
+    TEST_ASSERT_TRUE(cost_with(picture, {near}) > one && cost_with(picture, {near}) < none);
+    TEST_ASSERT_EQUAL_INT32(one, cost_with(picture, {near, exact, near, exact}));
+}
+
 int main()
 {
     UNITY_BEGIN();
@@ -261,5 +293,6 @@ int main()
     RUN_TEST(test_systems_over_grids_are_solved_as_dense_ones);
     RUN_TEST(test_a_similar_systems_factor_serves_and_another_is_replaced);
     RUN_TEST(test_a_system_without_a_minimum_is_refused);
+    RUN_TEST(test_matches_on_one_pixel_speak_for_it_as_the_best_of_them);
     return UNITY_END();
 }

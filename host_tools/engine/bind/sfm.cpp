@@ -76,8 +76,6 @@ nb::dict two_view(const pf_profile &first, const pf_profile &second, const Pixel
     out["iterations"] = found.iterations;
     out["sigma"] = found.sigma;
     out["median_parallax"] = found.median_parallax;
-    out["sextants"] = found.sextants;
-    out["off_axis"] = found.off_axis;
     Eigen::Matrix<double, 6, 5> spread = Eigen::Matrix<double, 6, 5>::Zero();
     spread.topLeftCorner<3, 3>().setIdentity();
     spread.bottomRightCorner<3, 2>() = found.direction_basis;

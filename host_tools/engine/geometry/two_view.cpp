@@ -10,7 +10,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
 
 namespace pipefish::geometry
 {
@@ -367,24 +366,17 @@ void drop_levers(const Pose &pose, std::span<const Sight> a, std::span<const Sig
     inliers.resize(kept);
 }
 
-// Spread, noise and coverage of the inliers.
+// Spread and noise of the inliers.
 void describe(TwoView &result, std::span<const Sight> a, std::span<const Sight> b, std::span<const int> inliers)
 {
     std::vector<double> distance, angle;
-    bool sextant[6] = {};
-    const Matrix32 basis = tangent_basis(result.pose.t);
     for (const int i : inliers) {
         const size_t k = static_cast<size_t>(i);
         distance.push_back(std::sqrt(sampson_squared(result.pose, a[k], b[k])));
         angle.push_back(std::acos(std::clamp((result.pose.r * a[k].ray).dot(b[k].ray), -1.0, 1.0)));
-        const Vector2d around = basis.transpose() * b[k].ray;
-        const double turn = std::atan2(around[1], around[0]) / std::numbers::pi * 3.0 + 3.0;
-        sextant[std::clamp(static_cast<int>(turn), 0, 5)] = true;
-        result.off_axis += std::abs(result.pose.t.dot(b[k].ray)) < 0.93969262;
     }
     result.sigma = 1.4826 * median_of(distance);
     result.median_parallax = median_of(angle);
-    result.sextants = static_cast<int>(std::count(sextant, sextant + 6, true));
 }
 
 void take_inliers(TwoView &result, std::span<const int> inliers)

@@ -32,8 +32,6 @@ struct TwoView {
     int inliers = 0, iterations = 0;
     double sigma = 0.0;           // robust, of the inliers' Sampson distances: 1 = noise as stated
     double median_parallax = 0.0; // radians, of the inliers
-    int sextants = 0;             // around the direction of motion, that hold inliers
-    int off_axis = 0;             // inliers more than 20 degrees from the direction of motion
     Eigen::Matrix<double, 5, 5> covariance = Eigen::Matrix<double, 5, 5>::Zero(); // rotation (left, 3), direction (2)
     Matrix32 direction_basis = Matrix32::Zero(); // tangent vectors that the last two refer to
 };

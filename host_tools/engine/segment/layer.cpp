@@ -185,15 +185,20 @@ private:
     std::vector<float> line_; // zeros on either side
 };
 
-// A match speaks for its pixel, as far as the layer carries it where the match says.
-void count_match(const Side &side, const Tie &tie, const cv::Mat_<cv::Vec2f> &flow, cv::Mat_<int32_t> &cost)
+// A match speaks for its pixel, as far as the layer carries it where the match says; of several there the best one.
+void count_matches(const Side &side, const cv::Mat_<cv::Vec2f> &flow, cv::Mat_<int32_t> &cost)
 {
-    const cv::Point at = nearest(tie.at) - side.box().tl();
-    if (!cv::Rect({0, 0}, cost.size()).contains(at) || cost(at) >= Problem::kNever)
-        return;
-    const Vector2d to(static_cast<double>(flow(at)[0]), static_cast<double>(flow(at)[1]));
-    const double off = (to - tie.to).norm() / unit_there(side);
-    cost(at) -= static_cast<int32_t>(std::lround(kUnit * kMatched * tie.weight / (1 + square(off))));
+    cv::Mat_<int32_t> said(cost.size(), 0);
+    for (const Tie &tie : side.ties) {
+        const cv::Point at = nearest(tie.at) - side.box().tl();
+        if (!cv::Rect({0, 0}, cost.size()).contains(at) || cost(at) >= Problem::kNever)
+            continue;
+        const Vector2d to(static_cast<double>(flow(at)[0]), static_cast<double>(flow(at)[1]));
+        const double off = (to - tie.to).norm() / unit_there(side);
+        said(at) =
+            std::max(said(at), static_cast<int32_t>(std::lround(kUnit * kMatched * tie.weight / (1 + square(off)))));
+    }
+    cost -= said;
 }
 
 } // namespace
@@ -288,8 +293,7 @@ void look_likely(const Side &side, Evidence &seen)
             const float nats = seen.informed(y, x) * (unlike - std::log(ratio + hidden)) + static_cast<float>(kGround);
             cost(y, x) = static_cast<int32_t>(std::lround(static_cast<float>(kUnit) * nats));
         }
-    for (const Tie &t : side.ties)
-        count_match(side, t, seen.flow, cost);
+    count_matches(side, seen.flow, cost);
     seen.fits = fits;
     seen.cost = cost;
 }
