@@ -70,10 +70,10 @@ def jitter(step: np.ndarray, length: np.ndarray) -> tuple[float, float]:
     s = np.cumsum(np.abs(length))
     slow = length[:, None] * (s / s[-1])[:, None] ** np.arange(3)
     held = step
-    for _ in range(4):  # a step that slipped does not bend the rest
+    for _ in range(4):  # without the steps that slipped
         fit = slow @ np.linalg.lstsq(slow, held, rcond=None)[0]
         spread = 1.4826 * float(np.median(np.abs(step - fit)))
-        rest = np.clip(step - fit, -3 * spread, 3 * spread)
+        rest = np.where(np.abs(step - fit) <= 3 * spread, step - fit, 0.0)
         held = fit + rest
     power, both = float(rest @ rest), -float(rest[1:] @ rest[:-1])
     sigma = power / math.sqrt(len(rest))

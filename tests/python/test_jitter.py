@@ -92,6 +92,15 @@ def test_jitter_is_what_neighbouring_steps_contradict_each_other_by() -> None:
     assert jitter(length[:10] + white[:10], length[:10])[0] == 0.0  # too few to tell
 
 
+def test_a_slip_hides_no_jitter() -> None:
+    length, slip, found = np.full(60, 0.05), 0.15 * (np.arange(60) == 30), []
+    for seed in range(60):
+        white = np.diff(np.random.default_rng(seed).normal(0, 0.005, 61))
+        found.append([jitter(length + white, length)[0] > 0, jitter(length + white + slip, length)[0] > 0])
+    without, beside = np.mean(found, axis=0)
+    assert beside > without - 0.1
+
+
 def test_missing_readings_stay_missing_and_a_wheel_may_count_downwards(drive: Drive) -> None:
     true = drive.driven[-1] - drive.driven
     reading = true + np.random.default_rng(4).normal(0, 0.005, len(true))
