@@ -150,9 +150,9 @@ def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) 
         f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which it does not say: they "
         "were smoothed along what the pictures say was driven from one to the next."
     )
-    readings = dataclasses.replace(readings, chainage=chainage, encoder=encoder, remarks=[*readings.remarks, remark])
-    again = _adjusted_once(readings, method, threads, lambda: tell(0.3, "poses and points, the encoder smoothed"))
-    return readings, again
+    better = dataclasses.replace(readings, chainage=chainage, encoder=encoder, remarks=[*readings.remarks, remark])
+    again = _adjusted_once(better, method, threads, lambda: tell(0.3, "poses and points, the encoder smoothed"))
+    return (readings, structure) if again.status == "failed" else (better, again)
 
 
 def _adjusted_once(readings: Readings, method: str, threads: int | None, tell: Callable[[], None]) -> Reconstruction:
