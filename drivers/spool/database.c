@@ -45,6 +45,12 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
         d->is_damaged = true;
         status = PF_ERR_FORMAT;
         break;
+    case SQLITE_NOMEM:
+        if (!pf_spool_has_memory())
+            break;
+        d->is_damaged = true;
+        return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: %s: a row says that it is larger than any object", d->path,
+                       doing);
     case SQLITE_BUSY:
         return pf_fail(&d->failure, PF_ERR_IO, "%s: another program uses it", d->path);
     case SQLITE_FULL:

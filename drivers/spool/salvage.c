@@ -28,6 +28,13 @@ bool pf_spool_was_one(const char *path)
     return (n >= 72 && memcmp(page + 68, id, sizeof id) == 0) || memmem(page, n, mark, sizeof mark - 1) != NULL;
 }
 
+bool pf_spool_has_memory(void)
+{
+    void *more_than_an_object = sqlite3_malloc64(UINT64_C(1) << 26);
+    sqlite3_free(more_than_an_object);
+    return more_than_an_object != NULL;
+}
+
 /* The log's name follows the file's. */
 static int rename_both(const char *from, const char *to)
 {
@@ -121,6 +128,10 @@ static bool is_lost(salvage *s)
     case SQLITE_ERROR:
     case SQLITE_TOOBIG:
         return true;
+    case SQLITE_NOMEM:
+        if (pf_spool_has_memory())
+            return true;
+        break;
     default:
         break;
     }
@@ -166,6 +177,12 @@ static bool commit(salvage *s)
     return ok || give_up(s);
 }
 
+/* False: no memory. What is not bound would be NULL, which an INSERT OR IGNORE passes over. */
+static bool copy_column(sqlite3_stmt *to, sqlite3_stmt *from, int column)
+{
+    return sqlite3_bind_value(to, column + 1, sqlite3_column_value(from, column)) == SQLITE_OK;
+}
+
 /* Of a value that is there already the newer one stays. A note that the damaged file has of another one says that the
  * other's values were taken into it, and no more: objects taken with them may be lost here. False: the new file does
  * not take them, or they cannot be read now. */
@@ -180,9 +197,7 @@ static bool copy_values(salvage *s)
     if (ok && (code = sqlite3_prepare_v2(s->from, order, -1, &get, NULL)) == SQLITE_OK) {
         (void)sqlite3_bind_blob(get, 1, rows, sizeof rows, SQLITE_STATIC);
         while (ok && (code = sqlite3_step(get)) == SQLITE_ROW) {
-            (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
-            (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
-            ok = sqlite3_step(set) == SQLITE_DONE;
+            ok = copy_column(set, get, 0) && copy_column(set, get, 1) && sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
     }
@@ -201,9 +216,10 @@ static bool copy_object(salvage *s, sqlite3_stmt *row)
     if (name == NULL || bytes == NULL || sqlite3_column_bytes(row, 2) != 32 ||
         pf_sha256(bytes, (size_t)sqlite3_column_bytes(row, 3), hash) != PF_OK || memcmp(hash, name, sizeof hash) != 0)
         return true;
+    bool ok = true;
     for (int i = 0; i < 4; i++)
-        (void)sqlite3_bind_value(s->put, i + 1, sqlite3_column_value(row, i));
-    bool ok = sqlite3_step(s->put) == SQLITE_DONE;
+        ok = ok && copy_column(s->put, row, i);
+    ok = ok && sqlite3_step(s->put) == SQLITE_DONE;
     (void)sqlite3_reset(s->put);
     return ok;
 }

@@ -13,6 +13,10 @@
  * left alone. */
 bool pf_spool_was_one(const char *path);
 
+/* What SQLITE_NOMEM says of a file: true: its bytes are bad, for there is memory for any object; false: there is none
+ * now. SQLite says so too of a row whose length is damaged: none such can be had, or its count of pages wraps to 0. */
+bool pf_spool_has_memory(void);
+
 /* Gives the file, and the log beside it, the name <path>.damaged-1.unread, or that with the first free number above
  * those that are still called so. PF_OK, PF_ERR_IO. */
 pf_status pf_spool_set_aside(const char *path, pf_failure *failure);

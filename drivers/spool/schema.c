@@ -86,7 +86,7 @@ int pf_spool_read_schema(sqlite3 *db, pf_spool_schema *found)
 }
 
 static uint8_t first_page[PF_SPOOL_PAGE];
-static bool has_first_page;
+static bool has_first_page; /* from then on it does not change */
 
 /* SQLite's own, of a spool in memory. */
 static void make_first_page(void)
@@ -109,7 +109,11 @@ static void make_first_page(void)
 
 const uint8_t *pf_spool_first_page(void)
 {
-    static pthread_once_t once = PTHREAD_ONCE_INIT;
-    (void)pthread_once(&once, make_first_page);
-    return has_first_page ? first_page : NULL;
+    static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
+    pthread_mutex_lock(&mutex);
+    if (!has_first_page)
+        make_first_page();
+    const uint8_t *page = has_first_page ? first_page : NULL;
+    pthread_mutex_unlock(&mutex);
+    return page;
 }
