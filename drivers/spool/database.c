@@ -45,6 +45,12 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
         d->is_damaged = true;
         status = PF_ERR_FORMAT;
         break;
+    case SQLITE_NOMEM:
+        if (!pf_spool_has_memory())
+            break;
+        d->is_damaged = true;
+        return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: %s: a row says that it is larger than any object", d->path,
+                       doing);
     case SQLITE_BUSY:
         return pf_fail(&d->failure, PF_ERR_IO, "%s: another program uses it", d->path);
     case SQLITE_FULL:
@@ -117,30 +123,76 @@ static pf_status fail_damaged(pf_spool_database *d, const char *why)
     return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: damaged: %s", d->path, why);
 }
 
+static pf_status fail_version(pf_spool_database *d, int64_t version)
+{
+    return pf_fail(&d->failure, PF_ERR_VERSION, "%s: spool of version %" PRId64 "; this program reads version %d",
+                   d->path, version, PF_SPOOL_VERSION);
+}
+
+/* Before it is known whose file it is: what is damaged may be another program's, to which it is left. */
+static pf_status leave_others(pf_spool_database *d, pf_status status)
+{
+    if (!d->is_damaged || pf_spool_was_one(d->path))
+        return status;
+    d->is_damaged = false;
+    return fail_foreign(d);
+}
+
 /* Tells a spool from an empty file, a damaged one and everything else, before anything is written. */
 static pf_status identify(pf_spool_database *d, pf_spool_schema *schema)
 {
-    int64_t id = 0, version = 0;
+    int64_t id = 0, version = 0, pages = 0;
     pf_status status = ask(d, "PRAGMA application_id", &id);
     if (status == PF_OK)
         status = ask(d, "PRAGMA user_version", &version);
     if (status != PF_OK)
-        return status;
+        return leave_others(d, status);
     const bool is_spool = id == PF_SPOOL_APPLICATION_ID;
     const int code = pf_spool_read_schema(d->db, schema);
     if (code == SQLITE_ERROR) /* of a format that SQLite does not know */
-        return is_spool || pf_spool_was_one(d->path) ? fail_damaged(d, sqlite3_errmsg(d->db)) : fail_foreign(d);
+        return leave_others(d, fail_damaged(d, sqlite3_errmsg(d->db)));
     if (code != SQLITE_OK)
-        return fail_sqlite(d, "opening");
+        return leave_others(d, fail_sqlite(d, "opening"));
     schema->is_empty = schema->is_empty && id == 0 && version == 0;
-    if (schema->is_empty)
-        return PF_OK;
+    if (schema->is_empty) {
+        status = ask(d, "PRAGMA page_count", &pages);
+        return status == PF_OK && pages > 1 && pf_spool_was_one(d->path) ? fail_damaged(d, "it names no table")
+                                                                         : status;
+    }
     if (!is_spool && !schema->has_objects)
         return fail_foreign(d);
     if (is_spool && version != PF_SPOOL_VERSION)
-        return pf_fail(&d->failure, PF_ERR_VERSION, "%s: spool of version %" PRId64 "; this program reads version %d",
-                       d->path, version, PF_SPOOL_VERSION);
+        return fail_version(d, version);
     return is_spool && schema->is_right ? PF_OK : fail_damaged(d, "its first page is not a spool's");
+}
+
+static int call_alive(void *self)
+{
+    ((pf_spool_database *)self)->alive();
+    return 0;
+}
+
+/* Tables that lie elsewhere than this program puts them may do so rightly, or because the place where they begin is
+ * damaged: what is there is looked at. */
+static pf_status look_through(pf_spool_database *d, const pf_spool_schema *schema)
+{
+    const struct {
+        bool is_due;
+        const char *query;
+    } checks[] = {{!schema->is_in_place, pf_spool_check_tables},
+                  {!schema->ranks_are_in_place && schema->has_rank_rows, pf_spool_check_ranks},
+                  {!schema->ranks_are_in_place && schema->has_ranks, pf_spool_check_order}};
+    pf_status status = PF_OK;
+    sqlite3_progress_handler(d->db, 1000, d->alive != NULL ? call_alive : NULL, d);
+    for (size_t i = 0; status == PF_OK && i < sizeof checks / sizeof checks[0]; i++) {
+        int64_t is_right = 1;
+        if (checks[i].is_due)
+            status = ask(d, checks[i].query, &is_right);
+        if (status == PF_OK && is_right == 0)
+            status = fail_damaged(d, "its tables begin on wrong pages");
+    }
+    sqlite3_progress_handler(d->db, 0, NULL, NULL);
+    return status;
 }
 
 /* The row of an object that could not be saved may be held by somebody, who will remove it: it is given to no other. */
@@ -167,6 +219,8 @@ static pf_status open_for_writing(pf_spool_database *d)
     pf_status status = run_text(d, "PRAGMA locking_mode = EXCLUSIVE");
     if (status == PF_OK)
         status = identify(d, &schema);
+    if (status == PF_OK)
+        status = schema.is_empty ? run_text(d, pf_spool_layout) : look_through(d, &schema);
     /* The log is cut back to 4 MB after a checkpoint, lest it hold an SD card's free space for ever. */
     if (status == PF_OK)
         status =
@@ -203,6 +257,10 @@ static pf_status open_for_reading(pf_spool_database *d)
                                                                        : fail_sqlite(d, "opening");
         if (status == PF_OK)
             status = identify(d, &schema);
+        if (d->is_damaged && schema.has_objects) { /* all that is needed for sending */
+            d->is_damaged = false;
+            status = PF_OK;
+        }
     }
     if (schema.is_empty || d->is_damaged) {
         d->is_damaged = false;
@@ -213,13 +271,9 @@ static pf_status open_for_reading(pf_spool_database *d)
     if (status == PF_OK) /* over the file's own: nothing has to go while nothing can come */
         status = run_text(d, "PRAGMA temp_store = MEMORY; CREATE TEMP TABLE evictable (row INTEGER PRIMARY KEY,"
                              "importance INTEGER NOT NULL, number INTEGER NOT NULL)");
+    if (status == PF_OK && !schema.is_empty && schema.has_objects && !schema.has_values)
+        status = run_text(d, "CREATE TEMP TABLE value (key TEXT PRIMARY KEY, bytes BLOB NOT NULL)");
     return status;
-}
-
-static int call_alive(void *self)
-{
-    ((pf_spool_database *)self)->alive();
-    return 0;
 }
 
 /* Every row is looked at, on a slow card with a read for most of them: some 250 rows, 0.1 s, between two alive(). */
@@ -240,6 +294,9 @@ static pf_status open_file(pf_spool_database *d)
 {
     d->is_read_only = pf_spool_is_read_only(d->path);
     d->stats.objects = d->stats.bytes = 0;
+    const uint32_t version = pf_spool_version_of(d->path);
+    if (version > PF_SPOOL_VERSION) /* whatever else is in it, damaged or not */
+        return fail_version(d, version);
     pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
     if (status == PF_OK)
         status = measure(d);

@@ -13,19 +13,11 @@
 #define CHUNK_OBJECTS 64  /* of one transaction: some megabytes, so that neither a kill nor the log costs much */
 #define PATH_BYTES    1024
 
-bool pf_spool_was_one(const char *path)
+bool pf_spool_has_memory(void)
 {
-    static const char mark[] = "CREATE TABLE object (row INTEGER PRIMARY KEY AUTOINCREMENT";
-    const uint32_t application_id = PF_SPOOL_APPLICATION_ID;
-    uint8_t page[PF_SPOOL_PAGE];
-    const uint8_t id[4] = {(uint8_t)(application_id >> 24), (uint8_t)(application_id >> 16),
-                           (uint8_t)(application_id >> 8), (uint8_t)application_id};
-    FILE *file = fopen(path, "rb");
-    if (file == NULL)
-        return false;
-    size_t n = fread(page, 1, sizeof page, file);
-    (void)fclose(file);
-    return (n >= 72 && memcmp(page + 68, id, sizeof id) == 0) || memmem(page, n, mark, sizeof mark - 1) != NULL;
+    void *more_than_an_object = sqlite3_malloc64(UINT64_C(1) << 26);
+    sqlite3_free(more_than_an_object);
+    return more_than_an_object != NULL;
 }
 
 /* The log's name follows the file's. */
@@ -100,7 +92,9 @@ typedef struct salvage {
     void (*alive)(void);
     char key[32];         /* of the value that says how far it has come */
     int64_t up_to, after; /* rows that are done: from the first one up, from the last one down */
-    bool has_begun;       /* an earlier run has taken the values: they may have changed since */
+    bool has_values;      /* taken, by an earlier run too: they may have changed since */
+    bool is_usual;        /* the file's first page is that of every spool */
+    bool is_lossy;        /* something of the file could not be read */
     int chunk;            /* objects of the open transaction */
     char why[128];        /* the new file takes no more, or the damaged one cannot be read now */
 } salvage;
@@ -121,6 +115,10 @@ static bool is_lost(salvage *s)
     case SQLITE_ERROR:
     case SQLITE_TOOBIG:
         return true;
+    case SQLITE_NOMEM:
+        if (pf_spool_has_memory())
+            return true;
+        break;
     default:
         break;
     }
@@ -130,17 +128,22 @@ static bool is_lost(salvage *s)
     return false;
 }
 
+/* A note is two rows, and a third number while the values are still to be taken. */
+enum { NOTE = 16, NOTE_WITHOUT_VALUES = 24 };
+
 static void load_progress(salvage *s)
 {
     sqlite3_stmt *get = NULL;
+    s->up_to = 0;
     s->after = INT64_MAX;
     if (sqlite3_prepare_v2(s->to, "SELECT bytes FROM value WHERE key = ?1", -1, &get, NULL) == SQLITE_OK) {
         (void)sqlite3_bind_text(get, 1, s->key, -1, SQLITE_STATIC);
-        if (sqlite3_step(get) == SQLITE_ROW && sqlite3_column_bytes(get, 0) == 16) {
+        const int n = sqlite3_step(get) == SQLITE_ROW ? sqlite3_column_bytes(get, 0) : 0;
+        if (n == NOTE || n == NOTE_WITHOUT_VALUES) {
             const uint8_t *bytes = sqlite3_column_blob(get, 0);
             memcpy(&s->up_to, bytes, 8);
             memcpy(&s->after, bytes + 8, 8);
-            s->has_begun = true;
+            s->has_values = s->has_values || n == NOTE;
         }
     }
     sqlite3_finalize(get);
@@ -158,12 +161,18 @@ static bool give_up(salvage *s)
 
 static bool commit(salvage *s)
 {
-    int64_t rows[2] = {s->up_to, s->after};
+    int64_t rows[3] = {s->up_to, s->after, 0};
     (void)sqlite3_bind_text(s->note, 1, s->key, -1, SQLITE_STATIC);
-    (void)sqlite3_bind_blob(s->note, 2, rows, sizeof rows, SQLITE_TRANSIENT);
+    (void)sqlite3_bind_blob(s->note, 2, rows, s->has_values ? NOTE : NOTE_WITHOUT_VALUES, SQLITE_TRANSIENT);
     bool ok = sqlite3_step(s->note) == SQLITE_DONE;
     ok = sqlite3_reset(s->note) == SQLITE_OK && ok && run(s->to, "COMMIT");
     return ok || give_up(s);
+}
+
+/* False: no memory. What is not bound would be NULL, which an INSERT OR IGNORE passes over. */
+static bool copy_column(sqlite3_stmt *to, sqlite3_stmt *from, int column)
+{
+    return sqlite3_bind_value(to, column + 1, sqlite3_column_value(from, column)) == SQLITE_OK;
 }
 
 /* Of a value that is there already the newer one stays. A note that the damaged file has of another one says that the
@@ -171,7 +180,8 @@ static bool commit(salvage *s)
  * not take them, or they cannot be read now. */
 static bool copy_values(salvage *s)
 {
-    static const char order[] = "SELECT key, CASE WHEN key GLOB 'salvage [0-9]*' THEN ?1 ELSE bytes END FROM value";
+    static const char order[] = "SELECT key, CASE WHEN key GLOB 'salvage [0-9]*' THEN ?1 ELSE bytes END FROM value "
+                                "WHERE typeof(key) = 'text' AND typeof(bytes) = 'blob'";
     const int64_t rows[2] = {0, INT64_MAX};
     sqlite3_stmt *get = NULL, *set = NULL;
     int code = SQLITE_OK;
@@ -180,12 +190,11 @@ static bool copy_values(salvage *s)
     if (ok && (code = sqlite3_prepare_v2(s->from, order, -1, &get, NULL)) == SQLITE_OK) {
         (void)sqlite3_bind_blob(get, 1, rows, sizeof rows, SQLITE_STATIC);
         while (ok && (code = sqlite3_step(get)) == SQLITE_ROW) {
-            (void)sqlite3_bind_value(set, 1, sqlite3_column_value(get, 0));
-            (void)sqlite3_bind_value(set, 2, sqlite3_column_value(get, 1));
-            ok = sqlite3_step(set) == SQLITE_DONE;
+            ok = copy_column(set, get, 0) && copy_column(set, get, 1) && sqlite3_step(set) == SQLITE_DONE;
             (void)sqlite3_reset(set);
         }
     }
+    s->has_values = ok && code == SQLITE_DONE;
     if (ok && code != SQLITE_DONE)
         ok = is_lost(s);
     sqlite3_finalize(get);
@@ -201,9 +210,10 @@ static bool copy_object(salvage *s, sqlite3_stmt *row)
     if (name == NULL || bytes == NULL || sqlite3_column_bytes(row, 2) != 32 ||
         pf_sha256(bytes, (size_t)sqlite3_column_bytes(row, 3), hash) != PF_OK || memcmp(hash, name, sizeof hash) != 0)
         return true;
+    bool ok = true;
     for (int i = 0; i < 4; i++)
-        (void)sqlite3_bind_value(s->put, i + 1, sqlite3_column_value(row, i));
-    bool ok = sqlite3_step(s->put) == SQLITE_DONE;
+        ok = ok && copy_column(s->put, row, i);
+    ok = ok && sqlite3_step(s->put) == SQLITE_DONE;
     (void)sqlite3_reset(s->put);
     return ok;
 }
@@ -244,14 +254,23 @@ static bool walk(salvage *s, bool is_down, bool *has_ended)
 /* From both ends: a page that cannot be read stops a walk over the table. False: there is more, for another time. */
 static bool copy_all(salvage *s)
 {
-    bool has_ended = false;
+    bool has_ended = false, from_above = false;
     load_progress(s);
-    bool ok = run(s->to, "BEGIN IMMEDIATE") && (s->has_begun || copy_values(s)) && walk(s, false, &has_ended) &&
-              (has_ended || walk(s, true, &has_ended)) && commit(s);
+    bool ok = run(s->to, "BEGIN IMMEDIATE") && (s->has_values || copy_values(s)) && walk(s, false, &has_ended) &&
+              (has_ended || walk(s, true, &from_above)) && commit(s);
+    s->is_lossy = !has_ended || !s->has_values;
     return ok || give_up(s);
 }
 
-/* Nothing of the damaged file's own first page is needed: its tables lie where every spool's do. */
+/* Alone: its log needs no memory that is shared, which would be a file more. */
+static bool open_damaged(salvage *s, const char *file)
+{
+    return (sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) == SQLITE_OK &&
+            run(s->from, "PRAGMA locking_mode = EXCLUSIVE")) ||
+           is_lost(s);
+}
+
+/* In place of the file's own, through which it has been read. */
 static bool write_first_page(salvage *s, const char *file)
 {
     const uint8_t *page = pf_spool_first_page();
@@ -266,7 +285,7 @@ static bool write_first_page(salvage *s, const char *file)
 /* The log's pages go into the file, its first one among them. */
 static bool empty_log(salvage *s, const char *file)
 {
-    bool ok = sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) == SQLITE_OK || is_lost(s);
+    bool ok = open_damaged(s, file);
     /* The first opens the log, and fails where the log's first page is bad. */
     ok = ok && (run(s->from, "PRAGMA user_version") || is_lost(s));
     ok = ok &&
@@ -286,18 +305,32 @@ static bool mend_first_page(salvage *s, const char *file)
     return access(log, F_OK) != 0 || (empty_log(s, file) && write_first_page(s, file));
 }
 
-static bool salvage_file(salvage *s, const char *file)
+/* Whether the file, opened, has the first page that every spool has, as far as it matters. False, with s->why: it
+ * cannot be read now. */
+static bool has_every_spools_page(salvage *s, const char *file)
 {
-    /* Where its row is another's by now it gets a new one. */
+    pf_spool_schema schema;
+    if (pf_spool_read_schema(s->from, &schema) != SQLITE_OK) {
+        (void)is_lost(s);
+        return false;
+    }
+    return schema.is_in_place && pf_spool_has_first_header(file);
+}
+
+/* One pass. The notes of what was read through a page of the file's own say nothing of the other pass. */
+static bool read_through(salvage *s, const char *file, int number)
+{
+    /* Where its row is another's by now it gets a new one; what is there already takes none. */
     static const char put[] = "INSERT OR IGNORE INTO object (row, kind, name, bytes) SELECT "
                               "CASE WHEN EXISTS (SELECT 1 FROM object WHERE row = ?1) THEN NULL ELSE ?1 END, "
-                              "?2, ?3, ?4";
+                              "?2, ?3, ?4 WHERE NOT EXISTS (SELECT 1 FROM object WHERE name = ?3)";
     static const char note[] = "INSERT OR REPLACE INTO value (key, bytes) VALUES (?1, ?2)";
-    bool is_done;
-    if (!mend_first_page(s, file))
-        return false;
-    if (sqlite3_open_v2(file, &s->from, SQLITE_OPEN_READWRITE, NULL) != SQLITE_OK)
-        is_done = is_lost(s);
+    bool is_done = open_damaged(s, file);
+    s->chunk = 0;
+    s->is_usual = is_done && has_every_spools_page(s, file);
+    (void)snprintf(s->key, sizeof s->key, s->is_usual ? "salvage %d" : "salvage %d own", number);
+    if (!is_done || s->why[0] != '\0')
+        is_done = false;
     else if (sqlite3_prepare_v2(s->to, put, -1, &s->put, NULL) != SQLITE_OK ||
              sqlite3_prepare_v2(s->to, note, -1, &s->note, NULL) != SQLITE_OK)
         is_done = give_up(s);
@@ -306,7 +339,18 @@ static bool salvage_file(salvage *s, const char *file)
     sqlite3_finalize(s->put);
     sqlite3_finalize(s->note);
     (void)sqlite3_close(s->from);
+    s->put = s->note = NULL;
+    s->from = NULL;
     return is_done;
+}
+
+static bool salvage_file(salvage *s, const char *file, int number)
+{
+    if (!read_through(s, file, number))
+        return false;
+    if ((s->is_usual && !s->is_lossy) || !pf_spool_takes_first_page(file))
+        return true;
+    return mend_first_page(s, file) && read_through(s, file, number);
 }
 
 static uint64_t count(sqlite3 *db)
@@ -328,9 +372,8 @@ uint32_t pf_spool_salvage(sqlite3 *to, const char *path, void (*alive)(void), pf
         salvage s = {.to = to, .alive = alive};
         name_aside(path, number, read, unread);
         files++;
-        (void)snprintf(s.key, sizeof s.key, "salvage %d", number);
         const uint64_t before = count(to);
-        bool is_done = salvage_file(&s, unread);
+        bool is_done = salvage_file(&s, unread, number);
         const uint64_t saved = count(to) - before; /* of those in a transaction that failed none are there */
         if (!is_done) {
             left++;

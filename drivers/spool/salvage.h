@@ -1,7 +1,9 @@
 /* A spool's file that has become unreadable: it is set aside, and what can be read of it goes into a new one. Until all
  * of it is there the file is called <path>.damaged-N.unread, so that a kill, a full disk, a missing descriptor or
- * a new file that cannot be opened ends nothing: the next opening goes on. Its log is taken into it, and its first page
- * is replaced, by the one that every spool has. */
+ * a new file that cannot be opened ends nothing: the next opening goes on. It is read through its own first page; where
+ * that says other than every spool's, or a page could not be read, its log is taken into it, the first page of every
+ * spool takes the place of its own, if its pages are of that size, and it is read once more, for what is still missing.
+ * A card too full for that is "not now" as well. */
 #ifndef PIPEFISH_SPOOL_SALVAGE_H
 #define PIPEFISH_SPOOL_SALVAGE_H
 
@@ -9,9 +11,9 @@
 
 #include <sqlite3.h>
 
-/* Whether a file that SQLite does not take was a spool: its header or its schema says so. Another program's file is
- * left alone. */
-bool pf_spool_was_one(const char *path);
+/* What SQLITE_NOMEM says of a file: true: its bytes are bad, for there is memory for any object; false: there is none
+ * now. SQLite says so too of a row whose length is damaged: none such can be had, or its count of pages wraps to 0. */
+bool pf_spool_has_memory(void);
 
 /* Gives the file, and the log beside it, the name <path>.damaged-1.unread, or that with the first free number above
  * those that are still called so. PF_OK, PF_ERR_IO. */

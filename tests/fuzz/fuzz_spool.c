@@ -2,12 +2,12 @@
  * what a file that it sets aside still has. The files live in memory (memory_files.h). The input's first byte chooses
  * what lies there: a spool as kill -9 leaves it, with its log, or one that was closed; a valid header before bytes of
  * the input's own; whether the log's checksums are repaired, so that damage behind them is reached; and whether another
- * program opens it first: one that can write nothing, or one that is told after so many reads of an error that passes.
- * The rest are changes and cuts. Invariants: opening succeeds, unless the file says that it is another program's or
- * a newer one's; an object that is handed out has the bytes of its name, and rows ascend; what is stored in undamaged
- * files without an error is there after opening again, and they lose nothing, also by errors that pass; what cannot be
- * written is read, and stays as it is; after any damage the next object is stored; damage to pages that hold no
- * objects, only an index of them, costs none.
+ * program opens it first: one that can write nothing, or one that has no
+ * memory for a while after so many reads. The rest are changes and cuts. Invariants: opening succeeds, unless the file
+ * says that it is another program's or a newer one's; an object that is handed out has the bytes of its name, and rows
+ * ascend; what is stored in undamaged files without an error is there after opening again, and they lose nothing, also
+ * by errors that pass; what cannot be written is read, and stays as it is; after any damage the next object is stored;
+ * damage to pages that hold no objects, only an index of them, costs none.
  */
 #include "memory_files.h"
 #include "pipefish/drivers/sha256.h"
@@ -283,7 +283,7 @@ static void read_only(bool is_whole)
         require(before[i].n == medium.file[i].n && memcmp(before[i].bytes, medium.file[i].bytes, before[i].n) == 0);
 }
 
-/* A program whose reads fail after so many, for a moment. */
+/* A program that has no memory after so many reads, for a moment. */
 static void fail_for_a_moment(int reads)
 {
     pf_spool spool;
@@ -299,9 +299,20 @@ static void fail_for_a_moment(int reads)
     medium.was_full = false;
 }
 
+/* A log that says that the spool has as many pages as SQLite ever gives one: "full", without a write. */
+static bool says_full(const memory_file *log)
+{
+    const size_t frame = 24 + 4096;
+    for (size_t at = 32; log->is_there && at + frame <= log->n; at += frame)
+        if (get_be(log->bytes + at + 4) >= 1073741823)
+            return true;
+    return false;
+}
+
 typedef struct laid {
     bool is_whole, is_spared; /* undamaged; undamaged where objects are */
     bool says_spool;          /* and of which version, in the one place where that is said */
+    bool says_full;           /* by a log whose checksums are right */
 } laid;
 
 static laid lay_all(const uint8_t *data, size_t size)
@@ -324,16 +335,18 @@ static laid lay_all(const uint8_t *data, size_t size)
     }
     if (how & REPAIRED && medium.file[LOG].is_there)
         repair_log(&medium.file[LOG]);
+    what.says_full = how & REPAIRED && says_full(&medium.file[LOG]);
     what.is_spared = what.is_whole || (how & CLOSED && pages != 0 && (pages & ~index_pages) == 0);
     what.says_spool = what.is_whole || (how & CLOSED && medium.file[DATABASE].n >= 72 &&
                                         memcmp(medium.file[DATABASE].bytes + 60, closed.bytes + 60, 12) == 0);
     return what;
 }
 
-/* A log that is right by its checksums, and says that the spool is larger than the medium. */
-static bool is_full(uint8_t how, pf_status status)
+/* A log that is right by its checksums, and says that the spool is larger than the medium, or than any can be: no
+ * damage leaves such a one. */
+static bool is_full(uint8_t how, laid what, pf_status status)
 {
-    return status == PF_ERR_SPACE && medium.was_full && how & REPAIRED && !(how & CLOSED);
+    return status == PF_ERR_SPACE && (medium.was_full || what.says_full) && how & REPAIRED && !(how & CLOSED);
 }
 
 /* A program that does everything, and what another one finds then. */
@@ -348,7 +361,8 @@ static void use(const uint8_t *data, size_t size, laid what)
     bool is_there;
     pf_status status = open_spool(&spool);
     if (status != PF_OK) { /* it says that it is another program's, or a newer one's */
-        require((!what.says_spool && (status == PF_ERR_FORMAT || status == PF_ERR_VERSION)) || is_full(how, status));
+        require((!what.says_spool && (status == PF_ERR_FORMAT || status == PF_ERR_VERSION)) ||
+                is_full(how, what, status));
         return;
     }
     uint32_t intact = walk(&spool, name, &is_there);
@@ -368,7 +382,7 @@ static void use(const uint8_t *data, size_t size, laid what)
     close_spool(&spool);
     left += status == PF_OK;
     status = open_spool(&spool);
-    require(status == PF_OK || is_full(how, status));
+    require(status == PF_OK || is_full(how, what, status));
     if (status != PF_OK)
         return;
     intact = walk(&spool, name, &is_there);

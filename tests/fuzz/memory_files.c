@@ -21,9 +21,10 @@ void require(bool holds)
 }
 
 /* ---- SQLite's memory, guarded as the sanitizer's own is, and quicker, which makes twice as many inputs of it: each
- * piece lies between poisoned ones, and is poisoned when it is freed until memory_reset() */
+ * piece lies between poisoned ones, and is poisoned when it is freed until memory_reset(), but that there is room for
+ * large ones again: the spool asks for more than any object takes, to see whether there is memory */
 
-enum { HEAP = 1 << 25, GUARD = 16 };
+enum { HEAP = 1 << 28, GUARD = 16, LARGE = 1 << 20 };
 
 static _Alignas(16) uint8_t heap[HEAP];
 static size_t heap_used, heap_kept; /* kept: what SQLite took when it began */
@@ -37,7 +38,7 @@ __attribute__((no_sanitize("address"))) static int piece_size(void *piece)
 __attribute__((no_sanitize("address"))) static void *take_piece(int n)
 {
     size_t size = ((size_t)n + 15) / 16 * 16 + GUARD;
-    if (size > HEAP - heap_used)
+    if (size > HEAP - heap_used || medium.reads_left < 0)
         return NULL;
     uint8_t *piece = heap + heap_used + GUARD;
     *(int *)(void *)(piece - GUARD) = n;
@@ -49,8 +50,11 @@ __attribute__((no_sanitize("address"))) static void *take_piece(int n)
 
 static void free_piece(void *piece)
 {
+    const int n = piece_size(piece);
     pieces--;
-    ASAN_POISON_MEMORY_REGION(piece, (size_t)piece_size(piece));
+    ASAN_POISON_MEMORY_REGION(piece, (size_t)n);
+    if (n > LARGE && (uint8_t *)piece + ((size_t)n + 15) / 16 * 16 == heap + heap_used)
+        heap_used = (size_t)((uint8_t *)piece - heap) - GUARD;
 }
 
 static void *change_piece(void *piece, int n)

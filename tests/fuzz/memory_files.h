@@ -23,7 +23,7 @@ typedef struct memory_medium {
     memory_file file[MEMORY_FILES];
     bool is_read_only;
     bool was_full;  /* a write was refused for that */
-    int reads_left; /* then they fail; INT_MAX: they do not */
+    int reads_left; /* then they fail, and memory is no longer given either; INT_MAX: not */
 } memory_medium;
 
 extern memory_medium medium;

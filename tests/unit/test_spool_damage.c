@@ -263,11 +263,11 @@ static void test_a_damaged_file_without_a_successor_is_read_later(void)
  * with nothing in it: it stays unread, in words, and the next opening reads it. */
 static void test_a_damaged_file_that_cannot_be_opened_now_is_read_later(void)
 {
-    static const char *const names[] = {".unread", ".unread-wal", ".unread-shm"};
+    static const char *const names[] = {".unread", ".unread-wal"};
     bool is_there[MANY + 2];
     uint64_t value = 0;
     size_t n;
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 2; i++) {
         char name[32];
         (void)snprintf(name, sizeof name, "scarce%d.db", i);
         const uint64_t whole = make_worn(name);
@@ -288,6 +288,22 @@ static void test_a_damaged_file_that_cannot_be_opened_now_is_read_later(void)
         TEST_ASSERT_FALSE(is_unread(name));
         close_spool();
     }
+}
+
+/* Proves: a damaged file is read without memory shared with other programs: a medium that can have none, or no
+ * descriptor for it, costs nothing. */
+static void test_a_damaged_file_is_read_without_shared_memory(void)
+{
+    bool is_there[MANY + 2];
+    const uint64_t whole = make_worn("alone.db");
+    hook("open", (sqlite3_syscall_ptr)open_or_not);
+    no_such = "-shm";
+    open_spool("alone.db", 0);
+    sift();
+    no_such = NULL;
+    hook("open", NULL);
+    TEST_ASSERT_EQUAL_UINT64(whole, list_ids(is_there));
+    TEST_ASSERT_FALSE(is_unread("alone.db"));
 }
 
 static bool is_worn_out;
@@ -540,6 +556,7 @@ int main(void)
     RUN_TEST(test_rows_of_lost_objects_are_not_given_again);
     RUN_TEST(test_a_damaged_file_without_a_successor_is_read_later);
     RUN_TEST(test_a_damaged_file_that_cannot_be_opened_now_is_read_later);
+    RUN_TEST(test_a_damaged_file_is_read_without_shared_memory);
     RUN_TEST(test_a_sector_that_cannot_be_read_is_given_up);
     RUN_TEST(test_a_disk_that_is_full_while_a_damaged_file_is_read_loses_nothing);
     RUN_TEST(test_a_kill_while_a_damaged_file_is_read_loses_nothing);
