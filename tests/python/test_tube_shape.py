@@ -1,4 +1,4 @@
-"""Sections that are no ellipse: an egg is told as one, or not at all, if more than its crown is seen; and never with water."""
+"""Sections that are no ellipse: an egg of which more than the crown is seen is told as one, or not at all; no water."""
 
 from __future__ import annotations
 
