@@ -181,16 +181,17 @@ def guessed(tube: Tube) -> np.ndarray:
     return np.asarray(np.sqrt(np.maximum(0, variance) + (leverage * BEYOND * table["departure"]) ** 2))
 
 
-def bordered(tube: Tube, without: np.ndarray) -> np.ndarray:
-    """(n,) bool: stations where points lie outside the wall on either side of the gap, more of them than gross points
-    elsewhere make likely: the wall goes on there, but not as the section does. without: (N,) bool, of other points."""
+def bordered(tube: Tube, among: np.ndarray, without: np.ndarray) -> np.ndarray:
+    """(n,) bool: those of stations `among` (n,) where points, but `without` (N,), lie outside the wall on either side
+    of the gap, more than gross points elsewhere make likely: the wall goes on there, but not as the section does."""
     p, d = tube.points, tube.summary["d_mean"]
     near = np.flatnonzero((p["piece"] >= 0) & (p["r"] < 0.5 * FAR * d) & ~without)
     near = near[np.argsort(p["s"][near], kind="stable")]
     off, wall = (p["weight"][near] <= 0) & (p["distance"][near] > 0), p["weight"][near] > 0
     out = np.zeros(len(tube.stations["s"]), bool)
     ends = [np.searchsorted(p["s"][near], tube.stations["s"] + away) for away in (-d, d)]
-    for k, (first, last) in enumerate(zip(*ends, strict=True)):
+    for k in np.flatnonzero(among):
+        first, last = ends[0][k], ends[1][k]
         clock = p["clock"][near[first:last]]
         seen = np.sort(clock[wall[first:last]])
         if len(seen) < LEAST:
@@ -213,12 +214,17 @@ def is_open(tube: Tube) -> np.ndarray:
 
     table, d = tube.stations, tube.summary["d_mean"]
     measured = np.isin(table["status"], MEASURED)
-    beside = bordered(tube, np.zeros(len(tube.points["s"]), bool)) & measured
+    beside = measured & (table["gap"] > (HALF_WAVE if tube.surface.order == 2 else 0.0))
     if beside.any():
-        beside &= bordered(tube, mirrored(tube, False)[0])
+        beside = bordered(tube, beside, np.zeros(len(tube.points["s"]), bool))
+    if beside.any():
+        beside = bordered(tube, beside, mirrored(tube, False)[0])
     if tube.surface.order == 2:
-        doubt = np.where(beside & (table["gap"] > HALF_WAVE), 2.0, 0.0)
+        doubt = np.where(beside, 2.0, 0.0)
     else:
         doubt = guessed(tube) / (np.where(beside, 0.5, 1.0) * KNOWN * d)
-    around = np.abs(table["s"][:, None] - table["s"]) < d  # a section is not another one from one station to the next
-    return np.array([measured[k] and np.median(doubt[near]) > 1 for k, near in enumerate(around)], bool)
+    # A section is not another one from one station to the next.
+    s, doubt = table["s"][measured], doubt[measured]
+    ends = zip(np.searchsorted(s, s - d), np.searchsorted(s, s + d, side="right"), strict=True)
+    measured[measured] = [np.median(doubt[first:last]) > 1 for first, last in ends]
+    return np.asarray(measured, bool)
