@@ -50,7 +50,8 @@ class Tube:
 
     stations: arrays with one row a station, by name:
       s, x, y, z, tx, ty, tz   chainage, point of the axis, unit tangent
-      status                   "ok", "circle_only", "open", "one_sided", "too_few_points"; what was not measured is NaN
+      status                   "ok", "circle_only", "open", "one_sided", "too_few_points"; what was not measured is NaN.
+                               "circle_only": sizes hold if the unseen wall goes on as an ellipse does
       d_mean, d_area, circumference, d_max, d_min   perimeter / pi; diameter of the circle of equal area; widest and
                                narrowest caliper width. The ellipse's part is without the noise's bias
       clock_max                clock angle of d_max, radians, 0 to pi
@@ -297,7 +298,7 @@ def _of_another_shape(fit: _Fit, points: np.ndarray, tube: Tube, count: int) -> 
     """The surface from circles through all points around a tube that leaves many of them off its wall (an egg's crown
     is exactly round), where that is likelier."""
     nodes, rho = tube_shape.wide_circles(points, tube, count)
-    if not tube_shape.is_even(rho):
+    if not (tube_shape.is_even(rho) and tube_shape.leads_elsewhere(points, tube, nodes, rho)):
         return None
     try:
         other, common = fit.on(nodes, rho)
