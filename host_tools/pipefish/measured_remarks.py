@@ -322,7 +322,7 @@ def not_measured(m: Measurement) -> list[dict[str, Any]]:
             inside = list(run)
             ends = np.sort(stretch.chainage(stations["s"][[inside[0], inside[-1]]]))
             what = {
-                "circle_only": "mean diameter only: no wall seen over more than 150 degrees",
+                "circle_only": "mean diameter only, if the rest goes on round: no wall seen over more than 150 degrees",
                 "open": "nothing: the section is no ellipse, and too little of it is seen to tell what it is",
                 "one_sided": "nothing: no wall seen over more than 220 degrees",
                 "too_few_points": "nothing: too few points on the wall",
