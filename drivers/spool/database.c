@@ -92,10 +92,22 @@ bool pf_spool_run(pf_spool_database *d, pf_spool_statement which)
     return code == SQLITE_DONE && reset == SQLITE_OK;
 }
 
+static pf_status fail_damaged(pf_spool_database *d, const char *why)
+{
+    d->is_damaged = true;
+    return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: damaged: %s", d->path, why);
+}
+
+/* Nothing is stored here: what is too large is so in the file. */
+static pf_status fail_opening(pf_spool_database *d)
+{
+    return sqlite3_errcode(d->db) == SQLITE_TOOBIG ? fail_damaged(d, sqlite3_errmsg(d->db)) : fail_sqlite(d, "opening");
+}
+
 static pf_status run_text(pf_spool_database *d, const char *text)
 {
     if (sqlite3_exec(d->db, text, NULL, NULL, NULL) != SQLITE_OK)
-        return fail_sqlite(d, "opening");
+        return fail_opening(d);
     return PF_OK;
 }
 
@@ -105,7 +117,7 @@ static pf_status ask(pf_spool_database *d, const char *query, int64_t *value)
     sqlite3_stmt *q = NULL;
     pf_status status = PF_OK;
     if (sqlite3_prepare_v2(d->db, query, -1, &q, NULL) != SQLITE_OK || sqlite3_step(q) != SQLITE_ROW)
-        status = fail_sqlite(d, "opening");
+        status = fail_opening(d);
     else
         *value = sqlite3_column_int64(q, 0);
     sqlite3_finalize(q);
@@ -115,12 +127,6 @@ static pf_status ask(pf_spool_database *d, const char *query, int64_t *value)
 static pf_status fail_foreign(pf_spool_database *d)
 {
     return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: not a spool: an SQLite database of another program", d->path);
-}
-
-static pf_status fail_damaged(pf_spool_database *d, const char *why)
-{
-    d->is_damaged = true;
-    return pf_fail(&d->failure, PF_ERR_FORMAT, "%s: damaged: %s", d->path, why);
 }
 
 static pf_status fail_version(pf_spool_database *d, int64_t version)
@@ -152,7 +158,7 @@ static pf_status identify(pf_spool_database *d, pf_spool_schema *schema)
     if (code == SQLITE_ERROR) /* of a format that SQLite does not know */
         return leave_others(d, fail_damaged(d, sqlite3_errmsg(d->db)));
     if (code != SQLITE_OK)
-        return leave_others(d, fail_sqlite(d, "opening"));
+        return leave_others(d, fail_opening(d));
     schema->is_empty = schema->is_empty && id == 0 && version == 0;
     if (schema->is_empty) {
         status = ask(d, "PRAGMA page_count", &pages);

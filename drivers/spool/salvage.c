@@ -92,7 +92,7 @@ typedef struct salvage {
     void (*alive)(void);
     char key[32];         /* of the value that says how far it has come */
     int64_t up_to, after; /* rows that are done: from the first one up, from the last one down */
-    bool has_values;      /* taken, by an earlier run too: they may have changed since */
+    bool has_values;      /* taken through this page, by an earlier run too: they may have changed since */
     bool is_usual;        /* the file's first page is that of every spool */
     bool is_lossy;        /* something of the file could not be read */
     int chunk;            /* objects of the open transaction */
@@ -136,6 +136,7 @@ static void load_progress(salvage *s)
     sqlite3_stmt *get = NULL;
     s->up_to = 0;
     s->after = INT64_MAX;
+    s->has_values = false;
     if (sqlite3_prepare_v2(s->to, "SELECT bytes FROM value WHERE key = ?1", -1, &get, NULL) == SQLITE_OK) {
         (void)sqlite3_bind_text(get, 1, s->key, -1, SQLITE_STATIC);
         const int n = sqlite3_step(get) == SQLITE_ROW ? sqlite3_column_bytes(get, 0) : 0;
@@ -143,7 +144,7 @@ static void load_progress(salvage *s)
             const uint8_t *bytes = sqlite3_column_blob(get, 0);
             memcpy(&s->up_to, bytes, 8);
             memcpy(&s->after, bytes + 8, 8);
-            s->has_values = s->has_values || n == NOTE;
+            s->has_values = n == NOTE;
         }
     }
     sqlite3_finalize(get);

@@ -80,6 +80,7 @@ static void test_a_schema_of_other_tables_is_damage(void)
         "UPDATE sqlite_schema SET name = 'valuf', tbl_name = 'valuf', sql = replace(sql, 'TABLE value', 'TABLE valuf') "
         "WHERE name = 'value'",
         "UPDATE sqlite_schema SET rootpage = 4 WHERE name = 'object'",
+        "UPDATE sqlite_schema SET rootpage = 3 WHERE name = 'value'",
         "UPDATE sqlite_schema SET rootpage = 2 WHERE name = 'evictable'",
         "UPDATE sqlite_schema SET sql = replace(sql, '= 32', '= 33') WHERE name = 'object'",
         "UPDATE sqlite_schema SET sql = replace(sql, 'importance', 'importancf') WHERE name LIKE 'evictable%'",
