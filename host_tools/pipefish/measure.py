@@ -147,8 +147,8 @@ def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) 
         return readings, structure
     chainage, encoder, white = smooth
     remark = (
-        f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which it does not say: they "
-        "were smoothed along what the pictures say was driven from one to the next."
+        f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which the device does not state: "
+        "they were smoothed along what the pictures say was driven from one to the next."
     )
     better = dataclasses.replace(readings, chainage=chainage, encoder=encoder, remarks=[*readings.remarks, remark])
     again = _adjusted_once(better, method, threads, lambda: tell(0.3, "poses and points, the encoder smoothed"))

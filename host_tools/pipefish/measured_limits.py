@@ -86,7 +86,9 @@ def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]
     value = factor * column(document, quantity)
     sigma = factor * whole_sigma(document, quantity)
     if not np.isfinite(value).any():
-        return _verdict(name, bound, unit, "not measured", "no station has it")
+        wanting = limit.column.endswith("nominal") and not scale["nominal"]
+        why = "no nominal diameter was given (--nominal of reconstruct)" if wanting else "no station has it"
+        return _verdict(name, bound, unit, "not measured", why)
     excess = (value - bound) * (1 if limit.side == "at most" else -1)
     outside, inside = excess - Z95 * sigma > 0, excess + Z95 * sigma <= 0
     known = np.isfinite(value)

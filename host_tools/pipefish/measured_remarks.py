@@ -72,9 +72,10 @@ def remark(m: Measurement) -> None:
     told = disagreement(m.scale)
     remarks = [told] if told else []
     if m.health is not None and m.health.verdict == VERDICTS["drifted"]:
-        # By a diameter that contradicts the encoder, one of three is wrong.
+        # Told by a given diameter beside the encoder, one of three is wrong.
+        given = any(row["name"] == "diameter" for row in m.scale.sources)
         remarks.append(
-            m.health.text.rstrip(".") + (", unless the encoder or the given diameter is wrong." if told else ".")
+            m.health.text.rstrip(".") + (", unless the encoder or the given diameter is wrong." if given else ".")
         )
     if m.scale.source == "none":
         remarks.append(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipefish.errors import FormatError
+from pipefish.scale import DISAGREE_SIGMA
 
 FORMAT, VERSION = "pipefish-reconstruction", 1
 Z95 = 1.96
@@ -83,7 +84,9 @@ def scale_texts(scale: dict[str, Any]) -> list[str]:
         return []
     out = []
     for row in scale["sources"]:
-        word = "agrees" if row["consistent"] else f"DISAGREES by {abs(row['deviation']):.1f} sigma"
+        word = f"agrees within {DISAGREE_SIGMA:g} sigma"
+        if not row["consistent"]:
+            word = f"DISAGREES by {abs(row['deviation']):.1f} sigma"
         role = "used" if row["used"] else "a check"
         size = f"{100 * row['relative']:+.2f} ± {100 * Z95 * row['sigma']:.2f} %"
         out.append(f"{row['name']}: {size}, {role}, {word} ({row['detail']})")

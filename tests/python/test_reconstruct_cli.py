@@ -513,6 +513,9 @@ def test_limits_hold_the_interval_against_the_bound(out):
     assert verdict(document, "d_max", worst + 20)["state"] == "passed"
     assert verdict(document, "d_max", worst - 20)["state"] == "failed"
     assert verdict(document, "d_max", worst)["state"] == "undecided"
+    document["summary"]["nominal"] = None
+    document["stations"]["reduction_nominal"] = [None] * len(document["stations"]["s"])
+    assert "no nominal diameter was given" in verdict(document, "reduction_nominal", 5)["text"]
 
 
 def test_texts_of_the_survey_cannot_break_the_report(out, tmp_path):
