@@ -31,6 +31,7 @@ SIZE = ["length", "width", "size_sigma", "height", "height_sigma", "area", "poin
 JOINT = ["step", "step_sigma", "diameter_step", "diameter_step_sigma", "gap", "gap_sigma", "chi2"]
 COLUMNS = [*PLACE, *SIZE, *JOINT, "angle", "angle_sigma", "radius", "radius_sigma"]
 FALSE_ALARMS = 0.01  # of one fit
+BESIDE = 0.3  # diameters: a gap or a kink nearer than this to a joint is that joint's
 CHI2_7_MEDIAN = 6.346
 # Of a joint, by the two ends of the surface that meet there.
 TESTED = ("chi2", "step", "step_sigma", "diameter_step", "diameter_step_sigma", "angle", "angle_sigma")
@@ -236,10 +237,15 @@ def _joints(
         shift = test["across"] @ np.stack([f["first"][0], f["second"][0]])
         clock = float(math.atan2(shift @ f["right"][0], shift @ f["up"][0]) % (2 * math.pi))
         found.append(_joint(test["s"], 0.05 * d, clock=clock, **{n: test[n] for n in TESTED}))
+    breaks = len(found)
     for kink in kinks:
-        found.append(_joint(**{n: kink[n] for n in ("s", "s_sigma", "clock", "angle", "angle_sigma")}))
+        piece = min(range(breaks), key=lambda k: abs(found[k]["s"] - kink["s"]), default=None)
+        if piece is not None and abs(found[piece]["s"] - kink["s"]) < BESIDE * d:
+            _take_kink(tube, found[piece], piece, kink)
+        else:
+            found.append(_joint(**{n: kink[n] for n in ("s", "s_sigma", "clock", "angle", "angle_sigma")}))
     for event in found:
-        near = [r for r in free if abs(r["s"] - event["s"]) < 0.3 * d]
+        near = [r for r in free if abs(r["s"] - event["s"]) < BESIDE * d]
         if near:
             ring = min(near, key=lambda r: abs(r["s"] - event["s"]))
             free.remove(ring)
@@ -248,6 +254,20 @@ def _joints(
         sigma = max(ring["gap"] / math.sqrt(12), 1e-4)
         found.append(_joint(ring["s"], sigma, **{n: ring[n] for n in ("gap", "gap_sigma", "points")}))
     return found
+
+
+def _take_kink(tube: Tube, joint: dict[str, Any], piece: int, kink: dict[str, Any]) -> None:
+    """A piece that ends a little off the joint kinks where the joint is, and the next one turns back: the joint is at
+    the clearer one of both, and its angle is that between the axes half a diameter outside them."""
+    reach = 0.5 * tube.summary["d_mean"]
+    outside = [min(joint["s"], kink["s"]) - reach, max(joint["s"], kink["s"]) + reach]
+    (start, _), (_, end) = tube.surface.pieces[piece : piece + 2]
+    before, behind = tube.frames([max(outside[0], start), min(outside[1], end)], [piece, piece + 1])["tangent"]
+    if kink["angle"] > joint["angle"]:
+        apart = abs(kink["s"] - joint["s"])
+        joint.update(s=kink["s"], s_sigma=math.hypot(kink["s_sigma"], apart))
+    joint["angle"] = float(math.atan2(np.linalg.norm(np.cross(before, behind)), before @ behind))
+    joint["angle_sigma"] = math.hypot(joint["angle_sigma"], kink["angle_sigma"])
 
 
 def _joint(s: float, s_sigma: float, **known: Any) -> dict[str, Any]:

@@ -148,6 +148,17 @@ def test_a_kink_is_a_joint_with_its_angle(degrees: float, step: float) -> None:
         assert joint["clock"] == pytest.approx(math.pi / 2, abs=0.1)  # to the right
 
 
+@pytest.mark.parametrize("off", [-0.05, 0.05])
+def test_a_break_beside_a_kink_is_one_joint_with_the_angle_of_both(monkeypatch, off: float) -> None:
+    """Where the surface was broken a sixth of a diameter off the joint it kinks there and turns back at its end."""
+    pipe = Pipe(joint=(1.5, 0.004, math.radians(6)), seed=1)
+    monkeypatch.setattr(tube_findings, "break_candidates", lambda *_: [1.5 + off])
+    tube = pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras())
+    joint = of_kind(tube, "joint")
+    assert abs(joint["s"] - 1.5) < 2 * joint["s_sigma"] and not any(e["kind"] == "bend" for e in tube.events)
+    assert abs(math.degrees(joint["angle"]) - 6) < max(0.1, 2.5 * math.degrees(joint["angle_sigma"]))
+
+
 def test_an_open_joint_that_kinks_is_one_joint() -> None:
     pipe = Pipe(joint=(1.5, 0.0, math.radians(5)), ring=(1.5, 0.03), seed=4)
     tube = pf.fit_tube(pipe.points(4000), pipe.noise, pipe.cameras())
