@@ -46,10 +46,10 @@ def test_a_spool_with_a_bad_page_is_replaced_and_what_is_whole_is_delivered(craw
     data = bytearray(spool.read_bytes())
     data[100:400] = bytes(300)  # the schema
     spool.write_bytes(data)
-    data[:4096] = bytes(4096)
+    data[: 5 * 4096] = os.urandom(5 * 4096)
     (spool.parent / "other.db").write_bytes(data)
     refused = run("--config", crawler.config, "--set", f"spool.path={spool.parent}/other.db")
-    assert refused.returncode == 1, "whose mark and schema are gone is not known to be a spool"
+    assert refused.returncode == 1, "of whose first pages nothing is left is not known to be a spool"
     store = Store(crawler.port)
     crawler.start(*EVERY_FRAME)
     assert receive_all(crawler, store) == 0
