@@ -46,6 +46,18 @@ static inline void hook(const char *name, sqlite3_syscall_ptr call)
     (void)vfs->xSetSystemCall(vfs, name, call);
 }
 
+/* Closes the spool and takes its file away, and those that were set aside. */
+static inline void forget(const char *name)
+{
+    char other[64];
+    close_spool();
+    (void)unlink(temporary_path(name));
+    for (int i = 1; i < 4; i++) {
+        (void)snprintf(other, sizeof other, "%s.damaged-%d", name, i);
+        (void)unlink(temporary_path(other));
+    }
+}
+
 /* Object `id` of 300 bytes. */
 static inline pf_status put_small(uint64_t id)
 {

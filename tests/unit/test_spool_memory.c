@@ -29,17 +29,6 @@ static void damage_length(uint8_t *name, uint8_t row)
     memcpy(name - BEFORE_NAME, wrong, sizeof wrong);
 }
 
-static void forget(const char *name)
-{
-    char other[64];
-    close_spool();
-    (void)unlink(temporary_path(name));
-    for (int i = 1; i < 4; i++) {
-        (void)snprintf(other, sizeof other, "%s.damaged-%d", name, i);
-        (void)unlink(temporary_path(other));
-    }
-}
-
 /* Proves: a row whose length is damaged so that SQLite says "out of memory" is damage like any other: the spool opens,
  * the row alone is lost, the others keep their numbers. */
 static void test_a_length_that_no_memory_holds_costs_its_row(void)

@@ -23,17 +23,6 @@ static size_t make_three(const char *name, uint8_t *file, size_t capacity)
     return slurp(temporary_path(name), file, capacity);
 }
 
-static void forget(const char *name)
-{
-    char other[64];
-    close_spool();
-    (void)unlink(temporary_path(name));
-    for (int i = 1; i < 4; i++) {
-        (void)snprintf(other, sizeof other, "%s.damaged-%d", name, i);
-        (void)unlink(temporary_path(other));
-    }
-}
-
 /* Proves: no changed byte of the first page, be it in the name of a table, in where it begins, in what SQLite is told
  * about the file or in whose file it is, keeps the spool from opening, costs an object or a value, or hinders the next
  * object. Left out: the version, by which a newer program's spool is known. */
