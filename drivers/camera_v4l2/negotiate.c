@@ -171,6 +171,9 @@ pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_
     info->width = width;
     info->height = height;
     info->stride = s.stride > row ? s.stride : row;
+    if (!pf_pixel_format_fits(format, width, height, info->stride, s.size)) /* every frame would count as damaged */
+        return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: its %u bytes, %u a row, hold no %s of %u x %u", c->device,
+                       s.size, s.stride, format->name, width, height);
     info->frame_rate = set_rate(c, wish->frame_rate);
     return PF_OK;
 }

@@ -338,13 +338,13 @@ FAULTS = (
 )
 
 
-def plug_vivid(survey, first: int, count: int, rate: float) -> int:
+def plug_vivid(survey, first: int, count: int, rate: float, pixels: str = "GREY") -> int:
     """Plugs in a camera whose HDMI cable leads to what the world shows; the world's process.
 
     Its frames are 640 x 480; it shrinks them for us. Its link appears when all is set, as udev's does."""
     timings = "; ".join(f"v4l2-ctl -d{d} --set-dv-bt-timings=cvt,width=640,height=480,fps=60" for d in (0, 1))
     survey.board.run(f"{VIVID}; v4l2-ctl -d0 -c osd_text_mode=2; {timings}")
-    world = survey.show(first, count, rate, "/dev/video1")
+    world = survey.show(first, count, rate, "/dev/video1", pixels)
     survey.board.run("sleep 1.5; v4l2-ctl -d0 -c loop_video=1; sleep 0.5; ln -s /dev/video0 /run/camera")
     return world
 
@@ -380,6 +380,23 @@ def test_a_camera_with_faults_that_is_unplugged_goes_on(crawl, note):
     numbers = [int(row["sequence"]) for _, rows in survey.indices() for row in rows]
     steps = [after - before for before, after in itertools.pairwise(numbers)]
     assert min(steps) > 0 and max(steps) < 10_000, "numbers that go on over the wrap, with gaps as long as the pauses"
+
+
+@pytest.mark.parametrize("pixels", ["Y10", "Y12"])
+def test_a_camera_of_more_than_eight_bits_gives_the_tracks_of_its_high_eight(crawl, note, pixels):
+    """Through vivid: v4l2loopback 0.12 makes room for ten bits a pixel of Y10, where V4L2 has sixteen."""
+    camera = {"camera__device": "/run/camera", "camera__buffers": "6", "camera__exposure": "device"}
+    survey = crawl(**{**SERIAL, **SIZE, **camera}, camera__format=pixels)
+    plug_vivid(survey, 0, 45, 3, pixels)  # for longer than the survey: after its output vivid shows noise
+    survey.start_receiver(usb(survey))
+    survey.start_daemon()
+    survey.wait_for("begins")
+    survey.wait_until(lambda s: s.get("frames", 0) >= 10 and s["keyframes"] >= 6, "10 frames, 6 keyframes")
+    assert f"'{pixels:4}'" in survey.board.run("v4l2-ctl -d0 --get-fmt-video"), "another format than was asked for"
+    result = end(survey, note, f"camera that gives {pixels}")
+    assert result.keyframes_out >= 6
+    pictures = {row["sha256"] for _, rows in survey.indices() for row in rows}
+    assert len(pictures) >= 4, "one picture again and again"
 
 
 VHCI = "/sys/devices/platform/vhci_hcd.0"

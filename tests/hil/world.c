@@ -4,8 +4,8 @@
  *   pipefish-world --overrun TTY
  *
  * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
- * capturing side's differ). FORMAT: GREY, YUYV, NV12 or Y10. COUNTS.txt has the encoder's count at each frame, one a
- * line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
+ * capturing side's differ). FORMAT: GREY, YUYV, NV12, Y10 or Y12. COUNTS.txt has the encoder's count at each frame, one
+ * a line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
  * Frame i is shown when the encoder has reached its count. --overrun makes a 16550 hear itself for 64 kB: beside what
  * the other end sends at that time that is more than its 16 bytes hold.
  */
@@ -28,8 +28,8 @@
 
 typedef struct world {
     FILE *y4m;
-    uint32_t width, height, fourcc, stride, scale;
-    size_t size, at; /* of a shown frame; of the first frame in the file */
+    uint32_t width, height, fourcc, stride, scale, extra; /* extra: bits of a pixel beyond eight */
+    size_t size, at;                                      /* of a shown frame; of the first frame in the file */
     uint8_t *grey;
     int fd;
     bool is_streaming, has_buffers;
@@ -89,9 +89,9 @@ static void fill(const world *w, uint8_t *to)
             const uint8_t v = from[w->scale == 2 ? x / 4 * 2 + x % 2 : x];
             if (w->fourcc == V4L2_PIX_FMT_YUYV) {
                 row[2 * x] = v;
-            } else if (w->fourcc == V4L2_PIX_FMT_Y10) { /* the low two bits are what a tracker of bytes must not see */
-                row[2 * x] = (uint8_t)(v << 2 | (x & 3));
-                row[2 * x + 1] = v >> 6;
+            } else if (w->extra > 0) { /* the low bits are what a tracker of bytes must not see */
+                row[2 * x] = (uint8_t)(v << w->extra | (x & ((1u << w->extra) - 1)));
+                row[2 * x + 1] = (uint8_t)(v >> (8 - w->extra));
             } else {
                 row[x] = v;
             }
@@ -103,6 +103,7 @@ static void open_video(world *w, const char *device, const char *format)
 {
     struct v4l2_format f = {.type = V4L2_BUF_TYPE_VIDEO_OUTPUT};
     w->fourcc = v4l2_fourcc(format[0], format[1], format[2], format[3] ? format[3] : ' ');
+    w->extra = w->fourcc == V4L2_PIX_FMT_Y10 ? 2 : w->fourcc == V4L2_PIX_FMT_Y12 ? 4 : 0;
     w->fd = open(device, O_RDWR);
     if (w->fd < 0 || ioctl(w->fd, VIDIOC_G_FMT, &f) != 0)
         fail(device);
@@ -124,6 +125,11 @@ static void open_video(world *w, const char *device, const char *format)
     }
     w->stride = f.fmt.pix.bytesperline;
     w->size = f.fmt.pix.sizeimage;
+    const uint32_t bytes = w->extra > 0 || w->fourcc == V4L2_PIX_FMT_YUYV ? 2 : 1;
+    if (w->stride < f.fmt.pix.width * bytes || w->size < (size_t)w->stride * f.fmt.pix.height) {
+        errno = EMSGSIZE; /* v4l2loopback 0.12 counts ten bits for a pixel of Y10, which has sixteen */
+        fail("the device has no room for its own format");
+    }
     if (!w->has_buffers) {
         w->buffer[0] = malloc(w->size);
         return;

@@ -23,7 +23,8 @@ static struct {
     fake_format formats[FORMATS];
     uint32_t n_formats, width, height, fourcc, sequence, n_buffers, restarts;
     bool is_queued[SLOTS], is_done[SLOTS], is_mplane;
-    uint32_t header; /* bytes before each picture: multi-planar cameras tell of them */
+    uint32_t image_size; /* that it tells */
+    uint32_t header;     /* bytes before each picture: multi-planar cameras tell of them */
     uint32_t done[SLOTS], n_done, flags[SLOTS], numbers[SLOTS], damaged_next;
     uint64_t stamps[SLOTS];
     uint8_t memory[MAPS][BYTES]; /* a fresh one for each mapping: what is unmapped is never seen again */
@@ -85,7 +86,7 @@ static int set_format(struct v4l2_format *f)
     p->pixelformat = has ? p->pixelformat : k.formats[0].fourcc;
     p->field = V4L2_FIELD_NONE;
     p->bytesperline = STRIDE * (p->pixelformat == V4L2_PIX_FMT_YUYV ? 2 : 1);
-    p->sizeimage = BYTES;
+    p->sizeimage = k.image_size;
     if (k.is_mplane)
         f->fmt.pix_mp = (struct v4l2_pix_format_mplane){
             .width = p->width,
@@ -326,6 +327,7 @@ void setUp(void)
     k.formats[0] = (fake_format){V4L2_PIX_FMT_YUYV, 0};
     k.formats[1] = (fake_format){V4L2_PIX_FMT_GREY, 0};
     k.n_formats = 2;
+    k.image_size = BYTES;
     k.width = W;
     k.height = H;
     camera.self = NULL;
@@ -467,6 +469,18 @@ static void test_what_the_camera_cannot_do_is_said_with_what_it_can(void)
     TEST_ASSERT_EQUAL_INT(PF_ERR_ARGUMENT, open_with(W, 0, "", 0));
     k.is_plugged = false;
     TEST_ASSERT_EQUAL_INT(PF_ERR_IO, open_with(0, 0, "", 0)); /* nobody knows what to wait for */
+}
+
+/* As v4l2loopback 0.12 has it: ten bits of memory for a pixel of Y10. Each frame would be too short. */
+static void test_a_camera_without_room_for_its_own_format_is_told_of(void)
+{
+    k.formats[0].fourcc = V4L2_PIX_FMT_Y10;
+    k.n_formats = 1;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, open_with(W, H, "", 0), error);
+    close_camera();
+    k.image_size = W * H * 10 / 8;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, open_with(W, H, "", 0));
+    TEST_ASSERT_NOT_NULL_MESSAGE(strstr(error, "its 3840 bytes, 80 a row, hold no Y10 of 64 x 48"), error);
 }
 
 static void test_a_camera_that_is_not_there_yet_is_waited_for(void)
@@ -640,6 +654,7 @@ int main(void)
     RUN_TEST(test_a_header_before_the_picture_is_skipped);
     RUN_TEST(test_the_best_format_that_is_fast_enough_is_chosen);
     RUN_TEST(test_what_the_camera_cannot_do_is_said_with_what_it_can);
+    RUN_TEST(test_a_camera_without_room_for_its_own_format_is_told_of);
     RUN_TEST(test_a_camera_that_is_not_there_yet_is_waited_for);
     RUN_TEST(test_a_camera_that_another_program_uses_is_waited_for);
     RUN_TEST(test_a_stall_is_over_within_two_seconds_by_stop_and_start);
