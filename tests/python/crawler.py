@@ -118,12 +118,13 @@ class Crawler:
             section, name = key.split(".")
             sections.setdefault(section, []).append(f"{name} = {value}")
         self.config.write_text("".join(f"[{s}]\n" + "\n".join(lines) + "\n" for s, lines in sections.items()))
+        self.program = find_daemon()
         self.process: subprocess.Popen[bytes] | None = None
         self.made.append(self)
 
     def start(self, *arguments: str) -> None:
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen([find_daemon(), "--config", self.config, *arguments], stderr=log)
+            self.process = subprocess.Popen([self.program, "--config", self.config, *arguments], stderr=log)
 
     def kill(self) -> None:
         self.process.kill()

@@ -1,24 +1,139 @@
-"""What others install: the C library for CMake and pkg-config, with an example that uses nothing else."""
+"""What `make deb` makes for this machine, unpacked by dpkg and used from there: daemon and host tools take a survey
+together; the C library is found by CMake and by pkg-config, with an example that uses nothing else."""
+
+from __future__ import annotations
 
 import re
 import shutil
 import subprocess
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from crawler import HEIGHT, ROOT, WIDTH, find_daemon, texture
+from crawler import HEIGHT, PATIENCE_S, ROOT, WIDTH, Crawler, texture
+from pipefish.survey import Survey
 
 SHIFT = 2  # px a frame
+VERSION = metadata.version("pipefish")
+DAEMON, LIBRARY, HOST = "pipefishd", "libpipefish-dev", "pipefish"
+HEADERS = {p.name for p in (ROOT / "lib/include/pipefish").glob("*.h")} - {"messages.h"}  # its codec is the daemon's
+pytestmark = pytest.mark.skipif(shutil.which("dpkg-shlibdeps") is None, reason="NO PACKAGES: this is no Debian")
+
+
+def output(*command: object, **options) -> str:
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, **options)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    prefix = tmp_path_factory.mktemp("usr")
-    build = find_daemon().parents[1]
-    subprocess.run(["cmake", "--install", build, "--prefix", prefix, "--component", "dev"], check=True)
-    return prefix
+def packages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Of what `make build` has built."""
+    folder = tmp_path_factory.mktemp("deb")
+    output("make", "-C", ROOT, "deb-built", f"DEB={folder}")
+    return {output("dpkg-deb", "-f", deb, "Package").strip(): deb for deb in folder.glob("*.deb")}
+
+
+@pytest.fixture(scope="module")
+def root(packages: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A root folder with all of them and nothing else."""
+    folder = tmp_path_factory.mktemp("root")
+    for deb in packages.values():
+        output("dpkg-deb", "-x", deb, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(root: Path) -> Path:
+    return root / "usr"
+
+
+def contents(deb: Path) -> dict[str, str]:
+    """The files of a package, as /path: mode; all of them must be root's."""
+    rows = [line.split(maxsplit=5) for line in output("dpkg-deb", "-c", deb).splitlines()]
+    assert {owner for _, owner, *_ in rows} == {"root/root"}
+    return {row[5].removeprefix("."): row[0] for row in rows if not row[0].startswith("d")}
+
+
+def fields(deb: Path) -> dict[str, str]:
+    return dict(re.findall(r"^([A-Z][\w-]*): (.*)$", output("dpkg-deb", "-f", deb), re.M))
+
+
+def test_the_packages_are_of_this_machine_this_version_and_share_no_file(packages: dict[str, Path]):
+    assert set(packages) == {DAEMON, LIBRARY, HOST}
+    files = {name: contents(deb) for name, deb in packages.items()}
+    for name, deb in packages.items():
+        said = fields(deb)
+        assert said["Version"] == VERSION
+        assert said["Architecture"] == output("dpkg", "--print-architecture").strip()
+        assert said["Maintainer"] and said["Description"]
+        assert files[name][f"/usr/share/doc/{name}/copyright"] == "-rw-r--r--"
+    assert len(set().union(*files.values())) == sum(len(f) for f in files.values())
+
+
+def test_the_daemons_package_brings_its_unit_rules_settings_and_scripts(packages: dict[str, Path], tmp_path: Path):
+    assert contents(packages[DAEMON]) == {
+        "/usr/bin/pipefishd": "-rwxr-xr-x",
+        "/usr/lib/systemd/system/pipefishd.service": "-rw-r--r--",
+        "/usr/lib/udev/rules.d/60-pipefishd.rules": "-rw-r--r--",
+        "/usr/share/pipefishd/pipefishd.ini.example": "-rw-r--r--",
+        "/usr/share/doc/pipefishd/copyright": "-rw-r--r--",
+    }
+    output("dpkg-deb", "-e", packages[DAEMON], tmp_path)
+    for script in ("postinst", "prerm", "postrm"):  # these make the user, stop the service and clean up
+        assert (tmp_path / script).read_text() == (ROOT / "packaging" / script).read_text()
+        assert (tmp_path / script).stat().st_mode & 0o777 == 0o755
+    assert "adduser" in fields(packages[DAEMON])["Depends"]
+
+
+def test_the_librarys_package_brings_every_header_and_what_finds_it(packages: dict[str, Path]):
+    files = contents(packages[LIBRARY])
+    assert set(files.values()) == {"-rw-r--r--"}
+    headers = {Path(f).name for f in files if f.startswith("/usr/include/pipefish/")}
+    assert headers == HEADERS and len(headers) >= 9
+    others = {Path(f).name for f in files} - headers
+    cmake = {"pipefishConfig.cmake", "pipefishConfigVersion.cmake", "pipefishConfig-release.cmake"}
+    assert others == {"libpipefish.a", "pipefish.pc", "copyright", "track.c", "CMakeLists.txt"} | cmake
+
+
+def test_the_host_tools_package_brings_all_of_the_python_package(packages: dict[str, Path]):
+    files = contents(packages[HOST])
+    assert files["/usr/bin/pipefish"] == "-rwxr-xr-x"
+    folder = ROOT / "host_tools"
+    ours = {f"/usr/lib/pipefish/{p.relative_to(folder)}" for p in (folder / "pipefish").rglob("*.py")}
+    assert len(ours) > 50 and ours <= set(files)
+    assert any(re.fullmatch(r"/usr/lib/pipefish/pipefish/_engine\..*\.so", f) for f in files)
+    assert not any("__pycache__" in f or "editable" in f for f in files)
+
+
+def test_the_packages_depend_on_what_their_programs_are_linked_with(packages: dict[str, Path], root: Path):
+    """Asked of this machine, on which they were linked: who brings each library."""
+    engines = list((root / "usr/lib/pipefish/pipefish").rglob("*.so"))
+    for name, programs in ((DAEMON, [root / "usr/bin/pipefishd"]), (HOST, engines)):
+        depends = set(re.findall(r"(?:^|, )([a-z0-9.+-]+)", fields(packages[name])["Depends"]))
+        needed = {lib for p in programs for lib in re.findall(r"\(NEEDED\).*\[(.*?)\]", output("readelf", "-d", p))}
+        assert "libc.so.6" in needed and len(needed) > 3
+        found = [line.split(": ") for line in output("dpkg", "-S", *(f"*/{lib}" for lib in needed)).splitlines()]
+        for library in needed:
+            owners = {owner.partition(":")[0] for owner, path in found if Path(path).name == library}
+            assert owners & depends, f"{name} needs {library} of {owners}"
+
+
+def test_daemon_and_host_tools_of_the_packages_take_a_survey(root: Path, tmp_path: Path):
+    host, daemon = root / "usr/bin/pipefish", root / "usr/bin/pipefishd"
+    assert output(daemon, "--version") == f"pipefishd {VERSION}\n" and "usage: pipefishd" in output(daemon, "--help")
+    assert output(host, "--version") == f"pipefish {VERSION}\n" and "usage: pipefish" in output(host, "--help")
+    output(host, "simulate", ROOT / "tests/hil/crawl.toml", "-o", tmp_path / "survey", cwd=tmp_path)
+    crawler = Crawler(tmp_path)
+    crawler.program = daemon
+    crawler.start()
+    device, survey = f"tcp://127.0.0.1:{crawler.port}", tmp_path / "survey.mcap"
+    output(host, "receive", device, "-o", survey, cwd=tmp_path, timeout=2 * PATIENCE_S)
+    assert crawler.wait() == 0
+    received = Survey.open(survey)
+    assert received.complete and len(received.keyframes) > 5
 
 
 def run_on_frames(program: Path, folder: Path) -> list[list[str]]:
@@ -56,14 +171,15 @@ def test_pkg_config_finds_the_library_where_it_was_installed(installed: Path, tm
         text=True,
         check=True,
     ).stdout.split()
-    command = ["cc", ROOT / "examples/track/track.c", "-o", tmp_path / "track", *flags]
+    source = installed / "share/doc/libpipefish-dev/examples/track/track.c"
+    command = ["cc", source, "-o", tmp_path / "track", *flags]
     subprocess.run(command, check=True)
     check_tracks(run_on_frames(tmp_path / "track", tmp_path))
 
 
 def test_the_headers_stand_alone_in_c_and_cxx(installed: Path, tmp_path: Path):
     headers = sorted((installed / "include").rglob("*.h"))
-    assert len(headers) >= 9
+    assert {h.name for h in headers} == HEADERS
     for compiler, suffix in (("cc", "c"), ("c++", "cpp")):
         for header in headers:
             source = tmp_path / f"one.{suffix}"
@@ -73,8 +189,9 @@ def test_the_headers_stand_alone_in_c_and_cxx(installed: Path, tmp_path: Path):
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
-def test_the_unit_is_one_that_systemd_understands(tmp_path: Path):
-    unit = (find_daemon().parents[1] / "packaging" / "pipefishd.service").read_text()
+def test_the_unit_is_one_that_systemd_understands(installed: Path, tmp_path: Path):
+    unit = (installed / "lib/systemd/system/pipefishd.service").read_text()
+    assert "ExecStart=/usr/bin/pipefishd " in unit and "User=pipefish\n" in unit
     (tmp_path / "pipefishd.service").write_text(re.sub(r"ExecStart=\S+", "ExecStart=/bin/true", unit))
     command = ["systemd-analyze", "verify", "--man=no", tmp_path / "pipefishd.service"]
     done = subprocess.run(command, capture_output=True, text=True)
