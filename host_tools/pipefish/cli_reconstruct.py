@@ -49,7 +49,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def add_reconstruct(commands: Any) -> None:
-    """Adds the commands."""
+    """Adds `reconstruct` to the command line."""
     from pipefish.cli_profile import add_profile_input
 
     p = add_command(
@@ -94,48 +94,9 @@ def add_reconstruct(commands: Any) -> None:
     )
     add_profile_input(p)
 
-    p = add_command(
-        commands,
-        "unroll",
-        run_unroll,
-        "Draw the wall as one picture at true scale: chainage by clock, best view of each place, in one light.",
-        "pipefish unroll out/ -o unrolled.png --labels",
-    )
-    p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
-    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
-    p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
-    p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
-    p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
-    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
-    p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
-
-    p = add_command(
-        commands,
-        "report",
-        run_report,
-        "Write one HTML page about a measured pipe: figures and limits, profile, findings, 3-D, quality. No network.",
-        "pipefish report out/ -o report.html --limit ovality=5 --limit d_min=285",
-    )
-    p.add_argument("folder", metavar="DIR", help="of pipefish reconstruct")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="page to write")
-    p.add_argument(
-        "--limit",
-        type=_limit,
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
-        "ovality_astm_max, reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm). Unless all "
-        "passed the exit code is 1",
-    )
-    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
-    p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
-    p.add_argument("--title", help="of the page [the survey's name]")
-
 
 def run_reconstruct(args: argparse.Namespace) -> Result:
-    """Runs the command."""
+    """Measures a survey and writes the files."""
     from pipefish.measure import measure
     from pipefish.measured_files import write_measurement
     from pipefish.progress import Progress
@@ -230,6 +191,25 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     return table(rows)
 
 
+def add_unroll(commands: Any) -> None:
+    """Adds `unroll` to the command line."""
+    p = add_command(
+        commands,
+        "unroll",
+        run_unroll,
+        "Draw the wall as one picture at true scale: chainage by clock, best view of each place, in one light.",
+        "pipefish unroll out/ -o unrolled.png --labels",
+    )
+    p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
+    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
+    p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
+    p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
+    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
+    p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
+
+
 def run_unroll(args: argparse.Namespace) -> Result:
     """Runs the command."""
     from pipefish.progress import Progress
@@ -260,6 +240,32 @@ def run_unroll(args: argparse.Namespace) -> Result:
         *(("written", file) for file in files),
     ]
     return document, table(rows)
+
+
+def add_report(commands: Any) -> None:
+    """Adds `report` to the command line."""
+    p = add_command(
+        commands,
+        "report",
+        run_report,
+        "Write one HTML page about a measured pipe: figures and limits, profile, findings, 3-D, quality. No network.",
+        "pipefish report out/ -o report.html --limit ovality=5 --limit d_min=285",
+    )
+    p.add_argument("folder", metavar="DIR", help="of pipefish reconstruct")
+    p.add_argument("-o", "--output", required=True, metavar="FILE", help="page to write")
+    p.add_argument(
+        "--limit",
+        type=_limit,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
+        "ovality_astm_max, reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm). Unless all "
+        "passed the exit code is 1",
+    )
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
+    p.add_argument("--title", help="of the page [the survey's name]")
 
 
 def run_report(args: argparse.Namespace) -> Result:
