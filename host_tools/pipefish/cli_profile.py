@@ -12,6 +12,7 @@ from typing import Any
 
 from pipefish.cli import Result, UsageError, add_command, not_negative, positive, table
 from pipefish.errors import ArgumentError, ProfileError
+from pipefish.intervals import Z95
 
 # The forms of --from and --to: formats.READERS and WRITERS, whose import costs time here.
 READ = (
@@ -99,7 +100,7 @@ def run_profile_show(args: argparse.Namespace) -> Result:
             f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
         ),
         ("model chosen", camera.provenance.model_choice or None),
-        ("sigma(alpha)", _alpha_text(alpha)),
+        ("stretch along the axis", _alpha_text(alpha)),
         ("drawn in", args.out),
     ]
     document = json.loads(camera.to_json())
@@ -115,7 +116,8 @@ def _alpha_text(sigma: float | None) -> str | None:
     if sigma is None:
         return None
     angle = 0.5 / math.radians(45) * sigma  # sin cos of 45 degrees, of the angle itself
-    return f"{100 * sigma:.2g} % of a diameter beside an encoder, {100 * angle:.2g} % of the angle at 45 deg (1 sigma)"
+    of_diameter, of_angle = (100 * Z95 * value for value in (sigma, angle))
+    return f"± {of_diameter:.2g} % of a diameter beside an encoder, ± {of_angle:.2g} % of the angle at 45 deg (95 %)"
 
 
 def run_profile_check(args: argparse.Namespace) -> Result:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipefish.cli import DONE, FAILED, Result, UsageError, add_command, table
+from pipefish.intervals import SAID, Z95
 
 
 def _millimetres(text: str) -> float:
@@ -19,8 +20,9 @@ def _millimetres(text: str) -> float:
 
 
 def _known(text: str) -> Any:
-    """A length in millimetres with its tolerance, which is taken for 95 %: 1000, 1000+-2, 1000mm±2."""
-    from pipefish.scale import Z95, Known
+    """A length in millimetres with its tolerance, which is taken for 95 %: 1000, 1000+-2, 1000mm±2. On a
+    keyboard +- is easier."""
+    from pipefish.scale import Known
 
     number = r"([0-9]+(?:\.[0-9]*)?)\s*(?:mm)?"
     found = re.fullmatch(rf"\s*{number}\s*(?:(?:\+-|\+/-|±)\s*{number})?\s*", text)
@@ -136,7 +138,7 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
 
     s = document["summary"]
     unit = s["unit"]
-    shared = length_text(1.96 * s["d_mean_systematic"], unit)
+    shared = length_text(Z95 * s["d_mean_systematic"], unit)
     rows: list[tuple[str, object]] = [
         ("status", document["status"]),
         (
@@ -158,9 +160,8 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
         rows.append(
             (
                 "mean diameter",
-                f"{length_text(s['d_mean'], unit)} +- {length_text(1.96 * s['d_mean_sigma'], unit)} (95 %, "
-                "repeatability) "
-                f"+- {shared} (95 %, systematic)",
+                f"{length_text(s['d_mean'], unit)} ± {length_text(Z95 * s['d_mean_sigma'], unit)} (repeatability) "
+                f"± {shared} (systematic: scale and camera, the same all along)",
             )
         )
     rows += [("scale", told) for told in scale_texts(document["scale"])]
@@ -187,7 +188,9 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     if verdict and not any(remark.startswith(verdict["text"].rstrip(".")) for remark in document["remarks"]):
         rows.append(("profile", verdict["text"]))
     rows += [("note", remark) for remark in document["remarks"]]
+    rows.append(("intervals", SAID))
     rows += [("written", file) for file in files]
+    rows += [("about files", told) for told in document["file_remarks"]]
     return table(rows)
 
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipefish.errors import ArgumentError
-from pipefish.measured_texts import OVALITIES, Z95, column, length_text
+from pipefish.intervals import Z95
+from pipefish.measured_texts import OVALITIES, column, length_text
 
 #: A bound further off the pipe's diameter than by this factor was meant in another unit: metres, centimetres, inches.
 DIAMETER_OFF = 5.0

@@ -273,7 +273,7 @@ def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged
     check = next(r for r in document["scale"]["sources"] if r["name"] == "diameter")
     assert not check["consistent"] and check["deviation"] < -3 and not check["used"]
     assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
-    assert "sigma apart" in " ".join(document["remarks"])
+    assert "times the 95 % interval of the difference" in " ".join(document["remarks"])
     assert "Recalibrate the camera, unless the encoder or the given diameter is wrong." in " ".join(document["remarks"])
 
 

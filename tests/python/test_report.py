@@ -72,7 +72,7 @@ def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path):
     summary = read_wall(measured / "out").document["summary"]
     out, close = tmp_path / "report.html", f"ovality={100 * summary['ovality_most']:.3f}"
     assert main(["report", str(measured / "out"), "-o", str(out), "--limit", close]) == 1
-    assert "Undecided: the 95 % interval" in out.read_text()
+    assert "Undecided: the interval at the worst station" in out.read_text()
 
 
 def test_bands_of_ovality_hold_what_the_limits_count(measured):
