@@ -313,7 +313,8 @@ def colmap_model(m: Measurement) -> tuple[dict[str, bytes], str]:
     try:
         written = colmap(m.camera, Wanted(COLMAP_ERROR_PX, limit if m.camera.theta_max > COLMAP_THETA else None))
     except ProfileError as error:
-        return {}, f"No COLMAP model: {error.reason}."
+        why = str(error.reason).partition("; --")[0]  # what else it says are options of another command
+        return {}, f"No COLMAP model: {why}."
     keep = m.residuals.inlier & (m.residuals.theta < limit)
     frame, point, item = (v[keep] for v in (m.residuals.frame, m.residuals.point, m.residuals.item))
     error = np.linalg.norm(m.residuals.pixels[keep], axis=1)

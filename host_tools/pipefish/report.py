@@ -23,7 +23,7 @@ from pipefish.report_wall import WallPicture, wall_picture
 from pipefish.unroll import Tell
 
 INTERVALS = (
-    f"{SAID.capitalize()}. Repeatability: by how much another drive through the pipe would differ. Systematic: what it "
+    "Repeatability: by how much another drive through the pipe would differ. Systematic: what it "
     "would repeat, as scale and camera stay the same."
 )
 FILES = {

@@ -15,6 +15,7 @@ from pipefish.measured_remarks import TREND_PX
 from pipefish.measured_texts import OVALITIES, column, read_measured
 from pipefish.page import Chart
 
+LEAST_SPAN = 0.1  # diameters that the axis of heights spans
 NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
 
 DIAMETERS = (
@@ -229,9 +230,15 @@ class Charts:
                 "title": "Height of the centreline",
                 "text": f"Above where the pipe starts; up is {known}.",
                 "data": [{**line, "x": cut(self.x), "y": cut(self.factor * height)}],
-                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short)},
+                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short, range=self._heights(height))},
             },
         ]
+
+    def _heights(self, height: np.ndarray) -> list[float]:
+        """The range of the axis: not less than LEAST_SPAN, so that what adds up to a millimetre looks like one."""
+        low, high = float(np.nanmin(height)), float(np.nanmax(height))
+        half = max(0.55 * (high - low), LEAST_SPAN * self.summary["d_mean"] / 2)
+        return [round(self.factor * ((low + high) / 2 + end), 4) for end in (-half, half)]
 
     def charts_quality(self) -> list[Chart]:
         """Residuals by angle, points on the wall, encoder against vision."""
