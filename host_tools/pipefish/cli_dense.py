@@ -16,8 +16,7 @@ def run_dense(args: argparse.Namespace) -> Result:
     from pipefish.dense import DenseWall, dense_wall
     from pipefish.dense_cracks import find_cracks
     from pipefish.dense_files import Strip, strips_of, write_dense
-    from pipefish.dense_findings import finding_parts, findings_of, fingerprint
-    from pipefish.measured_texts import length_text
+    from pipefish.dense_findings import fingerprint
     from pipefish.progress import Progress
     from pipefish.wall import read_wall
 
@@ -58,6 +57,14 @@ def run_dense(args: argparse.Namespace) -> Result:
             raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
         summary, made = measured.document["summary"], fingerprint(Path(args.measured))
         document, files = write_dense(Path(args.output), maps, mapped, measured.unit, summary, made)
+    return document, _text(document, files)
+
+
+def _text(document: dict[str, Any], files: list[str]) -> str:
+    """The result for people."""
+    from pipefish.dense_findings import finding_parts, findings_of
+    from pipefish.measured_texts import length_text
+
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
     sigma = document["sigma_median"]  # None: nothing was measured
@@ -83,7 +90,7 @@ def run_dense(args: argparse.Namespace) -> Result:
     if len(found_there) > 40:
         rows.append(("and", f"{len(found_there) - 40} more findings"))
     rows.append(("intervals", SAID))
-    return document, table([*rows, *(("written", f) for f in files)])
+    return table([*rows, *(("written", f) for f in files)])
 
 
 def add_dense(commands: Any) -> None:

@@ -134,52 +134,10 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
     from pipefish.measured_reach import reach_text
-    from pipefish.measured_texts import events_text, length_text, percent_text, scale_texts
+    from pipefish.measured_texts import events_text
 
-    s = document["summary"]
-    unit = s["unit"]
-    shared = length_text(Z95 * s["d_mean_systematic"], unit)
-    rows: list[tuple[str, object]] = [
-        ("status", document["status"]),
-        (
-            "keyframes",
-            f"{s['keyframes_with_pose']} of {s['keyframes']} with a pose"
-            + (f", in {s['stretches']} stretches" if s["stretches"] > 1 else ""),
-        ),
-        ("points", s["points"]),
-        ("path", length_text(s["path_length"], unit, metres=True)),
-    ]
-    if s["diameter_from_prior"]:
-        rows.append(
-            (
-                "mean diameter",
-                "given, not measured" if unit == "metre" else "not measured: no scale (lengths in diameters)",
-            )
-        )
-    else:
-        rows.append(
-            (
-                "mean diameter",
-                f"{length_text(s['d_mean'], unit)} ± {length_text(Z95 * s['d_mean_sigma'], unit)} (repeatability) "
-                f"± {shared} (systematic: scale and camera, the same all along)",
-            )
-        )
-    rows += [("scale", told) for told in scale_texts(document["scale"])]
-    rows.append(
-        (
-            "along the pipe",
-            f"{length_text(s['d_mean_least'], unit)} to {length_text(s['d_mean_most'], unit)}, "
-            f"{s['stations_measured']} of {s['stations']} stations",
-        )
-    )
-    if "ovality_rms" in s:
-        rows.append(
-            (
-                "ovality",
-                f"{percent_text(s['ovality_rms'])} (rms along the pipe), most {percent_text(s['ovality_most'])} at "
-                f"{length_text(s['ovality_most_at'], unit, metres=True)} ((max - min) / mean)",
-            )
-        )
+    unit = document["summary"]["unit"]
+    rows = _figures(document)
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
     rows.append(
         ("findings", reach_text(document["findings_reach"], unit) + " `pipefish dense` finds smaller ones, and cracks.")
@@ -192,6 +150,46 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     rows += [("written", file) for file in files]
     rows += [("about files", told) for told in document["file_remarks"]]
     return table(rows)
+
+
+def _figures(document: dict[str, Any]) -> list[tuple[str, object]]:
+    """What was measured, and how much of the pipe."""
+    from pipefish.measured_texts import length_text, scale_texts
+
+    s = document["summary"]
+    unit = s["unit"]
+    stretches = f", in {s['stretches']} stretches" if s["stretches"] > 1 else ""
+    if s["diameter_from_prior"]:
+        mean = "given, not measured" if unit == "metre" else "not measured: no scale (lengths in diameters)"
+    else:
+        value, own, shared = (
+            length_text(v, unit) for v in (s["d_mean"], Z95 * s["d_mean_sigma"], Z95 * s["d_mean_systematic"])
+        )
+        mean = f"{value} ± {own} (repeatability) ± {shared} (systematic: scale and camera, the same all along)"
+    span = f"{length_text(s['d_mean_least'], unit)} to {length_text(s['d_mean_most'], unit)}"
+    rows: list[tuple[str, object]] = [
+        ("status", document["status"]),
+        ("keyframes", f"{s['keyframes_with_pose']} of {s['keyframes']} with a pose{stretches}"),
+        ("points", s["points"]),
+        ("path", length_text(s["path_length"], unit, metres=True)),
+        ("mean diameter", mean),
+        *(("scale", told) for told in scale_texts(document["scale"])),
+        ("along the pipe", f"{span}, {s['stations_measured']} of {s['stations']} stations"),
+    ]
+    if "ovality_rms" in s:
+        rows.append(("ovality", _ovality(document)))
+    return rows
+
+
+def _ovality(document: dict[str, Any]) -> str:
+    """Along the pipe, and where it is most, with its interval."""
+    from pipefish.measured_limits import most_oval
+    from pipefish.measured_texts import length_text, percent_text
+
+    s = document["summary"]
+    at = length_text(s["ovality_most_at"], s["unit"], metres=True)
+    most = f"{100 * s['ovality_most']:.2f} ± {100 * most_oval(document):.2f} %"
+    return f"{percent_text(s['ovality_rms'])} (rms along the pipe), most {most} at {at} ((max - min) / mean)"
 
 
 def add_unroll(commands: Any) -> None:

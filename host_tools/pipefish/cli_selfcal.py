@@ -80,6 +80,13 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     sigma = math.sqrt(camera.covariance[0, 0])
     document |= {"camera": {key: getattr(camera, key) for key in PARAMETERS} | {"f_u_sigma": sigma}}
     document |= {"pairs": pairs, "files": [args.output]}
+    return document, _text(found, pairs, args.output)
+
+
+def _text(found: Any, pairs: list[dict[str, Any]], output: str) -> str:
+    """The result for people."""
+    camera = found.camera
+    sigma = math.sqrt(camera.covariance[0, 0])
     rows: list[tuple[str, object]] = [
         ("focal length", f"{camera.f_u:.1f} ± {Z95 * sigma:.1f} px a radian"),
         ("centre", f"{camera.c_u:.1f}, {camera.c_v:.1f}"),
@@ -107,8 +114,8 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     rows.append(("pairs", f"{len(used)} of {len(pairs)}, {sum(p['inliers'] for p in used)} matches"))
     rows += [("left out", f"{p['name']}: {STATES[p['status']]}") for p in pairs if p["status"] != "ok"]
     rows.append(("intervals", SAID))
-    rows.append(("written", args.output))
-    return document, table(rows)
+    rows.append(("written", output))
+    return table(rows)
 
 
 def add_selfcal(commands: Any) -> None:

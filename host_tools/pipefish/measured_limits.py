@@ -76,6 +76,11 @@ def whole_sigma(document: dict[str, Any], quantity: str) -> np.ndarray:
     return sigma
 
 
+def most_oval(document: dict[str, Any]) -> float:
+    """Half width of the 95 % interval of the largest ovality."""
+    return Z95 * float(whole_sigma(document, "ovality")[int(np.nanargmax(column(document, "ovality")))])
+
+
 def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:
     """Whether a limit holds at every station with ovality, with 95 % intervals of repeatability and systematic error
     together: "passed", "passed where measured", "failed", "undecided" (the interval holds it), "not measured"."""

@@ -12,7 +12,7 @@ import numpy as np
 from pipefish.dense_findings import finding_parts
 from pipefish.files import write_atomically
 from pipefish.intervals import SAID, Z95
-from pipefish.measured_limits import LIMITS, check_limits, verdict, whole_sigma
+from pipefish.measured_limits import LIMITS, check_limits, most_oval, verdict, whole_sigma
 from pipefish.measured_reach import UNSEEN, reach_text
 from pipefish.measured_texts import clock_text, column, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
@@ -84,9 +84,7 @@ class Report(Charts):
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
             rms = s.get("ovality_rms")  # older documents have none
             along = "" if rms is None else f"; {100 * rms:.2f} % rms along the pipe"
-            half = (
-                100 * Z95 * whole_sigma(self.document, "ovality")[int(np.nanargmax(column(self.document, "ovality")))]
-            )
+            half = 100 * most_oval(self.document)
             tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, ± {half:.2f}, at {at}{along}"))
         figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
         tiles.append(figure)

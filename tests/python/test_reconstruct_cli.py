@@ -19,6 +19,7 @@ import pytest
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
+from pipefish.cli_reconstruct import reconstruct_text
 from pipefish.cloudfile import read_columns, read_points
 from pipefish.measure import measure
 from pipefish.measured_files import write_measurement
@@ -244,6 +245,19 @@ def test_the_colmap_model_reprojects_with_its_own_pixel_origin(drive, out):
     assert np.sqrt((errors**2).mean()) < 0.4 and np.abs(errors.mean(axis=0)).max() < 0.02
     for number, (_, track) in world.items():
         assert all(seen[i][j, 2] == number for i, j in track)
+
+
+def test_the_terminal_says_once_what_plus_minus_is(out):
+    """95 % of everything: standard deviations stood among intervals, and the largest ovality alone."""
+    document = document_of(out) | {"file_remarks": ["No COLMAP model: it is Tuesday."]}
+    lines = dict(line.split("  ", 1) for line in reconstruct_text(document, ["a.csv"]).splitlines())
+    text, s = "\n".join(lines.values()), document["summary"]
+    assert text.count("95 %") == 1 and "sigma" not in text and "+-" not in text
+    assert f"± {1960 * s['d_mean_sigma']:.1f} mm (repeatability) ± {1960 * s['d_mean_systematic']:.1f} mm" in text
+    k = document["stations"]["ovality"].index(s["ovality_most"])
+    half = 196 * np.hypot(*(document["stations"][f"ovality_{n}"][k] for n in ("sigma", "systematic")))
+    assert f"most {100 * s['ovality_most']:.2f} ± {half:.2f} % at" in text
+    assert list(lines)[-1] == "about files" and "Tuesday" not in text.partition("every ±")[0]
 
 
 def test_without_scale_everything_is_relative_and_says_so(drive, tmp_path, capsys):
