@@ -125,7 +125,7 @@ def add_commands(commands: Any) -> None:
     from pipefish.cli_homography import add_homography
     from pipefish.cli_match import add_match
     from pipefish.cli_pair import add_pair
-    from pipefish.cli_profile import add_profile
+    from pipefish.cli_profile import add_profile, add_undistort
     from pipefish.cli_recognise import add_recognise
     from pipefish.cli_reconstruct import add_reconstruct, add_report, add_unroll
     from pipefish.cli_record import add_record
@@ -139,7 +139,7 @@ def add_commands(commands: Any) -> None:
     survey = (add_demo, add_simulate, add_receive, add_status, add_info, add_show)
     pipe = (add_reconstruct, add_dense, add_unroll, add_report, add_tube, add_evaluate)
     camera = (add_target, add_record, add_calibrate, add_selfcal, add_profile, add_flash, add_pair)
-    pictures = (add_match, add_recognise, add_segment, add_homography)
+    pictures = (add_undistort, add_match, add_recognise, add_segment, add_homography)
     for add in (*survey, *pipe, *camera, *pictures):
         add(commands)
 

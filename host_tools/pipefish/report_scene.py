@@ -22,6 +22,7 @@ from pipefish.report_charts import Charts
 MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # a phone turns that
 SCENE_LENGTH = 2.5  # of the scene's longest side, in Plotly's units
 FULL_COLOUR = 3.0  # half widths of the interval that full colour is off, at least: noise is not shown as a finding
+LABELLED = 0.2  # of the longest side: a shorter one has no numbers, there is no room
 NAMED_APART = 0.07  # of the pipe's length: nearer findings are marked, but not both named
 
 
@@ -116,7 +117,10 @@ class Scene:
         extent = np.maximum(high - low, 1e-9)
         ratio = (SCENE_LENGTH * extent / extent.max()).round(4).tolist()  # true proportions
         unit = self.charts.along_unit
-        titles = (f"right, {unit}", f"ahead, {unit}", "")
+        long = extent >= LABELLED * extent.max()
+        titles = [
+            title if shown else "" for title, shown in zip((f"right, {unit}", f"ahead, {unit}", ""), long, strict=True)
+        ]
         axes = {
             f"{name}axis": {
                 "title": {"text": title},
@@ -218,13 +222,13 @@ class Scene:
 
 
 def named(at: list[float], names: list[str], apart: float) -> list[str]:
-    """The names of marks at rising places, without those that would lie over the last one that is written."""
-    last, out = -math.inf, []
-    for place, name in zip(at, names, strict=True):
-        shown = place - last >= apart
-        last = place if shown else last
-        out.append(name if shown else "")
-    return out
+    """The names of marks at places along the pipe, without those that would lie over another one: the rarer kind's is
+    kept, so that a deposit is not lost among joints."""
+    shown: list[int] = []
+    for k in sorted(range(len(at)), key=lambda k: (names.count(names[k]), at[k])):
+        if all(abs(at[k] - at[other]) >= apart for other in shown):
+            shown.append(k)
+    return [name if k in shown else "" for k, name in enumerate(names)]
 
 
 def _columns(points: np.ndarray) -> dict[str, list[float | None]]:

@@ -130,6 +130,8 @@ def test_noise_is_grey_and_a_limit_has_full_colour(measured):
 
 def test_names_of_near_findings_do_not_lie_over_each_other():
     assert named([1.0, 1.02, 1.5, 1.55, 1.61], ["a", "b", "c", "d", "e"], 0.1) == ["a", "", "c", "", "e"]
+    joints = ["joint", "deposit", "joint", "joint"]
+    assert named([1.0, 1.05, 1.1, 1.2], joints, 0.1) == ["", "deposit", "", "joint"], "the rarer kind's name is kept"
 
 
 def test_names_of_near_rings_on_the_wall_stand_below_each_other():
