@@ -26,8 +26,14 @@ DEVICE_HELP = (
 )
 
 
-def printable(text: str) -> str:
-    """As a terminal may have it: a survey's or a device's texts could hold codes that clear it or fake other lines."""
+def printable(text: str, encoding: str | None = None) -> str:
+    """As a terminal of this encoding [UTF-8] may have it: a survey's or a device's texts could hold codes that clear it
+    or fake other lines. What it has no letter for is told otherwise: a long measurement must not end in an error."""
+    known = encoding or "utf-8"
+    try:
+        text.encode(known)
+    except UnicodeEncodeError:
+        text = text.replace("±", "+-").replace("°", " deg").encode(known, "backslashreplace").decode(known)
     return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else f"\\u{ord(c):04x}" for c in text)
 
 
@@ -167,7 +173,7 @@ def main(argv: list[str] | None = None) -> int:
         args = build_parser().parse_args(argv)
         args.check(args)
         document, text, *code = args.run(args)
-        print(json.dumps(document, indent=2) if args.json else printable(text), flush=True)
+        print(json.dumps(document, indent=2) if args.json else printable(text, sys.stdout.encoding), flush=True)
         return code[0] if code else DONE
     except SystemExit as exit_:  # --help and --version
         return int(exit_.code or 0)
@@ -180,7 +186,7 @@ def main(argv: list[str] | None = None) -> int:
             print(json.dumps(error_document(error, code), indent=2), flush=True)
         if "--debug" in argv:
             raise
-        print(f"pipefish: {printable(message_of(error))}", file=sys.stderr)
+        print(f"pipefish: {printable(message_of(error), sys.stderr.encoding)}", file=sys.stderr)
         return code
 
 

@@ -74,7 +74,7 @@ def add_reconstruct(commands: Any) -> None:
         "--joint-spacing",
         type=_known,
         metavar="MM[+-MM]",
-        help="from one joint to the next (95 %%) [+-1 %%]: with the joints that are found it tells the scale",
+        help="from one joint to the next (95 %%) [± 1 %%]: with the joints that are found it tells the scale",
     )
     p.add_argument(
         "--target",
