@@ -44,6 +44,7 @@ _LAZY = {
     "Recognition": "pipefish.recognition",
     "recognise": "pipefish.recognition",
     "Layer": "pipefish.segmentation",
+    "Motion": "pipefish.segmentation",
     "Segmentation": "pipefish.segmentation",
     "segment_motion": "pipefish.segmentation",
     "Roc": "pipefish.roc_curve",

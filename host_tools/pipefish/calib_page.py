@@ -98,7 +98,7 @@ def _tiles(session: Session, first: dict[str, Any]) -> list[tuple[str, str, str]
     tiles = []
     pipe = next((p for p in first["pipes"] if p["dn_mm"] == 300), None)
     if pipe and pipe["systematic_mm"] is not None:
-        tiles.append((f"±{pipe['systematic_mm']:.2g}", "mm", "on the mean diameter of a DN 300 (95 %)"))
+        tiles.append((f"± {pipe['systematic_mm']:.2g}", "mm", "on the mean diameter of a DN 300 (95 %)"))
     tiles.append((f"{result.rms:.3f}", "px", f"rms of {report['points_used']} points"))
     if session.held_out:
         tiles.append((f"{session.held_out[0]:.3f}", "px", "rms of views held out"))
@@ -133,7 +133,7 @@ def _verdict(v: dict[str, Any], name: str, steps: str) -> str:
             "",
             (
                 f"DN {p['dn_mm']}",
-                "-" if p["systematic_mm"] is None else f"±{p['systematic_mm']:.2f} mm",
+                "-" if p["systematic_mm"] is None else f"± {p['systematic_mm']:.2f} mm",
                 "-" if p["share"] is None else f"{100 * p['share']:.2f} %",
                 "yes" if p["usable"] else "no",
             ),

@@ -14,6 +14,7 @@ from .calib_data import Array, CalibrationError
 from .calib_fit import Fit, angles, handedness, poses_apart
 from .camera import PARAMETERS, Camera
 from .errors import ProfileError
+from .intervals import Z95
 
 DN = (100, 150, 200, 250, 300, 400, 500, 600, 800, 1000)  # millimetres: pipes that reports speak of
 JACKKNIFE = 5  # parts
@@ -240,7 +241,7 @@ def coverage(
         }
         advice = (
             f"next view: the board near pixel ({u:.0f}, {v:.0f}), {math.degrees(place['theta']):.0f} degrees off the "
-            f"axis, tilted; the calibration is off by {sigma[worst]:.2g} px (1 sigma) there"
+            f"axis, tilted; the calibration is known to ± {Z95 * sigma[worst]:.2g} px (95 %) there"
         )
         if lit is None and camera.theta_covered and place["theta"] > camera.theta_covered:
             advice += (

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from .intervals import Z95
+
 SHARE = 0.005  # of the diameter: what profiler requirements of road agencies allow (MoDOT TM-84)
-_TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 _STUDENT = 2.776  # the same of a standard deviation from the five parts of a jackknife
 _UNSEEN = 0.001  # of the diameter: what all views share, as a pupil that moves otherwise than the model's (docs)
 _NARROW = math.radians(60)  # below, the wall is seen only far ahead
@@ -29,7 +30,7 @@ def verdict(
     halves = camera.get("halves", {}).get("ratio")
     pipes = []
     for pipe in camera["pipes"]:
-        bound = _TWO_SIDED * pipe["sigma_mm"]
+        bound = Z95 * pipe["sigma_mm"]
         if math.isfinite(pipe.get("spread_mm", math.nan)):
             bound = max(bound, _STUDENT * pipe["spread_mm"])
         else:  # too few views for parts, or parts that saw too little: what the halves tell

@@ -296,6 +296,26 @@ def _text(
     return table(shown)
 
 
+def together(args: argparse.Namespace) -> None:
+    """Raises UsageError for arguments that do not go together."""
+    ways = sum(map(bool, (args.views, args.camera, args.device)))
+    if ways != 1:
+        raise UsageError("calibrate: give either VIEWS, or --camera NAME=FOLDER for each camera of a rig, or --device")
+    if not args.target and not (args.views and all(str(v).lower().endswith(".csv") for v in args.views)):
+        raise UsageError(
+            "calibrate: --target FILE is needed: the JSON that `pipefish target` wrote; to describe a target you "
+            "have: pipefish target checkerboard --corners 9x6 --spacing 25 -o board.json"
+        )
+    if args.report and not args.report.lower().endswith((".html", ".htm")):
+        raise UsageError(f"calibrate: --report {args.report}: the name must end in .html")
+    if args.recording and not args.device:
+        raise UsageError("calibrate: --recording is for --device")
+    if len({name for name, _ in args.camera}) == 1:
+        raise UsageError("calibrate: a rig has at least two cameras of different names")
+    if not args.camera and Path(args.output).is_dir():
+        raise UsageError(f"calibrate: -o {args.output}: is a folder; name a file in it")
+
+
 def add_calibrate(commands: Any) -> None:
     """Adds `calibrate` to the command line."""
     p = add_command(
@@ -349,25 +369,4 @@ def add_calibrate(commands: Any) -> None:
     group.add_argument(
         "--timeout", type=not_negative, default=30.0, metavar="S", help="give up after S silent seconds [30]; 0: never"
     )
-
-    def together(args: argparse.Namespace) -> None:
-        ways = sum(map(bool, (args.views, args.camera, args.device)))
-        if ways != 1:
-            raise UsageError(
-                "calibrate: give either VIEWS, or --camera NAME=FOLDER for each camera of a rig, or --device"
-            )
-        if not args.target and not (args.views and all(str(v).lower().endswith(".csv") for v in args.views)):
-            raise UsageError(
-                "calibrate: --target FILE is needed: the JSON that `pipefish target` wrote; to describe a target you "
-                "have: pipefish target checkerboard --corners 9x6 --spacing 25 -o board.json"
-            )
-        if args.report and not args.report.lower().endswith((".html", ".htm")):
-            raise UsageError(f"calibrate: --report {args.report}: the name must end in .html")
-        if args.recording and not args.device:
-            raise UsageError("calibrate: --recording is for --device")
-        if len({name for name, _ in args.camera}) == 1:
-            raise UsageError("calibrate: a rig has at least two cameras of different names")
-        if not args.camera and Path(args.output).is_dir():
-            raise UsageError(f"calibrate: -o {args.output}: is a folder; name a file in it")
-
     p.set_defaults(check=together)

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError, PipefishError
+from pipefish.intervals import SAID, Z95
 
 
 def run_dense(args: argparse.Namespace) -> Result:
@@ -15,8 +16,7 @@ def run_dense(args: argparse.Namespace) -> Result:
     from pipefish.dense import DenseWall, dense_wall
     from pipefish.dense_cracks import find_cracks
     from pipefish.dense_files import Strip, strips_of, write_dense
-    from pipefish.dense_findings import finding_parts, findings_of, fingerprint
-    from pipefish.measured_texts import length_text
+    from pipefish.dense_findings import fingerprint
     from pipefish.progress import Progress
     from pipefish.wall import read_wall
 
@@ -57,6 +57,14 @@ def run_dense(args: argparse.Namespace) -> Result:
             raise PipefishError(f"{args.measured}: nothing was measured densely: {problem or 'no wall'}")
         summary, made = measured.document["summary"], fingerprint(Path(args.measured))
         document, files = write_dense(Path(args.output), maps, mapped, measured.unit, summary, made)
+    return document, _text(document, files)
+
+
+def _text(document: dict[str, Any], files: list[str]) -> str:
+    """The result for people."""
+    from pipefish.dense_findings import finding_parts, findings_of
+    from pipefish.measured_texts import length_text
+
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
     sigma = document["sigma_median"]  # None: nothing was measured
@@ -67,21 +75,22 @@ def run_dense(args: argparse.Namespace) -> Result:
             f"{document['measured']} of {length_text(document['cell'], unit)}, {100 * document['coverage']:.0f} % of "
             "those in view of two pairs",
         ),
-        ("sigma of a cell", "-" if sigma is None else f"median {length_text(sigma, unit)}"),
+        ("a cell is known", "-" if sigma is None else f"to ± {length_text(Z95 * sigma, unit)} (median)"),
         (
             "off the tube",
             f"median {length_text(middle, unit)}, 90 % within {length_text(low, unit)} to {length_text(high, unit)}",
         ),
     ]
     if document["scale_sigma"]:
-        rows.append(("scale", f"+- {196 * document['scale_sigma']:.2g} % (95 %) of every radius, in common"))
+        rows.append(("scale", f"± {100 * Z95 * document['scale_sigma']:.2g} % of every radius, in common"))
     found_there = findings_of(document)
     for e in found_there[:40]:
         at = f"at {length_text(e['chainage'], unit, metres=True)}, {e['clock_text']} o'clock"
         rows.append((e["kind"], ", ".join([at, *finding_parts(e, unit)])))
     if len(found_there) > 40:
         rows.append(("and", f"{len(found_there) - 40} more findings"))
-    return document, table([*rows, *(("written", f) for f in files)])
+    rows.append(("intervals", SAID))
+    return table([*rows, *(("written", f) for f in files)])
 
 
 def add_dense(commands: Any) -> None:
@@ -91,8 +100,8 @@ def add_dense(commands: Any) -> None:
         "dense",
         run_dense,
         "Measure the wall of a reconstructed survey densely: keyframes are unrolled onto the fitted tube and matched; "
-        "writes a map of how far the wall is from the tube with a sigma for each cell, as tables, arrays, a picture "
-        "and a point cloud, and what stands in or out of it, steps of joints and cracks.",
+        "writes a map of how far the wall is from the tube and how well each cell is known, as tables, arrays, a "
+        "picture and a point cloud, and what stands in or out of it, steps of joints and cracks.",
         "pipefish reconstruct survey.mcap -o out/ && pipefish dense out/ -o out/dense/",
     )
     p.add_argument("measured", metavar="DIR", help="of pipefish reconstruct")

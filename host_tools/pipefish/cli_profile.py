@@ -12,6 +12,7 @@ from typing import Any
 
 from pipefish.cli import Result, UsageError, add_command, not_negative, positive, table
 from pipefish.errors import ArgumentError, ProfileError
+from pipefish.intervals import Z95
 
 # The forms of --from and --to: formats.READERS and WRITERS, whose import costs time here.
 READ = (
@@ -99,7 +100,7 @@ def run_profile_show(args: argparse.Namespace) -> Result:
             f"of {len(camera.covariance_parameters)} parameters" if camera.covariance_parameters else "none",
         ),
         ("model chosen", camera.provenance.model_choice or None),
-        ("sigma(alpha)", _alpha_text(alpha)),
+        ("stretch along the axis", _alpha_text(alpha)),
         ("drawn in", args.out),
     ]
     document = json.loads(camera.to_json())
@@ -115,7 +116,8 @@ def _alpha_text(sigma: float | None) -> str | None:
     if sigma is None:
         return None
     angle = 0.5 / math.radians(45) * sigma  # sin cos of 45 degrees, of the angle itself
-    return f"{100 * sigma:.2g} % of a diameter beside an encoder, {100 * angle:.2g} % of the angle at 45 deg (1 sigma)"
+    of_diameter, of_angle = (100 * Z95 * value for value in (sigma, angle))
+    return f"± {of_diameter:.2g} % of a diameter beside an encoder, ± {of_angle:.2g} % of the angle at 45 deg (95 %)"
 
 
 def run_profile_check(args: argparse.Namespace) -> Result:
@@ -299,13 +301,15 @@ def add_profile_input(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--max-theta", type=above_zero, metavar="DEG", help="take no more than DEG off the axis")
 
 
+WHICH = "a profile, JSON or binary, or another program's calibration"
+
+
 def add_profile(commands: Any) -> None:
-    """`pipefish profile show|check|convert` and `pipefish undistort`."""
+    """Adds `profile` with its actions to the command line."""
     parser = commands.add_parser(
         "profile", help="look at, check and convert camera profiles", description="Camera profiles."
     )
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    which = "a profile, JSON or binary, or another program's calibration"
     p = add_command(
         actions,
         "show",
@@ -313,7 +317,7 @@ def add_profile(commands: Any) -> None:
         "Tell what a profile says, with the radius and the resolution at angles off the axis.",
         "pipefish profile show camera.json --out camera.png",
     )
-    p.add_argument("profile", metavar="PROFILE", help=which)
+    p.add_argument("profile", metavar="PROFILE", help=WHICH)
     p.add_argument("--out", metavar="FILE", help="draw the radial curve and the resolution: .png or .html")
     add_profile_input(p)
     p = add_command(
@@ -323,7 +327,7 @@ def add_profile(commands: Any) -> None:
         "Check a profile: valid, one-to-one, self-test, coverage, units; exit code 1 if it is not to be used.",
         "pipefish profile check camera.json",
     )
-    p.add_argument("profile", metavar="PROFILE", help=which)
+    p.add_argument("profile", metavar="PROFILE", help=WHICH)
     add_profile_input(p)
     p = add_command(
         actions,
@@ -334,7 +338,7 @@ def add_profile(commands: Any) -> None:
         "  pipefish profile convert camchain.yaml camera.profile\n"
         "  pipefish profile convert camera.json camera.yaml --to opencv-fisheye",
     )
-    p.add_argument("profile", metavar="PROFILE", help=which)
+    p.add_argument("profile", metavar="PROFILE", help=WHICH)
     p.add_argument(
         "out",
         metavar="OUT",
@@ -346,6 +350,10 @@ def add_profile(commands: Any) -> None:
         "--to", choices=WRITTEN, help="format to write, whatever the name is; needed for all but .json, .profile, .bin"
     )
     add_profile_input(p)
+
+
+def add_undistort(commands: Any) -> None:
+    """Adds `undistort` to the command line."""
     p = add_command(
         commands,
         "undistort",
@@ -355,7 +363,7 @@ def add_profile(commands: Any) -> None:
     )
     p.add_argument("input", metavar="INPUT", help="a picture, a folder of pictures, or a recording (.y4m)")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="picture, folder or .y4m to write")
-    p.add_argument("--profile", required=True, metavar="PROFILE", help=which)
+    p.add_argument("--profile", required=True, metavar="PROFILE", help=WHICH)
     p.add_argument(
         "--view", choices=("perspective", "cube", "cylinder", "equirect"), default="perspective", help="[perspective]"
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipefish.cli import DONE, FAILED, Result, UsageError, add_command, table
+from pipefish.intervals import SAID, Z95
 
 
 def _millimetres(text: str) -> float:
@@ -19,8 +20,9 @@ def _millimetres(text: str) -> float:
 
 
 def _known(text: str) -> Any:
-    """A length in millimetres with its tolerance, which is taken for 95 %: 1000, 1000+-2, 1000mm±2."""
-    from pipefish.scale import Z95, Known
+    """A length in millimetres with its tolerance, which is taken for 95 %: 1000, 1000+-2, 1000mm±2. On a
+    keyboard +- is easier."""
+    from pipefish.scale import Known
 
     number = r"([0-9]+(?:\.[0-9]*)?)\s*(?:mm)?"
     found = re.fullmatch(rf"\s*{number}\s*(?:(?:\+-|\+/-|±)\s*{number})?\s*", text)
@@ -49,7 +51,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def add_reconstruct(commands: Any) -> None:
-    """Adds the commands."""
+    """Adds `reconstruct` to the command line."""
     from pipefish.cli_profile import add_profile_input
 
     p = add_command(
@@ -72,7 +74,7 @@ def add_reconstruct(commands: Any) -> None:
         "--joint-spacing",
         type=_known,
         metavar="MM[+-MM]",
-        help="from one joint to the next (95 %%) [+-1 %%]: with the joints that are found it tells the scale",
+        help="from one joint to the next (95 %%) [± 1 %%]: with the joints that are found it tells the scale",
     )
     p.add_argument(
         "--target",
@@ -94,48 +96,9 @@ def add_reconstruct(commands: Any) -> None:
     )
     add_profile_input(p)
 
-    p = add_command(
-        commands,
-        "unroll",
-        run_unroll,
-        "Draw the wall as one picture at true scale: chainage by clock, best view of each place, in one light.",
-        "pipefish unroll out/ -o unrolled.png --labels",
-    )
-    p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
-    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
-    p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
-    p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
-    p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
-    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
-    p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
-
-    p = add_command(
-        commands,
-        "report",
-        run_report,
-        "Write one HTML page about a measured pipe: figures and limits, profile, findings, 3-D, quality. No network.",
-        "pipefish report out/ -o report.html --limit ovality=5 --limit d_min=285",
-    )
-    p.add_argument("folder", metavar="DIR", help="of pipefish reconstruct")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="page to write")
-    p.add_argument(
-        "--limit",
-        type=_limit,
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
-        "ovality_astm_max, reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm). Unless all "
-        "passed the exit code is 1",
-    )
-    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
-    p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
-    p.add_argument("--title", help="of the page [the survey's name]")
-
 
 def run_reconstruct(args: argparse.Namespace) -> Result:
-    """Runs the command."""
+    """Measures a survey and writes the files."""
     from pipefish.measure import measure
     from pipefish.measured_files import write_measurement
     from pipefish.progress import Progress
@@ -171,53 +134,10 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
     from pipefish.measured_reach import reach_text
-    from pipefish.measured_texts import events_text, length_text, percent_text, scale_texts
+    from pipefish.measured_texts import events_text
 
-    s = document["summary"]
-    unit = s["unit"]
-    shared = length_text(1.96 * s["d_mean_systematic"], unit)
-    rows: list[tuple[str, object]] = [
-        ("status", document["status"]),
-        (
-            "keyframes",
-            f"{s['keyframes_with_pose']} of {s['keyframes']} with a pose"
-            + (f", in {s['stretches']} stretches" if s["stretches"] > 1 else ""),
-        ),
-        ("points", s["points"]),
-        ("path", length_text(s["path_length"], unit, metres=True)),
-    ]
-    if s["diameter_from_prior"]:
-        rows.append(
-            (
-                "mean diameter",
-                "given, not measured" if unit == "metre" else "not measured: no scale (lengths in diameters)",
-            )
-        )
-    else:
-        rows.append(
-            (
-                "mean diameter",
-                f"{length_text(s['d_mean'], unit)} +- {length_text(1.96 * s['d_mean_sigma'], unit)} (95 %, "
-                "repeatability) "
-                f"+- {shared} (95 %, systematic)",
-            )
-        )
-    rows += [("scale", told) for told in scale_texts(document["scale"])]
-    rows.append(
-        (
-            "along the pipe",
-            f"{length_text(s['d_mean_least'], unit)} to {length_text(s['d_mean_most'], unit)}, "
-            f"{s['stations_measured']} of {s['stations']} stations",
-        )
-    )
-    if "ovality_rms" in s:
-        rows.append(
-            (
-                "ovality",
-                f"{percent_text(s['ovality_rms'])} (rms along the pipe), most {percent_text(s['ovality_most'])} at "
-                f"{length_text(s['ovality_most_at'], unit, metres=True)} ((max - min) / mean)",
-            )
-        )
+    unit = document["summary"]["unit"]
+    rows = _figures(document)
     rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
     rows.append(
         ("findings", reach_text(document["findings_reach"], unit) + " `pipefish dense` finds smaller ones, and cracks.")
@@ -226,8 +146,69 @@ def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     if verdict and not any(remark.startswith(verdict["text"].rstrip(".")) for remark in document["remarks"]):
         rows.append(("profile", verdict["text"]))
     rows += [("note", remark) for remark in document["remarks"]]
+    rows.append(("intervals", SAID))
     rows += [("written", file) for file in files]
+    rows += [("about files", told) for told in document["file_remarks"]]
     return table(rows)
+
+
+def _figures(document: dict[str, Any]) -> list[tuple[str, object]]:
+    """What was measured, and how much of the pipe."""
+    from pipefish.measured_texts import length_text, scale_texts
+
+    s = document["summary"]
+    unit = s["unit"]
+    stretches = f", in {s['stretches']} stretches" if s["stretches"] > 1 else ""
+    if s["diameter_from_prior"]:
+        mean = "given, not measured" if unit == "metre" else "not measured: no scale (lengths in diameters)"
+    else:
+        value, own, shared = (
+            length_text(v, unit) for v in (s["d_mean"], Z95 * s["d_mean_sigma"], Z95 * s["d_mean_systematic"])
+        )
+        mean = f"{value} ± {own} (repeatability) ± {shared} (systematic: scale and camera, the same all along)"
+    span = f"{length_text(s['d_mean_least'], unit)} to {length_text(s['d_mean_most'], unit)}"
+    rows: list[tuple[str, object]] = [
+        ("status", document["status"]),
+        ("keyframes", f"{s['keyframes_with_pose']} of {s['keyframes']} with a pose{stretches}"),
+        ("points", s["points"]),
+        ("path", length_text(s["path_length"], unit, metres=True)),
+        ("mean diameter", mean),
+        *(("scale", told) for told in scale_texts(document["scale"])),
+        ("along the pipe", f"{span}, {s['stations_measured']} of {s['stations']} stations"),
+    ]
+    if "ovality_rms" in s:
+        rows.append(("ovality", _ovality(document)))
+    return rows
+
+
+def _ovality(document: dict[str, Any]) -> str:
+    """Along the pipe, and where it is most, with its interval."""
+    from pipefish.measured_limits import most_oval
+    from pipefish.measured_texts import length_text, percent_text
+
+    s = document["summary"]
+    at = length_text(s["ovality_most_at"], s["unit"], metres=True)
+    most = f"{100 * s['ovality_most']:.2f} ± {100 * most_oval(document):.2f} %"
+    return f"{percent_text(s['ovality_rms'])} (rms along the pipe), most {most} at {at} ((max - min) / mean)"
+
+
+def add_unroll(commands: Any) -> None:
+    """Adds `unroll` to the command line."""
+    p = add_command(
+        commands,
+        "unroll",
+        run_unroll,
+        "Draw the wall as one picture at true scale: chainage by clock, best view of each place, in one light.",
+        "pipefish unroll out/ -o unrolled.png --labels",
+    )
+    p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
+    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
+    p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
+    p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
+    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
+    p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
 
 
 def run_unroll(args: argparse.Namespace) -> Result:
@@ -260,6 +241,32 @@ def run_unroll(args: argparse.Namespace) -> Result:
         *(("written", file) for file in files),
     ]
     return document, table(rows)
+
+
+def add_report(commands: Any) -> None:
+    """Adds `report` to the command line."""
+    p = add_command(
+        commands,
+        "report",
+        run_report,
+        "Write one HTML page about a measured pipe: figures and limits, profile, findings, 3-D, quality. No network.",
+        "pipefish report out/ -o report.html --limit ovality=5 --limit d_min=285",
+    )
+    p.add_argument("folder", metavar="DIR", help="of pipefish reconstruct")
+    p.add_argument("-o", "--output", required=True, metavar="FILE", help="page to write")
+    p.add_argument(
+        "--limit",
+        type=_limit,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a limit that must hold all along the pipe; may be repeated: ovality, ovality_nominal, ovality_astm, "
+        "ovality_astm_max, reduction_nominal (at most, %%), d_max (at most, mm), d_min (at least, mm). Unless all "
+        "passed the exit code is 1",
+    )
+    p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
+    p.add_argument("--dense", metavar="FOLDER", help="of pipefish dense: its findings and map [DIR/dense, if there]")
+    p.add_argument("--title", help="of the page [the survey's name]")
 
 
 def run_report(args: argparse.Namespace) -> Result:

@@ -23,7 +23,7 @@ def run_segment(args: argparse.Namespace) -> Result:
     from pipefish.matching_files import read_pixels
     from pipefish.progress import Progress
     from pipefish.segmentation import planes, segment_motion
-    from pipefish.segmentation_files import document, write_segmentation
+    from pipefish.segmentation_files import document, motion_text, write_segmentation
 
     one, two = read_pixels(args.first), read_pixels(args.second)
     for picture, name in ((one, args.first), (two, args.second)):
@@ -54,13 +54,14 @@ def run_segment(args: argparse.Namespace) -> Result:
         rows.append(("reason", REASONS[m.status]))
     for k, layer in enumerate(s.layers, 1):
         share = 100 * layer.area1 / s.labels1.size, 100 * layer.area2 / s.labels2.size
-        text = f"{share[0]:.1f} and {share[1]:.1f} % of the pictures, correlation {layer.zncc1:.2f}"
+        text = f"{motion_text(s.motion(k))}; {share[0]:.1f} and {share[1]:.1f} % of the pictures, "
+        text += f"correlation {layer.zncc1:.2f}"
         if (unsure := max(layer.low_evidence1, layer.low_evidence2)) > 0.3:
             text += f"; {100 * unsure:.0f} % of it has little texture and follows its surroundings"
         if max(layer.ambiguous1, layer.ambiguous2) > 0.1:
             text += ", ambiguous: another layer claims the same"
         rows.append((f"layer {k}", text))
-    rows.append(("written", f"{len(files)} files in {args.output}"))
+    rows.append(("written", f"{args.output}: segmentation.png shows all of it, README.txt tells what each file is"))
     return document(s) | {"matches": len(m), "files": files}, table(rows)
 
 
@@ -70,8 +71,9 @@ def add_segment(commands: Any) -> None:
         commands,
         "segment",
         run_segment,
-        "Find what two pictures have in common, as layers that move, bend and are lit each in its own way. Writes the "
-        "labels of both pictures' pixels, each layer's fields of motion and of light, and a picture of it all.",
+        "Find what two pictures have in common, as layers that move, bend and are lit each in its own way. Tells how "
+        "each moved, and writes the labels of both pictures' pixels, each layer's fields of motion and of light, and a "
+        "picture of it all.",
         "pipefish segment first.png second.png -o out/\n  pipefish segment first.png second.png --threads 2 -o out/",
     )
     p.add_argument("first", metavar="A", help="picture")

@@ -11,6 +11,7 @@ from typing import Any
 
 from pipefish.cli import Result, add_command, positive, table
 from pipefish.errors import ArgumentError, PipefishError
+from pipefish.intervals import SAID, Z95
 
 STATES = {
     "ok": "",
@@ -79,16 +80,23 @@ def run_selfcal(args: argparse.Namespace) -> Result:
     sigma = math.sqrt(camera.covariance[0, 0])
     document |= {"camera": {key: getattr(camera, key) for key in PARAMETERS} | {"f_u_sigma": sigma}}
     document |= {"pairs": pairs, "files": [args.output]}
+    return document, _text(found, pairs, args.output)
+
+
+def _text(found: Any, pairs: list[dict[str, Any]], output: str) -> str:
+    """The result for people."""
+    camera = found.camera
+    sigma = math.sqrt(camera.covariance[0, 0])
     rows: list[tuple[str, object]] = [
-        ("focal length", f"{camera.f_u:.1f} +- {sigma:.1f} px a radian"),
+        ("focal length", f"{camera.f_u:.1f} ± {Z95 * sigma:.1f} px a radian"),
         ("centre", f"{camera.c_u:.1f}, {camera.c_v:.1f}"),
         (
             "covered",
             f"to {math.degrees(found.theta):.1f} degrees off the axis; to {math.degrees(camera.theta_max):.1f} it is "
             "extrapolated",
         ),
-        ("bearings", f"within {math.degrees(found.bearing_sigma):.2f} degrees there (1 sigma)"),
-        ("alpha", f"{100 * found.alpha_sigma:.2f} % (1 sigma)"),
+        ("bearings", f"± {math.degrees(Z95 * found.bearing_sigma):.2f} degrees there"),
+        ("along the axis", f"± {100 * Z95 * found.alpha_sigma:.2f} % (stretch of what lies ahead)"),
         ("residuals", f"{found.rms:.2f} px rms; a match counts with {found.sigma:.2f} px"),
         ("starts", f"{found.agreeing} of {found.refined} end at this camera"),
     ]
@@ -100,13 +108,14 @@ def run_selfcal(args: argparse.Namespace) -> Result:
         )
     elif not found.usable:
         rows.append(
-            ("CAUTION", "rough: focal length to 3 % or bearings to 0.5 degrees are not certain. Take more views")
+            ("CAUTION", "rough: the focal length to ± 6 % or bearings to ± 1 degree are not certain. Take more views")
         )
     used = [p for p in pairs if p["status"] == "ok"]
     rows.append(("pairs", f"{len(used)} of {len(pairs)}, {sum(p['inliers'] for p in used)} matches"))
     rows += [("left out", f"{p['name']}: {STATES[p['status']]}") for p in pairs if p["status"] != "ok"]
-    rows.append(("written", args.output))
-    return document, table(rows)
+    rows.append(("intervals", SAID))
+    rows.append(("written", output))
+    return table(rows)
 
 
 def add_selfcal(commands: Any) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipefish.cli import Result, UsageError, add_command, table
+from pipefish.intervals import SAID, Z95
 
 APART = 0.1  # share of points that scattered gross ones do not reach
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -130,7 +131,7 @@ def _text(tube: Any, files: list[str]) -> str:
     spread = f", {1000 * np.nanmin(t['d_mean']):.1f} to {1000 * np.nanmax(t['d_mean']):.1f} along the pipe"
     rows: list[tuple[str, object]] = [
         ("length", f"{s['length']:.2f} m, {s['measured']} of {s['stations']} stations measured"),
-        ("mean diameter", f"{1000 * s['d_mean']:.2f} +- {1960 * s['d_mean_sigma']:.2f} mm (95 %){spread}"),
+        ("mean diameter", f"{1000 * s['d_mean']:.2f} ± {1000 * Z95 * s['d_mean_sigma']:.2f} mm{spread}"),
         ("ovality", oval),
         ("  most", _most_oval(t) if known else ""),
         ("roughness", f"{1000 * s['roughness']:.2f} mm"),
@@ -141,6 +142,7 @@ def _text(tube: Any, files: list[str]) -> str:
         rows.append(("left out", text))
     rows += [(e["kind"], event_text(e)) for e in tube.events]
     rows.append(("note", unit_note(s["d_mean"], tube.nominal)))
+    rows.append(("intervals", SAID))
     return table([*rows, *(("written", f) for f in files)])
 
 
@@ -173,9 +175,9 @@ def event_text(e: dict[str, Any]) -> str:
     if e.get("clock") is not None:
         parts.append(f"{(e['clock'] * 6 / math.pi) % 12:.1f} o'clock")
     if e["kind"] == "bend":
-        parts.append(f"{math.degrees(e['angle']):.1f} +- {math.degrees(1.96 * e['angle_sigma']):.1f} degrees")
+        parts.append(f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.1f} degrees")
         if e["radius"]:
-            parts.append(f"radius {e['radius']:.2f} +- {1.96 * e['radius_sigma']:.2f} m")
+            parts.append(f"radius {e['radius']:.2f} ± {Z95 * e['radius_sigma']:.2f} m")
     for name, what in (
         ("gap", "gap"),
         ("step", "step"),

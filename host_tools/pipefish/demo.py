@@ -18,6 +18,7 @@ from typing import Any
 
 from pipefish import __version__
 from pipefish.errors import PipefishError
+from pipefish.intervals import SAID, Z95
 
 PRESET = "demo"
 BAUD = 3_000_000
@@ -206,8 +207,9 @@ def measured_extra(summary: dict[str, Any]) -> dict[str, Any]:
     m = summary["measured"]
     rows = [
         ("mean diameter", f"{1000 * m['d_mean']:.1f} mm"),
-        ("  repeatability, 95 %", f"± {1960 * m['d_mean_sigma']:.2f} mm"),
-        ("  systematic, 95 %", f"± {1960 * m['d_mean_systematic']:.2f} mm"),
+        ("  repeatability", f"± {1000 * Z95 * m['d_mean_sigma']:.2f} mm"),
+        ("  systematic", f"± {1000 * Z95 * m['d_mean_systematic']:.2f} mm"),
+        ("  intervals", SAID),
         ("stations measured", f"{m['stations_measured']} of {m['stations']}"),
     ]
     texts = (

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pipefish.errors import FormatError, PipefishError
-from pipefish.measured_texts import Z95, length_text
+from pipefish.intervals import Z95
+from pipefish.measured_texts import length_text
 
 FORMAT, VERSION = "pipefish-dense", 2
 COLUMNS = (

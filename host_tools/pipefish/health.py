@@ -19,6 +19,7 @@ import numpy.typing as npt
 from .assumed import PUPIL_MOST
 from .camera import PARAMETERS, Camera
 from .errors import ArgumentError
+from .intervals import Z95
 from .structure import Encoder, Reconstruction, RollingShutter, changed_camera, reconstruct
 from .survey import Tracks
 from .tube import fit_tube
@@ -40,6 +41,14 @@ DRIFT = {
     "bend": 0.01,  # k2
     "centre u": 15.0,  # pixels
     "centre v": 15.0,
+}
+#: The same for people.
+WORDS = {
+    "angle scale": "focal length",
+    "alpha": "stretch along the axis",
+    "bend": "distortion (k2)",
+    "centre u": "picture centre (across)",
+    "centre v": "picture centre (down)",
 }
 UNITS = {"angle scale": "%", "alpha": "%", "bend": "", "centre u": "px", "centre v": "px"}
 CAUSES = (("angle scale",), ("alpha",), ("bend",), ("centre u", "centre v"))  # that move alone
@@ -252,57 +261,42 @@ def check_profile(
 
     Raises ArgumentError.
     """
-    if not noise > 0:
-        raise ArgumentError(f"noise: {noise} is not above 0")
-    if not common_scale >= 0:
-        raise ArgumentError(f"common_scale: {common_scale} is below 0")
-    if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
-        raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
+    _refuse_wrong(noise, common_scale, budget, diameter, diameter_sigma)
     if camera.radial != "generic":
         camera = camera.to_generic()[0]
     end = _theta_end(camera, tracks)
     if not end > 0:
         return _nothing(budget, "no track inside the profile's field")
     prior = _prior(camera, end)
+    known = {"encoder": encoder, "attitude": attitude, "attitude_sigma": attitude_sigma, "sigma": sigma}
+    known |= {"threads": threads, "shutter": shutter, "sag_sigma": sag_sigma, "common_errors": common_errors}
 
     def adjusted(about: Floats, spread: Floats) -> Reconstruction:
         """With the profile free to drift about a change, by this covariance."""
-        return reconstruct(
-            tracks,
-            changed_camera(camera, FREE, about),
-            chainage,
-            encoder=encoder,
-            attitude=attitude,
-            attitude_sigma=attitude_sigma,
-            sigma=sigma,
-            threads=threads,
-            drift=(FREE, spread, noise),
-            shutter=shutter,
-            sag_sigma=sag_sigma,
-            common_errors=common_errors,
-        )
+        return reconstruct(tracks, changed_camera(camera, FREE, about), chainage, drift=(FREE, spread, noise), **known)
 
     found = structure or adjusted(np.zeros(len(FREE)), prior)
     if not found.drift:
         return _nothing(budget, f"nothing was measured: {found.reason}")
     slope = _diameter_slope(camera, tracks, _wall_radius(found.drift[0]))
-    evidence = "bends and turns of the drive"
-    known, straight = diameter is not None and found.unit == "metre", _largest_turn(found) < TURN_LEAST
-    if known:
-        with_it = _with_diameter(found, adjusted, prior, slope, (diameter, diameter_sigma))
-        if isinstance(with_it, str):
-            return _nothing(budget, with_it, math.sqrt(slope @ prior @ slope))
-        seen, evidence, known = with_it
-    else:
-        seen = _together(found, np.zeros(len(FREE)), prior)
-    if not known and straight:
-        return _nothing(
-            budget,
-            "the camera never panned, tilted or went round a bend; a known diameter beside the encoder "
-            "would show a drift",
-            math.sqrt(slope @ prior @ slope),
-        )
-    return _judge(seen, camera, end, slope, budget, evidence, common_scale if straight else 0.0)
+    straight = _largest_turn(found) < TURN_LEAST
+    given = (diameter, diameter_sigma) if diameter is not None and found.unit == "metre" else None
+    seen = _evidence(found, adjusted, prior, slope, given, straight)
+    if isinstance(seen, str):
+        return _nothing(budget, seen, math.sqrt(slope @ prior @ slope))
+    return _judge(seen[0], camera, end, slope, budget, seen[1], common_scale if straight else 0.0)
+
+
+def _refuse_wrong(
+    noise: float, common_scale: float, budget: float, diameter: float | None, diameter_sigma: float
+) -> None:
+    """Raises ArgumentError for numbers that check_profile does not take."""
+    if not noise > 0:
+        raise ArgumentError(f"noise: {noise} is not above 0")
+    if not common_scale >= 0:
+        raise ArgumentError(f"common_scale: {common_scale} is below 0")
+    if not budget > 0 or not diameter_sigma > 0 or (diameter is not None and not diameter > 0):
+        raise ArgumentError("budget, diameter, diameter_sigma: not above 0")
 
 
 @dataclass(frozen=True)
@@ -311,6 +305,30 @@ class _Seen:
 
     information: Floats
     weighed: Floats
+
+
+def _evidence(
+    found: Reconstruction,
+    adjusted: Callable[[Floats, Floats], Reconstruction],
+    prior: Floats,
+    slope: Floats,
+    given: tuple[float, float] | None,
+    straight: bool,
+) -> tuple[_Seen, str] | str:
+    """What the survey says of FREE, with the diameter that is given (and its sigma), and what that rests on; or why
+    nothing can be told."""
+    seen, evidence, known = _together(found, np.zeros(len(FREE)), prior), "bends and turns of the drive", False
+    if given:
+        with_it = _with_diameter(found, adjusted, prior, slope, given)
+        if isinstance(with_it, str):
+            return with_it
+        seen, evidence, known = with_it
+    if not known and straight:
+        return (
+            "the camera never panned, tilted or went round a bend; a known diameter beside the encoder would show a "
+            "drift"
+        )
+    return seen, evidence
 
 
 def _inverse(matrix: Floats) -> Floats:
@@ -349,7 +367,7 @@ def _nothing(budget: float, why: str, alpha_sigma: float = math.inf) -> ProfileC
     text = f"Cannot tell: {why}."
     if math.isfinite(alpha_sigma):
         text = (
-            f"Cannot tell: all that a lens may drift leaves the diameter open by {100 * alpha_sigma:.2g} % (sigma); "
+            f"Cannot tell: all that a lens may drift leaves the diameter open by ± {100 * Z95 * alpha_sigma:.2g} %; "
             f"{why}."
         )
     return ProfileCheck(VERDICTS["unknown"], text, alpha_sigma, budget, changes, 1.0, 0, why)
@@ -419,7 +437,7 @@ class _Cause:
         """In words, by the change that is most of its sigmas."""
         name = max(self.changes, key=lambda n: abs(self.changes[n][0]) / self.changes[n][1])
         value, sigma = self.changes[name]
-        return f"{name} changed by {value:+.2g} +- {sigma:.1g} {UNITS[name]}".rstrip()
+        return f"{WORDS[name]} changed by {value:+.2g} ± {Z95 * sigma:.2g} {UNITS[name]}".rstrip()
 
 
 def _of_cause(names: tuple[str, ...], known: Floats, weighed: Floats, total: float, degrees: int) -> _Cause:
@@ -451,9 +469,9 @@ def _limits(known: Floats) -> str:
     for name, size, information in zip(DRIFT, DRIFT.values(), known.diagonal(), strict=True):
         if information > SEEN:
             least = CLEAR * size / math.sqrt(information) * (100 if UNITS[name] == "%" else 1)
-            shown.append(f"{name} by {least:.2g} {UNITS[name]}".rstrip())
+            shown.append(f"{WORDS[name]} by {least:.2g} {UNITS[name]}".rstrip())
         else:
-            hidden.append(name)
+            hidden.append(WORDS[name])
     text = f"Changes that would have shown: {', '.join(shown) or 'none'}."
     return text + (f" Of {' and '.join(hidden)} no change could be seen." if hidden else "")
 
@@ -491,12 +509,13 @@ def _judge(
     what = " or ".join([likeliest.text(), *alike]) + (
         ", if nothing else changed" if likeliest.rest >= FALSE_ALARM else ", which does not explain all of it"
     )
-    open_text = f"a drift that the survey cannot see leaves the diameter open by {100 * open_sigma:.2g} % (one sigma)"
+    open_text = f"a drift that the survey cannot see leaves the diameter open by ± {100 * Z95 * open_sigma:.2g} %"
     if open_sigma > budget:
         verdict = VERDICTS["unknown"]
         text = (
-            f"Cannot tell whether the profile still holds: {open_text}, more than the {100 * budget:.2g} % allowed. "
-            "A bend, panning and tilting, or a known diameter beside the encoder would show it."
+            f"Cannot tell whether the profile still holds: {open_text}, more than the "
+            f"± {100 * Z95 * budget:.2g} % allowed. A bend, panning and tilting, or a "
+            "known diameter beside the encoder would show it."
         )
         if moved:
             text += f" What can be seen does not fit the profile, though: {what}. Recalibrate where limits are tight."
@@ -507,7 +526,7 @@ def _judge(
         verdict, text = VERDICTS["valid"], f"The profile is still valid: {open_text}, by {evidence}. {_limits(known)}"
     if common_scale:
         text += (
-            f" Errors that tracks have in common look like {100 * common_scale:.2g} % (one sigma) of the angle scale "
+            f" Errors that tracks have in common look like a focal length off by ± {100 * Z95 * common_scale:.2g} % "
             "in a straight drive, and count as noise."
         )
     if camera.source == "selfcal":

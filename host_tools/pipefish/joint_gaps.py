@@ -83,7 +83,7 @@ def tell_gaps(m: Measurement) -> None:
         for event in stretch.tube.events:
             if event["kind"] != "joint" or event.get("gap") is not None:
                 continue
-            wall = wall or measured_wall(m, document_of(m, []))
+            wall = wall or measured_wall(m, document_of(m))
             at, reach = float(stretch.chainage(event["s"])), REACH * wall.diameter
             try:
                 unroller = Unroller(wall, span=(at - reach, at + reach))

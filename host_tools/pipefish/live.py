@@ -20,6 +20,7 @@ import numpy as np
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
+from pipefish.intervals import Z95
 from pipefish.scene import STATES, frames_in
 from pipefish.structure import REASONS
 from pipefish.survey import Keyframe, Observations, Survey
@@ -356,8 +357,8 @@ def progress_text(progress: dict[str, Any]) -> str:
     oval = f", oval {100 * newest['ovality']:.1f} %" if math.isfinite(newest["ovality"]) else ""
     if progress["unit"] != "metre":
         return f"{where}: no scale{oval}"
-    d, sigma = 1000 * newest["d_mean"], 1960 * newest["d_mean_sigma"]
-    return f"{where}: diameter {d:.1f} ± {sigma:.1f} mm at {newest['at']:.2f} m{oval}"
+    d, half = 1000 * newest["d_mean"], 1000 * Z95 * newest["d_mean_sigma"]
+    return f"{where}: diameter {d:.1f} ± {half:.1f} mm at {newest['at']:.2f} m{oval}"
 
 
 def summary_rows(summary: dict[str, Any] | None) -> list[tuple[str, object]]:
@@ -372,8 +373,10 @@ def summary_rows(summary: dict[str, Any] | None) -> list[tuple[str, object]]:
         rows.append(
             ("measured live", f"{summary['from']:.2f} to {summary['to']:.2f} m, {summary['stations']} stations")
         )
-        shared = 1960 * summary["systematic"]
-        rows.append(("mean diameter", f"{d:.1f} mm ± {shared:.1f} (95 %, systematic), {low:.1f} to {high:.1f} mm"))
+        shared = 1000 * Z95 * summary["systematic"]
+        rows.append(
+            ("mean diameter", f"{d:.1f} mm ± {shared:.1f} (95 %; scale and camera), {low:.1f} to {high:.1f} mm")
+        )
     if "ovality_most" in summary:
         rows.append(("most oval", f"{100 * summary['ovality_most']:.2f} % at {summary['ovality_most_at']:.2f} m"))
     rows.append(("warnings", len(summary["warnings"]) or "none"))

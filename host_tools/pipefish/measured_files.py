@@ -12,6 +12,7 @@ import numpy as np
 
 from pipefish import __version__
 from pipefish.assumed import assumed_px
+from pipefish.camera import Camera
 from pipefish.cloudfile import ply_bytes
 from pipefish.colours import diverging
 from pipefish.errors import ProfileError
@@ -20,7 +21,7 @@ from pipefish.measure import Tell
 from pipefish.measured_reach import reach
 from pipefish.measured_remarks import not_measured, trend
 from pipefish.measured_texts import FORMAT, VERSION
-from pipefish.measurement import Measurement, mean_diameter
+from pipefish.measurement import Measurement, Stretch, mean_diameter
 from pipefish.pupil import pupil_is_known
 from pipefish.simulate import quaternion
 from pipefish.tube import rms_ovality
@@ -128,108 +129,108 @@ def encoder_against_vision(m: Measurement) -> dict[str, Any] | None:
     return {"chainage": chainage, "vision_minus_encoder": excess, "stretch": stretch_of}
 
 
-def document_of(m: Measurement, notes: list[str]) -> dict[str, Any]:
-    """The document of reconstruction.json."""
-    s, structure, camera = m.survey, m.structure, m.camera
-    residuals = m.residuals
-    centres = structure.centres
+def document_of(m: Measurement) -> dict[str, Any]:
+    """The document of reconstruction.json, but for its files."""
+    s = m.survey
     return plain(
         {
             "format": FORMAT,
             "version": VERSION,
             "software": f"pipefish {__version__}",
-            "status": "ok" if structure.status == "ok" and not not_measured(m) else "partial",
+            "status": "ok" if m.structure.status == "ok" and not not_measured(m) else "partial",
             "survey": {k: s.info[k] for k in ("file", "name", "survey_id", "first_time_unix_ns", "source", "software")},
             "summary": summary(m),
-            "remarks": [*m.remarks, *notes],
-            "scale": {
-                "source": m.scale.source,
-                "unit": m.scale.unit,
-                "sigma": m.scale.sigma,
-                "wheel": m.scale.wheel,
-                "wheel_sigma": m.scale.wheel_sigma,
-                "sources": m.scale.sources,
-                "consistent": m.scale.consistent,
-                "chi2": m.scale.chi2,
-                "freedom": m.scale.freedom,
-            },
+            "remarks": m.remarks,
+            "scale": _scale_part(m),
             "clock_zero": m.measured[0].tube.clock_zero,
-            "camera": {
-                "name": camera.name,
-                "serial": camera.serial,
-                "model": camera.radial,
-                "width": camera.width,
-                "height": camera.height,
-                "theta_max_deg": math.degrees(camera.theta_max),
-                "rms_px": camera.rms_px,
-                "pupil_e1": camera.pupil_e1,
-                "pupil_known": pupil_is_known(camera),
-                "covariance": camera.covariance is not None,
-                "assumed_px": None if camera.covariance is not None else assumed_px(camera),
-                "source": camera.source,
-                "created": camera.created.isoformat() if camera.created else None,
-                "profile": json.loads(camera.to_json()),
-            },
-            "structure": {
-                "status": structure.status,
-                "reason": structure.reason,
-                "gauge": structure.gauge,
-                "sigma": structure.sigma,
-                "variance_factor": structure.variance_factor,
-                "observations": structure.observations,
-                "outside": structure.outside,
-                "repeated": structure.repeated,
-                "standing": m.index[structure.standing],
-                "down": structure.down,
-                "gaps": [
-                    {
-                        "first": int(m.index[g.first]),
-                        "last": int(m.index[g.last]),
-                        "reason": g.reason,
-                        "common": g.common,
-                    }
-                    for g in structure.gaps
-                ],
-                "backwards": m.backwards,
-            },
-            "poses": {
-                "keyframe": m.index[structure.frames],
-                "stretch": structure.segment,
-                "chainage": m.frame_chainage(),
-                "quaternion": [quaternion(p[:, :3]) for p in structure.poses],
-                "translation": structure.poses[:, :, 3],
-                "centre": centres,
-                "centre_sigma": np.sqrt(
-                    np.maximum(0, np.trace(structure.pose_covariance[:, 3:, 3:], axis1=1, axis2=2))
-                ),
-            },
-            "tubes": [
-                {
-                    "stretch": x.segment,
-                    "status": x.tube.status,
-                    "reason": x.tube.reason,
-                    "chainage_at_start": x.origin,
-                    "chainage_sign": x.sign,
-                    "summary": x.tube.summary,
-                    "water": x.water,
-                }
-                for x in m.stretches
-            ],
+            "camera": _camera_part(m.camera),
+            "structure": _structure_part(m),
+            "poses": _poses_part(m),
+            "tubes": [_tube_part(stretch) for stretch in m.stretches],
             "stations": stations(m),
             "events": events(m),
             "not_measured": not_measured(m),
             "findings_reach": reach(m),
-            "quality": {
-                "residuals_by_angle": trend(residuals, camera, m.tracks),
-                "residual_rms_px": float(np.sqrt(np.mean(residuals.pixels[residuals.inlier] ** 2))),
-                "residuals_over_noise": residuals.spread,
-                "observations": len(residuals.item),
-                "outliers": int((~residuals.inlier).sum()),
-                "encoder": encoder_against_vision(m),
-                "profile": m.health.as_dict() if m.health else None,
-            },
+            "quality": _quality_part(m),
         }
     )
+
+
+def _scale_part(m: Measurement) -> dict[str, Any]:
+    names = ("source", "unit", "sigma", "wheel", "wheel_sigma", "sources", "consistent", "chi2", "freedom")
+    return {name: getattr(m.scale, name) for name in names}
+
+
+def _camera_part(camera: Camera) -> dict[str, Any]:
+    """What one asks of a camera first, and its whole profile."""
+    return {
+        "name": camera.name,
+        "serial": camera.serial,
+        "model": camera.radial,
+        "width": camera.width,
+        "height": camera.height,
+        "theta_max_deg": math.degrees(camera.theta_max),
+        "rms_px": camera.rms_px,
+        "pupil_e1": camera.pupil_e1,
+        "pupil_known": pupil_is_known(camera),
+        "covariance": camera.covariance is not None,
+        "assumed_px": None if camera.covariance is not None else assumed_px(camera),
+        "source": camera.source,
+        "created": camera.created.isoformat() if camera.created else None,
+        "profile": json.loads(camera.to_json()),
+    }
+
+
+def _structure_part(m: Measurement) -> dict[str, Any]:
+    """How the adjustment went."""
+    names = ("status", "reason", "gauge", "sigma", "variance_factor", "observations", "outside", "repeated", "down")
+    gaps = [
+        {"first": int(m.index[g.first]), "last": int(m.index[g.last]), "reason": g.reason, "common": g.common}
+        for g in m.structure.gaps
+    ]
+    part = {name: getattr(m.structure, name) for name in names}
+    return part | {"standing": m.index[m.structure.standing], "gaps": gaps, "backwards": m.backwards}
+
+
+def _poses_part(m: Measurement) -> dict[str, Any]:
+    """Of each keyframe that has one: x_camera = R x + t, by quaternion w x y z; where the camera was."""
+    s = m.structure
+    variance = np.trace(s.pose_covariance[:, 3:, 3:], axis1=1, axis2=2)
+    return {
+        "keyframe": m.index[s.frames],
+        "stretch": s.segment,
+        "chainage": m.frame_chainage(),
+        "quaternion": [quaternion(p[:, :3]) for p in s.poses],
+        "translation": s.poses[:, :, 3],
+        "centre": s.centres,
+        "centre_sigma": np.sqrt(np.maximum(0, variance)),
+    }
+
+
+def _tube_part(x: Stretch) -> dict[str, Any]:
+    return {
+        "stretch": x.segment,
+        "status": x.tube.status,
+        "reason": x.tube.reason,
+        "chainage_at_start": x.origin,
+        "chainage_sign": x.sign,
+        "summary": x.tube.summary,
+        "water": x.water,
+    }
+
+
+def _quality_part(m: Measurement) -> dict[str, Any]:
+    """Residuals, the encoder against the pictures, and whether the profile still holds."""
+    residuals = m.residuals
+    return {
+        "residuals_by_angle": trend(residuals, m.camera, m.tracks),
+        "residual_rms_px": float(np.sqrt(np.mean(residuals.pixels[residuals.inlier] ** 2))),
+        "residuals_over_noise": residuals.spread,
+        "observations": len(residuals.item),
+        "outliers": int((~residuals.inlier).sum()),
+        "encoder": encoder_against_vision(m),
+        "profile": m.health.as_dict() if m.health else None,
+    }
 
 
 def _colours(deviation: np.ndarray, diameter: float) -> dict[str, np.ndarray]:
@@ -312,7 +313,8 @@ def colmap_model(m: Measurement) -> tuple[dict[str, bytes], str]:
     try:
         written = colmap(m.camera, Wanted(COLMAP_ERROR_PX, limit if m.camera.theta_max > COLMAP_THETA else None))
     except ProfileError as error:
-        return {}, f"No COLMAP model: {error.reason}."
+        why = str(error.reason).partition("; --")[0]  # what else it says are options of another command
+        return {}, f"No COLMAP model: {why}."
     keep = m.residuals.inlier & (m.residuals.theta < limit)
     frame, point, item = (v[keep] for v in (m.residuals.frame, m.residuals.point, m.residuals.item))
     error = np.linalg.norm(m.residuals.pixels[keep], axis=1)
@@ -374,10 +376,10 @@ def write_measurement(m: Measurement, folder: Path, tell: Tell | None = None) ->
     """Writes all files; returns the document of reconstruction.json and the files' paths. Raises OSError."""
     from pipefish.gltf import gltf_files
 
-    model, note = colmap_model(m)
-    document = document_of(m, [note] if note else [])
-    scenes, note = gltf_files(m, document, tell)
-    document["remarks"] += [note] if note else []
+    model, of_model = colmap_model(m)
+    document = document_of(m)
+    scenes, of_scenes = gltf_files(m, document, tell)
+    document["file_remarks"] = [note for note in (of_model, of_scenes) if note]  # of the files, not of the pipe
     table = stations(m)
     contents = {
         "profile.csv": csv_bytes(table),

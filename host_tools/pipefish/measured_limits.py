@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipefish.errors import ArgumentError
-from pipefish.measured_texts import OVALITIES, Z95, column, length_text
+from pipefish.intervals import Z95
+from pipefish.measured_texts import OVALITIES, column, length_text
 
 #: A bound further off the pipe's diameter than by this factor was meant in another unit: metres, centimetres, inches.
 DIAMETER_OFF = 5.0
@@ -73,6 +74,11 @@ def whole_sigma(document: dict[str, Any], quantity: str) -> np.ndarray:
     if quantity == "reduction_nominal":
         return np.sqrt(sigma**2 + scale["systematic"]["relative"] ** 2 + (0.5 * camera) ** 2)
     return sigma
+
+
+def most_oval(document: dict[str, Any]) -> float:
+    """Half width of the 95 % interval of the largest ovality."""
+    return Z95 * float(whole_sigma(document, "ovality")[int(np.nanargmax(column(document, "ovality")))])
 
 
 def verdict(document: dict[str, Any], name: str, bound: float) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.measured_texts import Z95, length_text
+from pipefish.intervals import Z95
+from pipefish.measured_texts import length_text
 from pipefish.measurement import Measurement, mean_diameter
 from pipefish.tube_findings import LEAST_HEIGHT, SURELY, TENTH
 
@@ -53,7 +54,7 @@ def map_text(dense: dict[str, Any]) -> str:
     """What a dense map (a document of dense.json) adds, in words."""
     unit, cell = dense["unit"], dense["cell"]
     sigma = dense["sigma_median"]
-    known = f", each to ± {length_text(Z95 * sigma, unit)} (95 %, median)" if sigma else ""
+    known = f", each to ± {length_text(Z95 * sigma, unit)} (median)" if sigma else ""
     return (
         f"By the dense map, a cell every {length_text(cell, unit)}{known}, on {100 * dense['coverage']:.0f} % of what "
         "two pairs of keyframes saw: smaller deposits and recesses, joint steps, cracks. Elsewhere only what tracks "

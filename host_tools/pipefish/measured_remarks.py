@@ -11,6 +11,7 @@ import numpy as np
 from pipefish.assumed import assumed_px
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
+from pipefish.intervals import Z95
 from pipefish.measured_texts import clock_text, length_text
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.repeated import against_encoder
@@ -202,7 +203,7 @@ def _shutter_remark(m: Measurement) -> list[str]:
     why = ": is its sign wrong?" if abs(value + stated) < max(LINE_SIGMAS * sigma, LINE_OFF * abs(stated)) else ""
     return [
         f"The rolling shutter is stated as {stated:.1f} us a row (camera.line_time_us, --line-time), but the survey's "
-        f"own rows say {value:.1f} +- {1.96 * sigma:.1f} (95 %){why}"
+        f"own rows say {value:.1f} ± {Z95 * sigma:.1f}{why}"
         + ("" if why else ": bends, clocks and ovality may be off.")
     ]
 

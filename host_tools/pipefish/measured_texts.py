@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipefish.errors import FormatError
-from pipefish.scale import DISAGREE_SIGMA
+from pipefish.intervals import Z95
 
 FORMAT, VERSION = "pipefish-reconstruction", 1
-Z95 = 1.96
 
 #: What an ovality of the tables is of, in words.
 OVALITIES = {
@@ -84,9 +83,9 @@ def scale_texts(scale: dict[str, Any]) -> list[str]:
         return []
     out = []
     for row in scale["sources"]:
-        word = f"agrees within {DISAGREE_SIGMA:g} sigma"
+        word = "agrees"
         if not row["consistent"]:
-            word = f"DISAGREES by {abs(row['deviation']):.1f} sigma"
+            word = f"DISAGREES by {abs(row['deviation']) / Z95:.1f} times the 95 % interval"
         role = "used" if row["used"] else "a check"
         size = f"{100 * row['relative']:+.2f} ± {100 * Z95 * row['sigma']:.2f} %"
         out.append(f"{row['name']}: {size}, {role}, {word} ({row['detail']})")

@@ -328,10 +328,10 @@ class Page:
         return [(heading, rows) for heading, rows in tables if rows]
 
 
-def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False) -> str:
-    """A table of two columns under its heading; folded: a click opens it."""
+def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False, note: str = "") -> str:
+    """A table of two columns under its heading, with a note below; folded: a click opens it."""
     body = "".join(f"<tr><th scope='row'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows)
-    table = f"<table>{body}</table>"
+    table = f"<table>{body}</table>" + (f"<p class='note'>{html.escape(note)}</p>" if note else "")
     if folded:
         return f"<details class='card'><summary><h3>{html.escape(heading)}</h3></summary>{table}</details>"
     return f"<section class='card'><h3>{html.escape(heading)}</h3>{table}</section>"

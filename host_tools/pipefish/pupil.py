@@ -11,7 +11,7 @@ import numpy as np
 
 from .assumed import PUPIL_MOST
 from .camera import Camera
-from .measured_texts import Z95
+from .intervals import Z95
 
 
 def pupil_is_known(camera: Camera) -> bool:

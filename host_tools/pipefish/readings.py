@@ -10,6 +10,7 @@ import numpy as np
 
 from pipefish.camera import Camera
 from pipefish.errors import PipefishError
+from pipefish.intervals import Z95
 from pipefish.repeated import cut
 from pipefish.rolling import shutter_of
 from pipefish.structure import Encoder, RollingShutter
@@ -120,8 +121,8 @@ def _encoder(survey: Survey, remarks: list[str]) -> tuple[np.ndarray | None, Enc
         return None, quality
     if not told or not told.metres_per_count_sigma:
         remarks.append(
-            f"The device does not say how good its encoder's scale is: {100 * quality.scale_sigma:.1f} % (one "
-            "sigma) is assumed."
+            f"The device does not say how good its encoder's scale is: ± {100 * Z95 * quality.scale_sigma:.1f} % is "
+            "assumed."
         )
     return chainage, quality
 

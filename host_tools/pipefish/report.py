@@ -11,14 +11,32 @@ import numpy as np
 
 from pipefish.dense_findings import finding_parts
 from pipefish.files import write_atomically
-from pipefish.measured_limits import LIMITS, check_limits, verdict
+from pipefish.intervals import SAID, Z95
+from pipefish.measured_limits import LIMITS, check_limits, most_oval, verdict, whole_sigma
 from pipefish.measured_reach import UNSEEN, reach_text
-from pipefish.measured_texts import Z95, clock_text, column, length_text, scale_texts, size_parts
+from pipefish.measured_texts import clock_text, column, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
+from pipefish.report_scene import Scene
 from pipefish.report_wall import WallPicture, wall_picture
 from pipefish.unroll import Tell
+
+INTERVALS = (
+    "Repeatability: by how much another drive through the pipe would differ. Systematic: what it "
+    "would repeat, as scale and camera stay the same."
+)
+FILES = {
+    "profile.csv": "diameters and ovality along the pipe",
+    "centreline.csv": "where the pipe goes",
+    "events.csv": "the findings",
+    "points.ply": "the points that were measured, as a cloud",
+    "tube.ply": "the fitted wall, as a surface",
+    "tube.glb": "the wall with its picture, in 3-D",
+    "deviation.glb": "the wall coloured by deviation, in 3-D",
+    "colmap": "poses and points for COLMAP and what reads it",
+    "reconstruction.json": "all of it, for programs",
+}
 
 
 def _with_code(text: str) -> str:
@@ -35,6 +53,7 @@ class Report(Charts):
         self.picture = picture
         self.dense = dense
         check_limits(limits, self.summary["d_mean"] if self.unit == "metre" else None)
+        self.scene = Scene(self, limits)
         self.verdicts = [verdict(self.document, name, bound) for name, bound in limits]
 
     # ---- texts
@@ -48,7 +67,7 @@ class Report(Charts):
                 (
                     f"{1000 * s['d_mean']:.1f}",
                     "mm",
-                    f"mean diameter; ± {random:.1f} repeatability, ± {shared:.1f} systematic (95 %)",
+                    f"mean diameter, ± {random:.1f} repeatability, ± {shared:.1f} systematic",
                 )
             )
         elif self.unit == "metre":
@@ -58,13 +77,15 @@ class Report(Charts):
             for name, word, worst in (("d_min", "narrowest", np.nanargmin), ("d_max", "widest", np.nanargmax)):
                 k = int(worst(column(self.document, name)))
                 at = length_text(column(self.document, "chainage")[k], self.unit, metres=True)
-                own = self.factor * Z95 * column(self.document, f"{name}_sigma")[k]
-                text = f"{word} anywhere, at {at}; ± {own:.{digits}f} repeatability (95 %)"
-                tiles.append((f"{self.factor * s[name]:.{digits}f}", self.short, text))
+                half = self.factor * Z95 * whole_sigma(self.document, name)[k]
+                tiles.append(
+                    (f"{self.factor * s[name]:.{digits}f}", self.short, f"{word}, ± {half:.{digits}f}, at {at}")
+                )
             at = length_text(s["ovality_most_at"], self.unit, metres=True)
             rms = s.get("ovality_rms")  # older documents have none
             along = "" if rms is None else f"; {100 * rms:.2f} % rms along the pipe"
-            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, at {at}{along}"))
+            half = 100 * most_oval(self.document)
+            tiles.append((f"{100 * s['ovality_most']:.2f}", "%", f"most oval, ± {half:.2f}, at {at}{along}"))
         figure = f"{s['path_length']:.2f}", self.along_unit, "of camera path"
         tiles.append(figure)
         return tiles
@@ -84,15 +105,20 @@ class Report(Charts):
         table = f"<div class='wide'><table class='list'>{rows}</table></div>"
         if all(v["state"] != "undecided" for v in self.verdicts):
             return table
-        note = "Undecided: the 95 % interval at the worst station, systematic part included, reaches across the limit."
+        note = "Undecided: the interval at the worst station, systematic part included, reaches across the limit."
         return f"{table}<p class='muted'>{note}</p>"
 
     def date(self) -> str:
         """When the first keyframe was taken."""
         stamp = self.document["survey"]["first_time_unix_ns"]
         if not stamp:
-            return "unknown"
+            return ""
         return datetime.datetime.fromtimestamp(stamp / 1e9, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+    def name(self) -> str:
+        """What the survey is called; without a name, its file and date."""
+        survey = self.document["survey"]
+        return survey["name"] or ", ".join(t for t in (Path(survey["file"]).stem, self.date()) if t) or "Pipe"
 
     def scale_source(self) -> str:
         """What the scale is from, in words."""
@@ -134,9 +160,11 @@ class Report(Charts):
             ("  of which pupil shift", self.pupil_text()),
         ]
         if "ovality_sigma" in s:
-            rows.append(("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} points"))
+            rows.append(
+                ("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} percentage points")
+            )
             if s["ovality_systematic"] > 0:
-                rows.append(("  systematic (camera)", f"± {Z95 * 100 * s['ovality_systematic']:.2f} points"))
+                rows.append(("  systematic (camera)", f"± {Z95 * 100 * s['ovality_systematic']:.2f} percentage points"))
         for text in scale_texts(self.document["scale"]):
             name, _, told = text.partition(": ")
             rows.append((f"lengths by the {name}, against the given ones", told))
@@ -159,7 +187,7 @@ class Report(Charts):
         told = f"<p class='note'>{_with_code(self.reach_text())}</p>"
         if not rows:
             return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
-        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size, 95 %", "found by"))
+        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size", "found by"))
         table = f"<table class='list findings'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         return f"<div class='wide'>{table}</div>{told}"
 
@@ -173,8 +201,7 @@ class Report(Charts):
 
     def tables(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(heading, rows) of what stands at the end."""
-        d, s, camera = self.document, self.summary, self.document["camera"]
-        structure = d["structure"]
+        d = self.document
         gaps = [
             (
                 f"{g['start']:.2f} to {g['end']:.2f} {self.along_unit}" if g["start"] is not None else "unknown",
@@ -183,9 +210,30 @@ class Report(Charts):
             for g in d["not_measured"]
             if g["end"] is not None or g["start"] is None
         ]
+        survey = [
+            ("survey", d["survey"]["name"] or "-"),
+            ("surveyed", self.date() or "unknown"),
+            ("survey id", d["survey"]["survey_id"]),
+            ("file", Path(d["survey"]["file"]).name),
+            ("device", d["survey"]["software"] or "-"),
+            ("measured by", d["software"]),
+        ]
+        return [
+            ("Accuracy", self.accuracy_rows()),
+            ("Measured", self.measured_rows()),
+            ("Stretches not measured", gaps or [("none", "all of the path was measured")]),
+            ("Calibration used", self.calibration_rows()),
+            ("Survey", survey),
+            ("Files of the measurement", self.file_rows()),
+        ]
+
+    def measured_rows(self) -> list[tuple[str, str]]:
+        """How much there is of everything."""
+        d, s = self.document, self.summary
+        structure = d["structure"]
         digits = 1 if self.unit == "metre" else 3
         least, most = (f"{self.factor * s[k]:.{digits}f}" for k in ("d_mean_least", "d_mean_most"))
-        measured = [
+        rows = [
             ("keyframes with a pose", f"{s['keyframes_with_pose']} of {s['keyframes']}"),
             ("left out: nothing had moved", str(len(structure["standing"]))),
             ("stretches", str(s["stretches"])),
@@ -202,8 +250,13 @@ class Report(Charts):
         ]
         if d["scale"]["wheel_sigma"] is not None:
             wheel = f"{100 * d['scale']['wheel']:+.2f} ± {100 * Z95 * d['scale']['wheel_sigma']:.2f} %"
-            measured.append(("wheel: true distance against reading", wheel))
-        calibration = [
+            rows.append(("wheel: true distance against reading", wheel))
+        return rows
+
+    def calibration_rows(self) -> list[tuple[str, str]]:
+        """The camera that measured."""
+        d, camera = self.document, self.document["camera"]
+        return [
             ("profile", camera["name"] or "unnamed"),
             ("serial", camera["serial"] or "-"),
             ("model", camera["model"]),
@@ -224,31 +277,22 @@ class Report(Charts):
             ),
             ("source", camera["source"] or "-"),
         ]
-        survey = [
-            ("survey", d["survey"]["name"] or "-"),
-            ("surveyed", self.date()),
-            ("survey id", d["survey"]["survey_id"]),
-            ("file", Path(d["survey"]["file"]).name),
-            ("device", d["survey"]["software"] or "-"),
-            ("measured by", d["software"]),
-        ]
-        return [
-            ("Accuracy, 95 %", self.accuracy_rows()),
-            ("Measured", measured),
-            ("Stretches not measured", gaps or [("none", "all of the path was measured")]),
-            ("Calibration used", calibration),
-            ("Survey", survey),
-        ]
+
+    def file_rows(self) -> list[tuple[str, str]]:
+        """What lies beside reconstruction.json, and what to know about it. Older documents do not say."""
+        names = dict.fromkeys(name.split("/")[0] for name in self.document.get("files", []))
+        rows = [(name, FILES.get(name, "")) for name in names]
+        return rows + [("note", text) for text in self.document.get("file_remarks", [])]
 
     def render(self, title: str | None) -> str:
         """The whole page."""
-        diameter, ovality, tube = self.chart_diameter(), self.chart_ovality(), self.chart_tube()
+        diameter, ovality, tube = self.chart_diameter(), self.chart_ovality(), self.scene.chart()
         line, quality = self.charts_line(), self.charts_quality()
         tables = dict(self.tables())
         remarks = "".join(f"<li>{_with_code(r)}</li>" for r in self.document["remarks"])
         values = {
             "limits": self.limits_html(),
-            "accuracy": table_html("Accuracy, 95 %", tables.pop("Accuracy, 95 %")),
+            "accuracy": table_html("Accuracy", tables.pop("Accuracy"), note=INTERVALS),
             "remarks": f"<ul class='remarks'>{remarks}</ul>" if remarks else "<p class='muted'>None.</p>",
             "profile": chart_html(diameter) + chart_html(ovality),
             "events": self.events_html(),
@@ -260,7 +304,6 @@ class Report(Charts):
             "tables": "".join(table_html(heading, rows) for heading, rows in tables.items()),
         }
         s = self.summary
-        name = title or self.document["survey"]["name"] or "Pipe"
         lead = f"{length_text(s['path_length'], self.unit, metres=True)} of "
         lead += f"DN{1000 * s['nominal']:.0f} pipe, " if s["nominal"] else "pipe, "
         lead += f"measured from {s['keyframes_with_pose']} keyframes and {s['points']} points of its wall."
@@ -272,7 +315,15 @@ class Report(Charts):
             lead += " What tells the scale disagrees: see what to know before a length is used."
         charts = [diameter, ovality, tube, *line, *quality]
         main, more = fill("report.html", values), {"wall": self.picture.data} if self.picture.data else {}
-        return whole_page("Pipefish measurement", name, lead, main, charts, self.tiles(), **more)
+        return whole_page(
+            "Pipefish measurement",
+            title or self.name(),
+            f"{lead} {SAID.capitalize()}.",
+            main,
+            charts,
+            self.tiles(),
+            **more,
+        )
 
 
 def write_report(

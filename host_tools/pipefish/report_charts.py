@@ -1,8 +1,7 @@
-"""The charts of the report and its 3-D scene."""
+"""The charts of the report."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,16 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pipefish.cloudfile import read_columns
-from pipefish.colours import DIVERGING
-from pipefish.errors import FormatError
-from pipefish.measured_files import COLOUR_SPAN, RING
+from pipefish.intervals import Z95
 from pipefish.measured_limits import whole_sigma
-from pipefish.measured_texts import OVALITIES, Z95, column, events_text, read_measured
+from pipefish.measured_remarks import TREND_PX
+from pipefish.measured_texts import OVALITIES, column, read_measured
 from pipefish.page import Chart
 
-MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # of the 3-D scene: a phone turns that
-SCENE_LENGTH = 2.5  # of the scene's longest side, in Plotly's units, in which the eye stands 2.1 off its middle
+LEAST_SPAN = 0.1  # diameters that the axis of heights spans
 NARROW_GAP = 1.5  # stations further apart than so many spacings are not joined by a line
 
 DIAMETERS = (
@@ -102,7 +98,7 @@ class Charts:
         return _axis(f"chainage, {self.along_unit}", range=[round(low - margin, 3), round(high + margin, 3)], **more)
 
     def shapes(self) -> list[dict[str, Any]]:
-        """Grey where nothing was measured, lines where something was found."""
+        """Grey where nothing was measured."""
         shapes: list[dict[str, Any]] = []
         for gap in self.document["not_measured"]:
             if gap["start"] is not None and gap["end"] is not None:
@@ -149,9 +145,8 @@ class Charts:
         return {
             "id": "diameter",
             "title": "Diameter along the pipe",
-            "text": "Bands: 95 % intervals of repeatability. What all values share (scale, camera) is not in them: "
-            f"± {shared:.{digits}f} {self.short} (95 %). Dotted: nominal. Grey: not measured. Names in the legend "
-            "switch on "
+            "text": "Bands: repeatability. What all values share (scale, camera) is not in them: "
+            f"± {shared:.{digits}f} {self.short}. Dotted: nominal. Grey: not measured. Names in the legend switch on "
             "and off.",
             "data": data,
             "layout": {
@@ -184,7 +179,7 @@ class Charts:
         return {
             "id": "ovality",
             "title": "Ovality along the pipe",
-            "text": "Choose the definition. Bands: 95 % intervals of repeatability and systematic error together, as "
+            "text": "Choose the definition. Bands: repeatability and systematic error together, as "
             "for the limits. Noise makes any circle look oval: its share is taken off, and the lower end of an "
             "interval may be zero.",
             "data": data,
@@ -196,128 +191,6 @@ class Charts:
             },
             "choice": {"label": "Definition", "names": names, "traces": 2},
         }
-
-    def chart_tube(self) -> Chart:
-        """The 3-D scene: wall coloured by deviation, points, path of the camera, findings."""
-        wall = read_columns(self.folder / "tube.ply")
-        missing = {"x", "y", "z", "deviation", "piece"} - set(wall)
-        if missing or len(wall["x"]) % RING:
-            raise FormatError(self.folder / "tube.ply", "vertex", "not a wall that `pipefish reconstruct` wrote")
-        shape = (-1, RING)
-        xyz = np.stack([wall[k].astype(float).reshape(shape) for k in "xyz"], -1)[:, :: RING // AROUND]
-        deviation = self.factor * wall["deviation"].astype(float).reshape(shape)[:, :: RING // AROUND]
-        piece = wall["piece"].reshape(shape)[:, 0]
-        keep = np.arange(len(xyz)) % max(1, math.ceil(len(xyz) / MOST_RINGS)) == 0
-        keep |= np.diff(piece, prepend=-1) != 0
-        keep |= np.diff(piece, append=-1) != 0
-        xyz, deviation, piece = xyz[keep], deviation[keep], piece[keep]
-        same = np.flatnonzero(piece[1:] == piece[:-1])
-        j = np.arange(AROUND)
-        a = (same[:, None] * AROUND + j).ravel()
-        b = (same[:, None] * AROUND + (j + 1) % AROUND).ravel()
-        faces = np.concatenate([np.c_[a, a + AROUND, b], np.c_[b, a + AROUND, b + AROUND]])
-        centre = xyz.mean(axis=(0, 1))
-
-        def at(points: np.ndarray) -> dict[str, list[float | None]]:
-            moved = points.reshape(-1, 3) - centre
-            # Plotly's third axis points upwards: camera x, z, -y.
-            return {"x": _numbers(moved[:, 0], 4), "y": _numbers(moved[:, 2], 4), "z": _numbers(-moved[:, 1], 4)}
-
-        extent = np.maximum(np.ptp(xyz.reshape(-1, 3), axis=0), 1e-9)[[0, 2, 1]]
-        reach = max(1e-6, min(float(np.nanpercentile(np.abs(deviation), 99)), self.factor * COLOUR_SPAN))
-        size = self.summary["nominal"] if self.summary["nominal"] and self.unit == "metre" else self.summary["d_mean"]
-        scale = [[k / (len(DIVERGING) - 1), "rgb({:.0f},{:.0f},{:.0f})".format(*c)] for k, c in enumerate(DIVERGING)]
-        data: list[dict[str, Any]] = [
-            {
-                "type": "mesh3d",
-                "name": "wall",
-                **at(xyz),
-                **{n: faces[:, k].tolist() for k, n in enumerate("ijk")},
-                "intensity": _numbers(deviation.ravel(), 3),
-                "colorscale": scale,
-                "cmin": -reach,
-                "cmax": reach,
-                "opacity": 0.55,
-                "flatshading": False,
-                "lighting": {"ambient": 0.7, "diffuse": 0.5, "specular": 0.1},
-                "colorbar": {
-                    "title": {"text": f"radius - {self.factor * size / 2:.4g}, {self.short}", "side": "top"},
-                    "orientation": "h",
-                    "thickness": 10,
-                    "len": 0.8,
-                    "y": 0,
-                    "yanchor": "bottom",
-                },
-                "hovertemplate": f"%{{intensity:.2f}} {self.short}<extra>wall</extra>",
-            }
-        ]
-        cloud = read_columns(self.folder / "points.ply")
-        points = np.stack([cloud[k].astype(float) for k in "xyz"], -1)
-        near = np.abs(cloud["distance"]) < 0.25 * size  # far ones would shrink the pipe to a dot
-        points = points[near][:: max(1, math.ceil(near.sum() / MOST_POINTS))]
-        dots = {
-            "type": "scatter3d",
-            "mode": "markers",
-            "marker": {"size": 1.2, "color": "#7d8a97"},
-            "hoverinfo": "skip",
-        }
-        data.append({**dots, "name": "points", "visible": "legendonly", **at(points)})  # they hide the wall's colour
-        path = np.array(self.document["poses"]["centre"], float)
-        of_stretch = self.document["poses"]["stretch"]
-        rows: list[np.ndarray] = []
-        for _, run in itertools.groupby(range(len(path)), key=lambda k: of_stretch[k]):
-            rows += [path[list(run)], np.full((1, 3), np.nan)]
-        line = {"type": "scatter3d", "mode": "lines", "line": {"width": 4, "color": "#d8a012"}, "hoverinfo": "skip"}
-        data.append({**line, "name": "camera", **at(np.vstack(rows))})
-        data += self._marks(at)
-        return {
-            "id": "tube",
-            "title": "The pipe in 3-D",
-            "text": "Drag to turn, wheel or two fingers to come nearer; the points are switched on in the legend. "
-            "Colour: the wall's radius against "
-            f"{'nominal' if self.summary['nominal'] and self.unit == 'metre' else 'the mean'}.",
-            "data": data,
-            "layout": {
-                "scene": {
-                    "domain": {"y": [0.13, 1]},  # above the colours' bar
-                    # True proportions, with the longest side so that the whole pipe is in view.
-                    "aspectmode": "manual",
-                    "aspectratio": dict(
-                        zip("xyz", (SCENE_LENGTH * extent / extent.max()).round(4).tolist(), strict=True)
-                    ),
-                    "xaxis": {"title": {"text": ""}},
-                    "yaxis": {"title": {"text": self.along_unit}},
-                    "zaxis": {"title": {"text": ""}},
-                    "camera": {"eye": {"x": 0.75, "y": -1.85, "z": 0.75}},  # along the pipe: fits tall and wide
-                },
-                "margin": {"l": 0, "r": 0, "t": 28, "b": 0},
-                "dragmode": "orbit",
-            },
-        }
-
-    def _marks(self, at: Any) -> list[dict[str, Any]]:
-        """Findings, on the axis."""
-        found = [e for e in self.document["events"] if e["kind"] != "not_measured"]
-        if not found:
-            return []
-        axis = np.stack([column(self.document, k) for k in "xyz"], -1)
-        order = np.argsort(self.x)
-        place = np.stack(
-            [np.interp([e["chainage"] for e in found], self.x[order], axis[order, k]) for k in range(3)], -1
-        )
-        return [
-            {
-                "type": "scatter3d",
-                "mode": "markers+text",
-                "name": "findings",
-                **at(place),
-                "marker": {"size": 5, "symbol": "diamond", "color": "#b83a63"},
-                "text": [e["kind"] for e in found],
-                "textposition": "top center",
-                "hovertext": [f"{e['kind']} {events_text(e, self.unit)}" for e in found],
-                "hoverinfo": "text",
-            }
-        ]
 
     def charts_line(self) -> list[Chart]:
         """Where the axis goes: plan, and height where gravity is known."""
@@ -357,87 +230,84 @@ class Charts:
                 "title": "Height of the centreline",
                 "text": f"Above where the pipe starts; up is {known}.",
                 "data": [{**line, "x": cut(self.x), "y": cut(self.factor * height)}],
-                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short)},
+                "layout": {"xaxis": self.along(), "yaxis": _axis(self.short, range=self._heights(height))},
             },
         ]
 
+    def _heights(self, height: np.ndarray) -> list[float]:
+        """The range of the axis: not less than LEAST_SPAN, so that what adds up to a millimetre looks like one."""
+        low, high = float(np.nanmin(height)), float(np.nanmax(height))
+        half = max(0.55 * (high - low), LEAST_SPAN * self.summary["d_mean"] / 2)
+        return [round(self.factor * ((low + high) / 2 + end), 4) for end in (-half, half)]
+
     def charts_quality(self) -> list[Chart]:
-        """Points on the wall, residuals by angle, encoder against vision."""
+        """Residuals by angle, points on the wall, encoder against vision."""
+        return [self._chart_residuals(), self._chart_points(), *self._chart_encoder()]
+
+    def _chart_residuals(self) -> Chart:
         quality = self.document["quality"]
         bins = quality["residuals_by_angle"]
         names = [f"{b['low_deg']:.0f}-{b['high_deg']:.0f}°" for b in bins]
-        charts: list[Chart] = [
-            {
-                "id": "angle",
-                "title": "Residuals by angle from the axis",
-                "text": f"{quality['observations']} observations, {quality['outliers']} of them outliers and left "
-                "out here. "
-                "A mean outward residual away from zero says that the profile does not fit the camera; judged at "
-                "0.15 px.",
-                "data": [
-                    {
-                        "type": "bar",
-                        "name": "rms",
-                        "x": names,
-                        "y": _numbers(b["rms_px"] for b in bins),
-                        "customdata": [b["count"] for b in bins],
-                        "hovertemplate": "%{y:.3f} px rms of %{customdata}<extra></extra>",
-                    },
-                    {
-                        "type": "scatter",
-                        "mode": "lines+markers",
-                        "name": "mean outwards",
-                        "x": names,
-                        "y": _numbers(b["mean_radial_px"] for b in bins),
-                        "hovertemplate": "%{y:+.3f} px outwards<extra></extra>",
-                    },
-                ],
-                "layout": {"xaxis": _axis("", type="category"), "yaxis": _axis("px")},
+        rms = {
+            "type": "bar",
+            "name": "rms",
+            "x": names,
+            "y": _numbers(b["rms_px"] for b in bins),
+            "customdata": [b["count"] for b in bins],
+            "hovertemplate": "%{y:.3f} px rms of %{customdata}<extra></extra>",
+        }
+        outwards = {
+            "type": "scatter",
+            "mode": "lines+markers",
+            "name": "mean outwards",
+            "x": names,
+            "y": _numbers(b["mean_radial_px"] for b in bins),
+            "hovertemplate": "%{y:+.3f} px outwards<extra></extra>",
+        }
+        return {
+            "id": "angle",
+            "title": "How well the camera profile fits",
+            "text": "How far points are in the pictures from where the measurement has them (residuals), by their "
+            f"angle from the camera's axis; {quality['observations']} observations, {quality['outliers']} of them "
+            "outliers and left out here. A mean outward residual away from zero says that the profile does not fit "
+            f"the camera; judged at {TREND_PX:g} px.",
+            "data": [rms, outwards],
+            "layout": {"xaxis": _axis("", type="category"), "yaxis": _axis("px")},
+        }
+
+    def _chart_points(self) -> Chart:
+        line = {"type": "scatter", "mode": "lines", "line": {"color": COLOURS[0]}}
+        return {
+            "id": "points",
+            "title": "Points behind each section",
+            "text": "Points within 0.375 diameters of each station. Under 20 nothing is given.",
+            "data": [{**line, "x": _numbers(self.x), "y": _numbers(column(self.document, "inliers"), 0)}],
+            "layout": {
+                "xaxis": self.along(),
+                "yaxis": _axis("points", rangemode="tozero"),
+                "shapes": self.shapes(),
             },
-            {
-                "id": "points",
-                "title": "Points behind each section",
-                "text": "Points within 0.375 diameters of each station. Under 20 nothing is given.",
-                "data": [
-                    {
-                        "type": "scatter",
-                        "mode": "lines",
-                        "x": _numbers(self.x),
-                        "y": _numbers(column(self.document, "inliers"), 0),
-                        "line": {"color": COLOURS[0]},
-                    }
-                ],
-                "layout": {
-                    "xaxis": self.along(),
-                    "yaxis": _axis("points", rangemode="tozero"),
-                    "shapes": self.shapes(),
-                },
-            },
-        ]
-        encoder = quality["encoder"]
-        if encoder and self.unit == "metre":
-            excess = np.array([np.nan if v is None else v for v in encoder["vision_minus_encoder"]], float)
-            along = np.array([np.nan if v is None else v for v in encoder["chainage"]], float)
-            last = excess[np.isfinite(excess)]
-            total = float(np.nanmax(along) - np.nanmin(along)) or math.nan
-            share = f" {100 * last[-1] / total:+.2f} % at the end." if len(last) else ""
-            charts.append(
-                {
-                    "id": "encoder",
-                    "title": "Camera's path against the encoder",
-                    "text": f"How much further the camera's path is than the encoder says.{share} Steps are slips "
-                    "of the wheel or "
-                    "of the tracking.",
-                    "data": [
-                        {
-                            "type": "scatter",
-                            "mode": "lines",
-                            "x": _numbers(along),
-                            "y": _numbers(1000 * excess, 2),
-                            "line": {"color": COLOURS[1]},
-                        }
-                    ],
-                    "layout": {"xaxis": _axis("chainage by the encoder, m"), "yaxis": _axis("mm")},
-                }
-            )
-        return charts
+        }
+
+    def _chart_encoder(self) -> list[Chart]:
+        """None without an encoder."""
+        encoder = self.document["quality"]["encoder"]
+        if not encoder or self.unit != "metre":
+            return []
+        excess, along = (
+            np.array([np.nan if v is None else v for v in encoder[name]], float)
+            for name in ("vision_minus_encoder", "chainage")
+        )
+        last = excess[np.isfinite(excess)]
+        total = float(np.nanmax(along) - np.nanmin(along)) or math.nan
+        share = f" {100 * last[-1] / total:+.2f} % at the end." if len(last) else ""
+        line = {"type": "scatter", "mode": "lines", "line": {"color": COLOURS[1]}}
+        chart: Chart = {
+            "id": "encoder",
+            "title": "Camera's path against the encoder",
+            "text": f"How much further the camera's path is than the encoder says.{share} Steps are slips of the wheel "
+            "or of the tracking.",
+            "data": [{**line, "x": _numbers(along), "y": _numbers(1000 * excess, 2)}],
+            "layout": {"xaxis": _axis("chainage by the encoder, m"), "yaxis": _axis("mm")},
+        }
+        return [chart]

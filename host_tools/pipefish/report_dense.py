@@ -13,8 +13,9 @@ from PIL import Image
 
 from pipefish.dense_findings import findings_of, read_dense
 from pipefish.errors import FormatError, PipefishError
+from pipefish.intervals import Z95
 from pipefish.measured_reach import map_text
-from pipefish.measured_texts import Z95, length_text
+from pipefish.measured_texts import length_text
 from pipefish.page import data_uri
 
 
@@ -53,7 +54,7 @@ def _section(where: Path, document: dict[str, Any]) -> str:
     text = (
         f"Every {length_text(document['cell'], unit)} of the wall by matching keyframes with each other: "
         f"{document['measured']} places, {100 * document['coverage']:.0f} % of those in view of two pairs, each to "
-        f"± {length_text(Z95 * (document['sigma_median'] or 0.0), unit)} (95 %, median) from the fitted tube. Found: "
+        f"± {length_text(Z95 * (document['sigma_median'] or 0.0), unit)} (median) from the fitted tube. Found: "
         f"{counts[0]} that stand in or out, {counts[1]} of joints, {counts[2]}; they are among the findings. Above "
         "the deviation, below the wall, chainage to the right; found is what is framed, marked or traced."
     )

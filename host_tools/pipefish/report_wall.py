@@ -26,6 +26,7 @@ MOST_COLUMNS = 40_000  # of it: 10 MB; longer pipes are drawn coarser
 PART = 4096  # columns of one picture
 MOST_KEYFRAMES, KEYFRAME_WIDTH = 200, 420  # in the page: 3 MB
 QUALITY = 78
+NAME_PIXELS, LETTER_PIXELS, ROW_PIXELS = 22, 8, 18  # of the name beside a mark: its margins, a letter, its height
 
 
 @dataclass
@@ -96,15 +97,19 @@ def _keyframes(wall: Wall, views: np.ndarray) -> tuple[dict[int, int], list[dict
 
 def _marks(unroller: Unroller, findings: Sequence[dict[str, Any]]) -> Iterable[str]:
     """Findings, where they are on the picture: a circle, a line for what goes around the pipe, a crack's path."""
-    for event in [*unroller.wall.document["events"], *findings]:
-        if event["kind"] in ("not_measured", "bend") or event["chainage"] is None:
-            continue
+    ends: list[float] = []  # of the names of rings in each row, pixels: near ones stand one below the other
+    found = [e for e in (*unroller.wall.document["events"], *findings) if e["kind"] not in ("not_measured", "bend")]
+    for event in sorted((e for e in found if e["chainage"] is not None), key=lambda e: float(e["chainage"])):
         x = 100 * (event["chainage"] - unroller.start) / (unroller.columns * unroller.cell)
         if not 0 <= x <= 100:
             continue
         word = html.escape(event["kind"])
         if event["kind"] in ("joint", "step") or event.get("clock") is None:
-            yield f"<span class='wall-mark ring' style='left:{x:.3f}%'><b>{word}</b></span>"
+            left = x / 100 * unroller.columns
+            row = next((k for k, end in enumerate(ends) if end <= left), len(ends))
+            ends[row : row + 1] = [left + NAME_PIXELS + LETTER_PIXELS * len(event["kind"])]
+            top = f" style='top:{2 + ROW_PIXELS * row}px'" if row else ""
+            yield f"<span class='wall-mark ring' style='left:{x:.3f}%'><b{top}>{word}</b></span>"
             continue
         signs = [s["clock_sign"] for s in unroller.signs if s["stretch"] == event.get("stretch")]
         sign = (signs or [unroller.signs[0]["clock_sign"]])[0]

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from pipefish.intervals import Z95
 from pipefish.structure import Reconstruction
 from pipefish.tube import Tube
 from pipefish.tube_findings import chi2_limit
 
 DISAGREE_SIGMA = 3.0
 DISAGREE = 2 * NormalDist().cdf(-DISAGREE_SIGMA)  # the same for the chi-squared of any number of estimates
-Z95 = 1.96
 ORDER = ("encoder", "target", "joints", "diameter")  # whose word counts where two contradict each other
 SPACING_SIGMA = 0.005  # of a joint spacing that is given without a tolerance, relative
 PATTERN = 0.05  # of the spacing: joints that are further off are none of the row
@@ -201,8 +201,9 @@ def disagreement(scale: Scale) -> str | None:
     used = dict.fromkeys(words[r["name"]] for r in scale.sources if r["used"])
     worst = max((abs(r["deviation"]) for r in scale.sources if r["deviation"] is not None), default=0.0)
     return (
-        f"What tells the scale disagrees, up to {worst:.1f} sigma apart: lengths are, against the given ones, by "
-        f"{'; by '.join(told(r) for r in scale.sources)}. The values are those of {' and '.join(used)}: nothing was "
+        f"What tells the scale disagrees, by up to {worst / Z95:.1f} times the 95 % interval of the difference: "
+        f"lengths are, against the given ones, by {'; by '.join(told(r) for r in scale.sources)}. "
+        f"The values are those of {' and '.join(used)}: nothing was "
         "averaged with what contradicts it."
     )
 

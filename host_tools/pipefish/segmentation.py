@@ -65,6 +65,19 @@ class Layer:
     claimed: int
 
 
+@dataclass(frozen=True)
+class Motion:
+    """How a layer as a whole moves from picture 1 to picture 2: its pixels' median displacement (pixels, to the right
+    and down) and how far that is; and of the similarity that is nearest to its field the rotation (radians, clockwise)
+    and the scale, about its middle. None of it tells how it bends: flow1 does."""
+
+    right: float
+    down: float
+    distance: float
+    rotation: float
+    scale: float
+
+
 @dataclass(frozen=True, eq=False)
 class Segmentation:
     """What segment_motion returns.
@@ -81,6 +94,20 @@ class Segmentation:
     layers: list[Layer]
     status: str
     trace: list[tuple[str, float, int]]
+
+    def motion(self, label: int) -> Motion | None:
+        """Of a layer by its label, from 1 on; None where no pixel of picture 1 has it."""
+        flow = self.layers[label - 1].flow1
+        y, x = np.nonzero((self.labels1 == label) & np.isfinite(flow).all(axis=2))
+        if not len(x):
+            return None
+        shift = flow[y, x].astype(float) - np.stack([x, y], axis=1)
+        right, down = np.median(shift, axis=0)
+        here = x - x.mean() + 1j * (y - y.mean())
+        there = here + shift @ [1, 1j]
+        spread = np.vdot(here, here).real
+        turn = np.vdot(here, there - there.mean()) / spread if spread > 0 else 1.0
+        return Motion(float(right), float(down), float(np.hypot(right, down)), float(np.angle(turn)), float(abs(turn)))
 
 
 def planes(image: ArrayLike, name: str) -> Floats32:

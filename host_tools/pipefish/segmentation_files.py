@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from .files import write_atomically
 from .matching_files import png
-from .segmentation import Floats32, Layer, Segmentation
+from .segmentation import Floats32, Layer, Motion, Segmentation
 
 COLOURS = np.array(
     [(0, 0, 0), (230, 60, 50), (60, 170, 255), (70, 210, 80), (255, 190, 30), (200, 100, 255), (40, 220, 210)],
@@ -22,6 +23,19 @@ COLOURS = np.array(
 MESH = 16  # pixels between the lines of a mesh
 HEADING = 16  # pixels
 LINE = (20, 20, 20)
+README = """\
+What `pipefish segment` wrote about two pictures, A and B (1 and 2 in the names). Look at segmentation.png first.
+
+segmentation.png          all at a glance: a row for each picture: itself, its layers with their numbers, their fields
+labels1.png, labels2.png  the layer of each pixel of A and of B; 0 is the background: what only one picture shows
+layers.json               of each layer: how it moved, how large it is, how sure; and how the search went
+
+A folder for each layer, layer_1 being the largest:
+flow.npz                  flow1: where B has each pixel of A (x, y; NaN where it cannot be); flow2: the other way
+light.npz                 colour in A = gain1 * colour in B + offset1, pixel by pixel; gain2, offset2: the other way
+warped1.png               B brought into A, in A's light, cut out; warped2.png: A brought into B
+residual1.png             A less warped1.png, four times, around grey; residual2.png: the same of B
+"""
 Bytes = NDArray[np.uint8]
 
 
@@ -144,11 +158,32 @@ def draw_overview(one: Floats32, two: Floats32, s: Segmentation) -> Bytes:
     return np.concatenate([_heading([column, column, width - 2 * column]), *padded])
 
 
+def motion_text(m: Motion | None) -> str:
+    """A layer's motion for people."""
+    if m is None:
+        return "moved nobody knows how far: no pixel of picture 1 is left"
+    ways = [(abs(m.right), "right" if m.right > 0 else "left"), (abs(m.down), "down" if m.down > 0 else "up")]
+    parts = " and ".join(f"{size:.1f} px {way}" for size, way in ways)
+    turn = math.degrees(m.rotation)
+    return (
+        f"moved {m.distance:.1f} px ({parts}), turned {abs(turn):.1f}° {'' if turn > 0 else 'counter-'}clockwise, "
+        f"{m.scale:.2f} times as large"
+    )
+
+
+def _motion(m: Motion | None) -> dict[str, float] | None:
+    if m is None:
+        return None
+    sizes = {"right_px": m.right, "down_px": m.down, "distance_px": m.distance}
+    sizes |= {"rotation_deg": math.degrees(m.rotation), "scale": m.scale}
+    return {name: round(value, 4) for name, value in sizes.items()}
+
+
 def document(s: Segmentation) -> dict[str, Any]:
     """For JSON: status, layers, energies."""
     names = ("area", "sigma", "zncc", "folds", "low_evidence", "ambiguous")
     layers = [
-        {"label": k, "groups": layer.groups, "claimed": layer.claimed}
+        {"label": k, "motion": _motion(s.motion(k)), "groups": layer.groups, "claimed": layer.claimed}
         | {f"{name}{p}": round(_side(layer, name, p), 5) for name in names for p in (1, 2)}
         for k, layer in enumerate(s.layers, 1)
     ]
@@ -163,28 +198,29 @@ def _arrays(**arrays: NDArray[Any]) -> bytes:
 
 
 def write_segmentation(folder: str | os.PathLike[str], one: Floats32, two: Floats32, s: Segmentation) -> list[str]:
-    """Writes a segmentation of pictures (C,H,W): labels1.png, labels2.png, segmentation.png (all at a glance),
-    layers.json, and of each layer k: layer_k_flow.npz (flow1, flow2), layer_k_light.npz (gain and offset of both),
-    layer_k_warped1.png (picture 2 brought into picture 1, relit; transparent elsewhere) and layer_k_residual1.png (the
-    difference, four times, around grey), the same of picture 2. Returns the names. Raises OSError."""
+    """Writes a segmentation of pictures (C,H,W): README.txt, which tells what each file is, labels1.png,
+    labels2.png, segmentation.png, layers.json, and for each layer a folder layer_1, layer_2, ... with flow.npz,
+    light.npz, and warped and residual pictures. Returns the names. Raises OSError."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     contents = {
+        "README.txt": README.encode(),
         "labels1.png": draw_labels(s.labels1),
         "labels2.png": draw_labels(s.labels2),
         "segmentation.png": png(draw_overview(one, two, s)),
         "layers.json": json.dumps(document(s), indent=1).encode(),
     }
     for k, layer in enumerate(s.layers, 1):
-        contents[f"layer_{k}_flow.npz"] = _arrays(flow1=layer.flow1, flow2=layer.flow2)
+        contents[f"layer_{k}/flow.npz"] = _arrays(flow1=layer.flow1, flow2=layer.flow2)
         light = {f"{name}{p}": _side(layer, name, p) for name in ("gain", "offset") for p in (1, 2)}
-        contents[f"layer_{k}_light.npz"] = _arrays(**light)
+        contents[f"layer_{k}/light.npz"] = _arrays(**light)
         for p, planes, labels in ((1, one, s.labels1), (2, two, s.labels2)):
             warped = np.where((labels == k)[..., None], _side(layer, "warped", p), np.nan)
             residual = np.where(np.isnan(warped), 0.5, 0.5 + 4 * (_rows(planes) - warped)).astype(np.float32)
             alpha = np.where(labels == k, 255, 0).astype(np.uint8)
-            contents[f"layer_{k}_warped{p}.png"] = png(np.dstack([_bytes(warped), alpha]))
-            contents[f"layer_{k}_residual{p}.png"] = png(_bytes(residual))
+            contents[f"layer_{k}/warped{p}.png"] = png(np.dstack([_bytes(warped), alpha]))
+            contents[f"layer_{k}/residual{p}.png"] = png(_bytes(residual))
     for name, data in contents.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         write_atomically(folder / name, data)
     return [str(folder / name) for name in contents]

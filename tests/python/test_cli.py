@@ -177,3 +177,9 @@ def test_help_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_terminal_without_the_letters_gets_others():
+    """It would have got a traceback, after minutes of measuring."""
+    assert cli.printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
+    assert cli.printable("29.9 ± 0.25°", "latin-1") == cli.printable("29.9 ± 0.25°") == "29.9 ± 0.25°"

@@ -66,8 +66,8 @@ def test_show_tells_how_well_alpha_is_known_of_a_self_calibrated_camera(camera, 
     chosen = pf.Provenance(model_choice="5 pairs, sigma(alpha) 0.31 %")
     dataclasses.replace(camera, source="selfcal", provenance=chosen).save(tmp_path / "c.json")
     assert run("show", tmp_path / "c.json") == 0
-    assert "0.31 % of a diameter" in (text := capsys.readouterr().out)
-    assert "0.2 % of the angle at 45 deg" in text  # sin 45 cos 45 / (pi / 4) x 0.31 = 0.197
+    assert "± 0.61 % of a diameter" in (text := capsys.readouterr().out)
+    assert "± 0.39 % of the angle at 45 deg (95 %)" in text  # sin 45 cos 45 / (pi / 4) x 1.96 x 0.31 = 0.387
     assert run("show", tmp_path / "c.json", "--json") == 0
     assert json.loads(capsys.readouterr().out)["alpha_sigma"] == pytest.approx(0.0031)
     dataclasses.replace(camera, provenance=chosen).save(tmp_path / "c.json")

@@ -19,6 +19,7 @@ import pytest
 import pipefish as pf
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
+from pipefish.cli_reconstruct import reconstruct_text
 from pipefish.cloudfile import read_columns, read_points
 from pipefish.measure import measure
 from pipefish.measured_files import write_measurement
@@ -246,6 +247,19 @@ def test_the_colmap_model_reprojects_with_its_own_pixel_origin(drive, out):
         assert all(seen[i][j, 2] == number for i, j in track)
 
 
+def test_the_terminal_says_once_what_plus_minus_is(out):
+    """95 % of everything: standard deviations stood among intervals, and the largest ovality alone."""
+    document = document_of(out) | {"file_remarks": ["No COLMAP model: it is Tuesday."]}
+    lines = dict(line.split("  ", 1) for line in reconstruct_text(document, ["a.csv"]).splitlines())
+    text, s = "\n".join(lines.values()), document["summary"]
+    assert text.count("95 %") == 1 and "sigma" not in text and "+-" not in text
+    assert f"± {1960 * s['d_mean_sigma']:.1f} mm (repeatability) ± {1960 * s['d_mean_systematic']:.1f} mm" in text
+    k = document["stations"]["ovality"].index(s["ovality_most"])
+    half = 196 * np.hypot(*(document["stations"][f"ovality_{n}"][k] for n in ("sigma", "systematic")))
+    assert f"most {100 * s['ovality_most']:.2f} ± {half:.2f} % at" in text
+    assert list(lines)[-1] == "about files" and "Tuesday" not in text.partition("every ±")[0]
+
+
 def test_without_scale_everything_is_relative_and_says_so(drive, tmp_path, capsys):
     survey = survey_of(drive, tmp_path / "a.mcap", encoder=False)
     assert main(["reconstruct", str(survey), "-o", str(tmp_path / "out")]) == 0
@@ -273,7 +287,7 @@ def test_an_encoder_that_contradicts_the_known_diameter_is_told_and_not_averaged
     check = next(r for r in document["scale"]["sources"] if r["name"] == "diameter")
     assert not check["consistent"] and check["deviation"] < -3 and not check["used"]
     assert document["summary"]["d_mean"] == pytest.approx(0.315, rel=0.005)
-    assert "sigma apart" in " ".join(document["remarks"])
+    assert "times the 95 % interval of the difference" in " ".join(document["remarks"])
     assert "Recalibrate the camera, unless the encoder or the given diameter is wrong." in " ".join(document["remarks"])
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +19,14 @@ from pipefish.cli import main
 from pipefish.dense import DenseWall
 from pipefish.dense_files import strips_of, write_dense
 from pipefish.dense_findings import fingerprint
+from pipefish.intervals import Z95
 from pipefish.measured_limits import whole_sigma
-from pipefish.measured_texts import OVALITIES, Z95
+from pipefish.measured_texts import OVALITIES, column
+from pipefish.report import Report
 from pipefish.report_charts import Charts
+from pipefish.report_dense import DensePart
+from pipefish.report_scene import Scene, colour_scale, named
+from pipefish.report_wall import WallPicture, _marks
 from pipefish.wall import read_wall
 from rendered_survey import MARKS
 from test_page import Outline, data_of
@@ -67,12 +74,84 @@ def with_map(folder: Path) -> None:
     write_dense(folder / "dense", [found], [strip], wall.unit, wall.document["summary"], fingerprint(folder))
 
 
+def test_a_report_without_a_name_is_called_by_its_file_and_date(measured, tmp_path):
+    folder = shutil.copytree(measured / "out", tmp_path / "out")
+    document = json.loads((folder / "reconstruction.json").read_text())
+    document["survey"] |= {"name": "", "file": "/away/street 7.mcap", "first_time_unix_ns": 1_700_000_000 * 10**9}
+    (folder / "reconstruction.json").write_text(json.dumps(document))
+    report = Report(folder, [], WallPicture("", None), DensePart())
+    assert report.name() == "street 7, 2023-11-14 22:13 UTC"
+    report.document["survey"]["name"] = "Mill Lane"
+    assert report.name() == "Mill Lane"
+
+
+def test_every_figure_of_the_head_has_its_interval_and_what_it_is_stands_once(measured, page):
+    text = page.read_text()
+    report = Report(measured / "out", [], WallPicture("", None), DensePart())
+    tiles = {words.split(",")[0]: words for _, _, words in report.tiles()}
+    k = int(np.nanargmax(column(report.document, "ovality")))
+    half = 100 * Z95 * whole_sigma(report.document, "ovality")[k]
+    assert f"± {half:.2f}, at" in tiles["most oval"]
+    assert all("±" in tiles[name] for name in ("mean diameter", "narrowest", "widest"))
+    seen = re.sub(r"<script.*?</script>", "", text, flags=re.S)
+    assert seen.count("very ± is a 95 % interval") == 1 and "+-" not in seen and "sigma" not in seen
+
+
+def test_what_is_to_know_about_files_stands_with_the_files(measured, tmp_path):
+    """And not where a surveyor is told of the pipe."""
+    folder = shutil.copytree(measured / "out", tmp_path / "out")
+    document = json.loads((folder / "reconstruction.json").read_text())
+    assert not any("COLMAP" in remark for remark in document["remarks"])
+    document["file_remarks"] = ["No COLMAP model: it is Tuesday."]
+    (folder / "reconstruction.json").write_text(json.dumps(document))
+    out = tmp_path / "r.html"
+    assert main(["report", str(folder), "-o", str(out)]) == 0
+    files = re.search(r"<h3>Files of the measurement</h3>.*?</table>", out.read_text(), re.S)[0]
+    assert "No COLMAP model: it is Tuesday." in files and out.read_text().count("it is Tuesday") == 1
+    assert all(name.split("/")[0] in files for name in document["files"])
+    assert not re.search(r"<td></td>", files), "each file is told of"
+
+
+def test_noise_is_grey_and_a_limit_has_full_colour(measured):
+    """The colours went over all that the fit had left: a round pipe looked like a finding."""
+    charts = Charts(measured / "out")
+    scene = Scene(charts, [])
+    half, reach = scene.colour_range()
+    assert reach >= 3 * half > 0
+    colours = {round(at, 4): colour for at, colour in colour_scale(half / reach)}
+    inside = [colour for at, colour in colours.items() if abs(2 * at - 1) <= half / reach + 1e-4]
+    assert len(inside) == 2 and len(set(inside)) == 1 and len(set(colours.values())) == 5
+    size = 1000 * scene.size
+    assert Scene(charts, [("d_min", size - 12)]).colour_range()[1] == pytest.approx(max(6, reach))
+    assert Scene(charts, [("ovality", 9), ("d_min", size - 60)]).colour_range()[1] == pytest.approx(
+        max(0.09 * size / 4, reach)
+    )
+
+
+def test_names_of_near_findings_do_not_lie_over_each_other():
+    assert named([1.0, 1.02, 1.5, 1.55, 1.61], ["a", "b", "c", "d", "e"], 0.1) == ["a", "", "c", "", "e"]
+    joints = ["joint", "deposit", "joint", "joint"]
+    assert named([1.0, 1.05, 1.1, 1.2], joints, 0.1) == ["", "deposit", "", "joint"], "the rarer kind's name is kept"
+
+
+def test_names_of_near_rings_on_the_wall_stand_below_each_other():
+    """A metre is 500 columns: joints at 1 m, 1.05 m and 1.1 m, and one at 2 m."""
+    joints = [{"kind": "joint", "chainage": at, "clock": None} for at in (2.0, 1.1, 1.0, 1.05)]
+    document = {"events": joints}
+    unroller = SimpleNamespace(wall=SimpleNamespace(document=document), start=0.0, cell=0.002, columns=1500)
+    found = [
+        re.search(r"left:([\d.]+)%'><b(?: style='top:(\d+)px')?>joint", mark).groups() for mark in _marks(unroller, [])
+    ]
+    tops = {round(float(x) / 100 * 3, 2): int(top or 0) for x, top in found}
+    assert tops[1.0] == tops[2.0] == 0 < tops[1.05] < tops[1.1]
+
+
 def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path):
     assert "passed" in page.read_text() and "Undecided" not in page.read_text()
     summary = read_wall(measured / "out").document["summary"]
     out, close = tmp_path / "report.html", f"ovality={100 * summary['ovality_most']:.3f}"
     assert main(["report", str(measured / "out"), "-o", str(out), "--limit", close]) == 1
-    assert "Undecided: the 95 % interval" in out.read_text()
+    assert "Undecided: the interval at the worst station" in out.read_text()
 
 
 def test_bands_of_ovality_hold_what_the_limits_count(measured):
@@ -164,7 +243,14 @@ SCRIPT = """
     return document.getElementById("wall-text").textContent;
   });
   const scene = document.getElementById("plot-tube");
-  const drawn = scene._fullLayout.scene._scene;
+  const drawn = scene._fullLayout.scene._scene, eye = drawn.glplot.cameraParams, wall = scene.data[0];
+  const times = (m, v) => [0, 1, 2, 3].map((r) => m[r] * v[0] + m[4 + r] * v[1] + m[8 + r] * v[2] + m[12 + r] * v[3]);
+  const ends = [[2, -2], [2, -2]]; // of the wall in the view, by Plotly's own matrices: -1 to 1 is what one sees
+  wall.x.forEach((x, n) => {
+    const place = [x, wall.y[n], wall.z[n]].map((v, k) => v * drawn.dataScale[k]);
+    const [u, v, , w] = times(eye.projection, times(eye.view, times(eye.model, [...place, 1])));
+    [u / w, v / w].forEach((at, k) => { ends[k] = [Math.min(ends[k][0], at), Math.max(ends[k][1], at)]; });
+  });
   return {
     inner: innerWidth, scroll: document.documentElement.scrollWidth, texts,
     view: document.getElementById("wall-view").naturalWidth,
@@ -172,7 +258,7 @@ SCRIPT = """
     select: select.getBoundingClientRect().right,
     shown: document.getElementById("plot-ovality").data.map((t) => t.visible),
     triangles: Math.max(...drawn.glplot.objects.map((o) => o.triangleCount || 0)),
-    picture: await Plotly.toImage(scene, { format: "png", width: 400, height: 400 }),
+    picture: await Plotly.toImage(scene, { format: "png", width: 400, height: 400 }), ends,
   };
 """
 
@@ -190,6 +276,9 @@ def test_the_page_draws_itself_in_a_browser(page, tmp_path, width):
     picture = Image.open(io.BytesIO(base64.b64decode(found["picture"].split(",")[1]))).convert("RGB")
     colours = picture.quantize(64).getcolors()
     assert len(colours) > 20, "the wall is shaded and coloured: an empty scene has a handful of colours"
+    (left, right), (low, high) = found["ends"]
+    assert -1 < left < right < 1 and -1 < low < high < 1, "all of the pipe is in view"
+    assert right - left > 1.4 or high - low > 1.2, "and fills it: it was half as large on a desktop"
     wall = data_of(page.read_text())["wall"]
     for text, share in zip(found["texts"], (0.1, 0.5), strict=True):
         at, taken = (

@@ -15,6 +15,7 @@ from PIL import Image
 import pipefish as pf
 from pipefish import _engine
 from pipefish.cli import main
+from pipefish.segmentation_files import document, motion_text
 from segment_scenes import (
     Pair,
     boundary_score,
@@ -254,12 +255,49 @@ def test_the_command_writes_labels_fields_and_pictures(tmp_path: Path, capsys: p
     labels = np.asarray(Image.open(out / "labels1.png"))
     assert [(labels == k).sum() for k in (1, 2)] == [layer["area1"] for layer in told["layers"]]
     assert json.loads((out / "layers.json").read_text())["trace"] == told["trace"]
-    with np.load(out / "layer_1_flow.npz") as flow, np.load(out / "layer_1_light.npz") as light:
+    with np.load(out / "layer_1/flow.npz") as flow, np.load(out / "layer_1/light.npz") as light:
         assert np.isfinite(flow["flow1"][labels == 1]).mean() > 0.99
         assert flow["flow2"].shape == (180, 240, 2) and light["gain1"].shape == (180, 240, 3)
-    cut = np.asarray(Image.open(out / "layer_1_warped1.png"))
+    legend = (out / "README.txt").read_text()
+    assert all(Path(f).name in legend for f in told["files"] if Path(f) != out / "README.txt"), "each file is told of"
+    assert (
+        sorted(p.name for p in out.iterdir() if p.is_dir()) == ["layer_1", "layer_2"] and len(list(out.iterdir())) == 7
+    )
+    cut = np.asarray(Image.open(out / "layer_1/warped1.png"))
     assert ((cut[..., 3] > 0) == (labels == 1)).all() and np.ptp(cut[labels == 1]) > 50
     assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 16 + 2 * 186)
+
+
+def test_a_layer_tells_how_far_it_moved_and_turned():
+    """Of pixels with its label alone, whatever its field says elsewhere; clockwise as one looks at the picture."""
+    s = segmented(seed=1)
+    y, x = np.mgrid[:180, :240].astype(float)
+    turn, middle = 1.1 * np.exp(1j * np.radians(12)), 90 + 60j
+    there = (x + 1j * y - middle) * turn + middle + (30 - 7.5j)
+    on = np.hypot(x - 90, y - 60) < 40
+    flow = np.stack([there.real, there.imag], axis=2).astype(np.float32)
+    flow[~on] = 500
+    flow[60, 90] = np.nan
+    labels = np.where(on, 1, 0).astype(np.uint8)
+    moved = replace(s, labels1=labels, layers=[replace(s.layers[0], flow1=flow)])
+    found = moved.motion(1)
+    assert (found.right, found.down) == pytest.approx((30, -7.5), abs=0.1)
+    assert found.distance == pytest.approx(np.hypot(30, 7.5), abs=0.1)
+    assert (np.degrees(found.rotation), found.scale) == pytest.approx((12, 1.1), abs=0.01)
+    told = motion_text(found)
+    assert "px right and" in told and "px up)" in told and "turned 12.0° clockwise, 1.10 times as large" in told
+    assert replace(moved, labels1=0 * labels).motion(1) is None
+
+
+def test_layers_that_changed_places_moved_apart():
+    """By as much as their pixels really did, median of the truth."""
+    pair, s = scene(seed=1), segmented(seed=1)
+    y, x = np.mgrid[:180, :240]
+    for patch, label in paired(s.labels1, pair.labels[0]).items():
+        true = np.nanmedian((pair.flow - np.stack([x, y], axis=2))[pair.labels[0] == patch], axis=0)
+        found = s.motion(label)
+        assert (found.right, found.down) == pytest.approx(true, abs=1.0) and found.distance > 80
+        assert document(s)["layers"][label - 1]["motion"]["right_px"] == pytest.approx(found.right, abs=1e-3)
 
 
 def test_the_command_takes_grey_with_colour_and_names_what_it_cannot_take(

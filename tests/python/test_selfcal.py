@@ -180,7 +180,7 @@ def test_a_camera_that_tilted_is_not_told_that_it_did_not():
     """Of a scene that is nearly flat the matches leave alpha open whatever the tilt: the reason is the scene."""
     found = found_with(("ok",), alpha_alone=0.3, tilt=math.radians(15))
     assert _status(found) == "weak"
-    assert "nearly flat" in _reason("weak", found) and "30 % (1 sigma, by themselves; 2 %" in _reason("weak", found)
+    assert "nearly flat" in _reason("weak", found) and "± 59 % (95 %, by themselves; ± 4 %" in _reason("weak", found)
     assert _status(found_with(("ok",), alpha_alone=0.3, tilt=math.radians(1))) == "no_rotation"
 
 
@@ -343,9 +343,9 @@ def test_health_check_tells_a_drifted_profile_from_one_that_holds(case):
     for change, name, size in (("scale", "angle scale", -1.0), ("centre", "centre u", -3.0)):
         found = health_of(1, case, change, density=300.0, length=5.0)
         assert found["verdict"] == "drifted, recalibrate"
-        assert f"{name} changed by" in found["text"] and "if nothing else changed" in found["text"]
+        assert f"{health.WORDS[name]} changed by" in found["text"] and "if nothing else changed" in found["text"]
         # A straight drive tells the angles' scale and alpha apart by nothing but their curves.
-        assert ("alpha changed" not in found["text"]) or (case == "axial" and change == "scale")
+        assert (health.WORDS["alpha"] not in found["text"]) or (case == "axial" and change == "scale")
         value, sigma = found["changes"][name]
         assert abs(value - size) < 3 * sigma < abs(size)
 
@@ -366,6 +366,7 @@ def test_a_change_that_is_named_is_that_of_one_cause_and_wider_by_what_it_leaves
     one, two = judged([-1 / 3, 0, 0, 0, 0], 0.01), judged([-1 / 3, 0, 0, 0.4, 0], 0.01)
     value, sigma = one.changes["angle scale"]
     assert value == pytest.approx(-1.0, abs=0.01) and "if nothing else changed" in one.text
+    assert f"focal length changed by {value:+.2g} ± {1.96 * sigma:.2g} %" in one.text, "its 95 % interval"
     assert two.changes["angle scale"][1] > 2 * sigma and "does not explain all of it" in two.text
 
 
@@ -375,7 +376,7 @@ def test_health_check_cannot_tell_in_a_straight_pipe_of_unknown_radius(change):
     found = health_of(3, "straight", change, density=300.0, length=5.0)
     assert found["verdict"] == "cannot tell"
     assert 0.02 < found["alpha_sigma"] < 0.2  # all that a lens may drift
-    assert f"leaves the diameter open by {100 * found['alpha_sigma']:.2g} %" in found["text"]
+    assert f"leaves the diameter open by ± {196 * found['alpha_sigma']:.2g} %" in found["text"]
 
 
 def test_a_valid_profile_is_told_with_what_would_have_shown():
@@ -383,8 +384,8 @@ def test_a_valid_profile_is_told_with_what_would_have_shown():
     found = judged([0, 0, 0, 0, 0], 0.01)
     blind = judged([0, 0, 0, 0, 0], 0.6).text
     least = 4 * found.changes["angle scale"][1]
-    assert f"angle scale by {least:.2g} %" in found.text and "no change" not in found.text
-    assert "would have shown: none. Of angle scale and alpha and bend and centre u and centre v no change" in blind
+    assert f"focal length by {least:.2g} %" in found.text and "no change" not in found.text
+    assert f"would have shown: none. Of {' and '.join(health.WORDS[name] for name in health.DRIFT)} no change" in blind
 
 
 def test_what_tracks_have_in_common_is_no_drift_and_hides_as_much():
@@ -395,7 +396,7 @@ def test_what_tracks_have_in_common_is_no_drift_and_hides_as_much():
     _, sigma = found.changes["angle scale"]
     assert found.verdict == health.VERDICTS["valid"]
     assert sigma == pytest.approx(math.hypot(0.45, judged(drift, 0.04).changes["angle scale"][1]), rel=0.1)
-    assert f"angle scale by {4 * sigma:.2g} %" in found.text and "0.45 % (one sigma)" in found.text
+    assert f"focal length by {4 * sigma:.2g} %" in found.text and "± 0.88 % in a straight drive" in found.text
     assert judged([0, 0, 0, 0.3, 0], 0.04, 0.0045).verdict == health.VERDICTS["drifted"], "the centre shows as before"
 
 
@@ -403,7 +404,7 @@ def test_what_tracks_have_in_common_is_no_drift_and_hides_as_much():
 def test_a_measurement_counts_what_tracks_have_in_common_where_the_drive_is_straight(wobble, said, tmp_path):
     file = survey_of(tube_drive(3, 2.0, density=300.0, wobble=wobble), tmp_path / "survey.mcap")
     health_text = measure(Survey.open(file), diameter=0.3, pictures=False, threads=1).health.text
-    assert ("have in common look like 0.45 %" in health_text) is said
+    assert ("in common look like a focal length off by ± 0.88 %" in health_text) is said
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -25,6 +25,41 @@
     }
     return out;
   };
+  // A camera that has all of what is shown in view, as large as it can be: from beside and a little above, and the
+  // wider the view (`aspect`: of its height) the more from the side. Plotly sees 45 degrees from bottom to top.
+  const seen = (chart, scene, aspect) => {
+    const keys = ["x", "y", "z"];
+    const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    const unit = (a) => a.map((v) => v / Math.hypot(...a));
+    const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    const places = [];
+    for (const trace of chart.data.filter((t) => t.visible !== "legendonly")) {
+      const step = Math.ceil(trace.x.length / 2000);
+      for (let n = 0; n < trace.x.length; n += step) {
+        if (trace.x[n] === null) continue;
+        places.push(keys.map((k) => {
+          const [low, high] = scene[k + "axis"].range;
+          return scene.aspectratio[k] * ((trace[k][n] - low) / (high - low) - 0.5);
+        }));
+      }
+    }
+    const level = Math.hypot(chart.along[0], chart.along[1]) > 0.2 ? unit([chart.along[0], chart.along[1], 0]) : [0, 1, 0];
+    const turn = (Math.PI / 180) * Math.min(62, Math.max(25, 25 + 40 * (aspect - 1)));
+    const side = cross(level, [0, 0, 1]);
+    const back = unit(keys.map((_, i) => Math.sin(turn) * side[i] - Math.cos(turn) * level[i] + (i === 2 ? 0.35 : 0)));
+    const right = unit(cross([0, 0, 1], back)), up = cross(back, right);
+    // A place is inside where |across - middle| <= share * (away - depth), for both directions across.
+    const share = [0.92 * aspect * Math.tan(Math.PI / 8), 0.85 * Math.tan(Math.PI / 8)]; // with room for names
+    const ends = [right, up].map((way, i) => [
+      Math.min(...places.map((p) => dot(p, way) - share[i] * dot(p, back))),
+      Math.max(...places.map((p) => dot(p, way) + share[i] * dot(p, back))),
+    ]);
+    const [across, over] = ends.map(([low, high]) => (low + high) / 2);
+    const away = Math.max(...ends.map(([low, high], i) => (high - low) / 2 / share[i]));
+    const at = (depth) => Object.fromEntries(keys.map((k, i) => [k, across * right[i] + over * up[i] + depth * back[i]]));
+    const depths = places.map((p) => dot(p, back));
+    return { eye: at(away), center: at((Math.min(...depths) + Math.max(...depths)) / 2) };
+  };
   const draw = () => {
     const style = getComputedStyle(document.documentElement);
     const colour = (name) => style.getPropertyValue(name).trim();
@@ -58,16 +93,20 @@
       }
       const whole = merge(merge(layout, axes), chart.layout);
       const place = document.getElementById("plot-" + chart.id);
-      const eye = whole.scene && whole.scene.camera && whole.scene.camera.eye;
-      if (eye) { // tall windows see as much to the sides from further away
-        const away = Math.min(2.5, Math.max(1, (1.25 * place.clientHeight) / place.clientWidth));
-        whole.scene.camera = { eye: { x: away * eye.x, y: away * eye.y, z: away * eye.z } };
+      if (chart.along) {
+        const tall = place.clientHeight * (1 - whole.scene.domain.y[0]) - whole.margin.t;
+        whole.scene.camera = seen(chart, whole.scene, place.clientWidth / tall);
       }
       Plotly.react(place, chart.data, whole, { displayModeBar: false, responsive: true });
     }
   };
   draw();
   dark.addEventListener("change", draw);
+  let waiting = 0; // a window that changes its shape is drawn for once it rests
+  window.addEventListener("resize", () => {
+    clearTimeout(waiting);
+    waiting = setTimeout(draw, 200);
+  });
 
   for (const chart of page.charts.filter((c) => c.choice)) {
     const select = document.getElementById("choice-" + chart.id);
