@@ -203,6 +203,32 @@ void test_linear_problem_equals_dense_least_squares()
     }
 }
 
+// Counts how often it is linearized.
+struct Counted : Toy {
+    using Toy::Toy;
+    mutable int count = 0;
+
+    template <class Sink> void linearize(int e, Sink &sink) const
+    {
+        count += e < 0;
+        Toy::linearize(e, sink);
+    }
+};
+
+// Proves: derivatives are made once for each step, and none at the result, where they would not be used.
+void test_the_result_is_not_linearized()
+{
+    Counted toy(1);
+    toy.curvature = 0.01;
+    LeastSquares<E, F> solver;
+    Options options;
+    options.cost_tolerance = 1e-3;
+    const Summary summary = solver.minimize(toy, options);
+    TEST_ASSERT_TRUE(summary.status == Status::converged);
+    TEST_ASSERT_TRUE(summary.iterations > 1);
+    TEST_ASSERT_EQUAL_INT(summary.iterations, toy.count);
+}
+
 // Proves: every covariance block it gives (e, f within the band, f with border, border) is that of the dense inverse.
 void test_covariance_equals_dense_inverse()
 {
@@ -424,6 +450,7 @@ int main()
 {
     UNITY_BEGIN();
     RUN_TEST(test_linear_problem_equals_dense_least_squares);
+    RUN_TEST(test_the_result_is_not_linearized);
     RUN_TEST(test_covariance_equals_dense_inverse);
     RUN_TEST(test_covariance_of_a_long_chain_keeps_its_digits);
     RUN_TEST(test_covariance_of_functions_equals_dense_inverse);

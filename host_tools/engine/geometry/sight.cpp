@@ -9,26 +9,32 @@
 namespace pipefish::geometry
 {
 
+Sight make_sight(const pf_camera &camera, const double *uv, const double *covariance, double sigma)
+{
+    Sight sight;
+    sight.uv = {uv[0], uv[1]};
+    Eigen::Matrix<double, 3, 2, Eigen::RowMajor> d_ray;
+    if (pf_camera_unproject(&camera, uv, sight.ray.data(), sight.origin.data(), d_ray.data()) != PF_OK) {
+        return sight;
+    }
+    sight.root = sigma * Eigen::Matrix2d::Identity();
+    if (covariance) {
+        const double a = std::sqrt(covariance[0]), b = 0.5 * (covariance[1] + covariance[2]) / a;
+        const double c = std::sqrt(covariance[3] - b * b);
+        sight.root << a, 0, b, c;
+    }
+    sight.b = d_ray * sight.root;
+    sight.valid = sight.b.allFinite() && sight.root(0, 0) > 0.0 && sight.root(1, 1) > 0.0;
+    return sight;
+}
+
 std::vector<Sight> make_sights(const pf_camera &camera, size_t n, const double *uv, const double *covariance,
                                double sigma)
 {
-    std::vector<Sight> sights(n);
+    std::vector<Sight> sights;
+    sights.reserve(n);
     for (size_t i = 0; i < n; i++) {
-        Sight &sight = sights[i];
-        sight.uv = {uv[2 * i], uv[2 * i + 1]};
-        Eigen::Matrix<double, 3, 2, Eigen::RowMajor> d_ray;
-        if (pf_camera_unproject(&camera, sight.uv.data(), sight.ray.data(), sight.origin.data(), d_ray.data()) !=
-            PF_OK) {
-            continue;
-        }
-        sight.root = sigma * Eigen::Matrix2d::Identity();
-        if (covariance) {
-            const double *s = covariance + 4 * i;
-            const double a = std::sqrt(s[0]), b = 0.5 * (s[1] + s[2]) / a, c = std::sqrt(s[3] - b * b);
-            sight.root << a, 0, b, c;
-        }
-        sight.b = d_ray * sight.root;
-        sight.valid = sight.b.allFinite() && sight.root(0, 0) > 0.0 && sight.root(1, 1) > 0.0;
+        sights.push_back(make_sight(camera, uv + 2 * i, covariance ? covariance + 4 * i : nullptr, sigma));
     }
     return sights;
 }

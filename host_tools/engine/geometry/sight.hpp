@@ -40,7 +40,10 @@ struct Sight {
     bool valid = false; // inside the model
 };
 
-// uv: n x 2; covariance: n x 2 x 2, or null for `sigma`^2 I. A covariance that is not positive definite: not valid.
+// uv: 2; covariance: 2 x 2, or null for `sigma`^2 I. A covariance that is not positive definite: not valid.
+Sight make_sight(const pf_camera &camera, const double *uv, const double *covariance, double sigma);
+
+// Of n pixels: uv: n x 2; covariance: n x 2 x 2, or null.
 std::vector<Sight> make_sights(const pf_camera &camera, size_t n, const double *uv, const double *covariance,
                                double sigma);
 

@@ -18,8 +18,7 @@ public:
     using MatrixEG = typename Normal::MatrixEG;
     using MatrixFG = typename Normal::MatrixFG;
     using VectorE = typename Normal::VectorE;
-    using MatrixEF = typename Normal::MatrixEF;
-    using MatrixFE = Eigen::Matrix<double, F, E>;
+    using MatrixFE = typename Normal::MatrixFE;
 
     // Of the inverse. Blocks of f further apart than the band are not computed.
     struct Covariance {
@@ -34,6 +33,7 @@ public:
 
     // Those below are of the matrix that was factored.
 
+    // With the right side of `normal`, which may be another than when the matrix was factored.
     Step<E, F> solve(const Normal &normal) const;
 
     Covariance inverse(const Normal &normal) const;
@@ -133,10 +133,10 @@ template <int E, int F> bool ArrowFactor<E, F>::eliminate(const Normal &normal, 
     solve_lower_transposed(l, inverse);
     for (size_t a = normal.w_offset[e]; a < normal.w_offset[e + 1]; a++) {
         MatrixFE left = MatrixFE::Zero();
-        add_transposed_product(left, 1.0, normal.w[a], inverse);
+        add_product(left, 1.0, normal.w[a], inverse);
         const size_t i = static_cast<size_t>(normal.w_index[a]);
         for (size_t b = normal.w_offset[e]; b <= a; b++) {
-            add_product(s_ff_[at(i, i - static_cast<size_t>(normal.w_index[b]))], -1.0, left, normal.w[b]);
+            add_product_transposed(s_ff_[at(i, i - static_cast<size_t>(normal.w_index[b]))], -1.0, left, normal.w[b]);
         }
         if (normal.border > 0) {
             add_product(s_fg_[i], -1.0, left, normal.h_eg[e]);
@@ -161,7 +161,7 @@ template <int E, int F> Step<E, F> ArrowFactor<E, F>::solve(const Normal &normal
         VectorE reduced = VectorE::Zero();
         add_product(reduced, 1.0, inverse_e_[e], normal.b_e[e]);
         for (size_t a = normal.w_offset[e]; a < normal.w_offset[e + 1]; a++) {
-            add_transposed_product(step.f[static_cast<size_t>(normal.w_index[a])], 1.0, normal.w[a], reduced);
+            add_product(step.f[static_cast<size_t>(normal.w_index[a])], 1.0, normal.w[a], reduced);
         }
         if (normal.border > 0) {
             add_transposed_product(right_g, 1.0, normal.h_eg[e], reduced);
@@ -181,7 +181,7 @@ template <int E, int F> Step<E, F> ArrowFactor<E, F>::solve(const Normal &normal
     for (size_t e = 0; e < normal.count_e; e++) {
         VectorE right = -normal.b_e[e];
         for (size_t a = normal.w_offset[e]; a < normal.w_offset[e + 1]; a++) {
-            add_product(right, -1.0, normal.w[a], step.f[static_cast<size_t>(normal.w_index[a])]);
+            add_transposed_product(right, -1.0, normal.w[a], step.f[static_cast<size_t>(normal.w_index[a])]);
         }
         if (normal.border > 0) {
             add_product(right, -1.0, normal.h_eg[e], step.g);
@@ -235,7 +235,7 @@ Eigen::MatrixXd ArrowFactor<E, F>::functions(const Normal &normal, std::span<con
         add_transposed_product(out, 1.0, a[k], solved);
         for (size_t c = normal.w_offset[block]; c < normal.w_offset[block + 1]; c++) {
             const size_t i = static_cast<size_t>(normal.w_index[c]);
-            add_transposed_product(x[i], -1.0, normal.w[c], solved);
+            add_product(x[i], -1.0, normal.w[c], solved);
             first = std::min(first, i);
         }
         if (normal.border > 0) {
@@ -343,13 +343,13 @@ auto ArrowFactor<E, F>::eliminated_covariance(const Normal &normal, const Covari
     for (size_t a = normal.w_offset[e]; a < normal.w_offset[e + 1]; a++) {
         const size_t i = static_cast<size_t>(normal.w_index[a]);
         for (size_t b = normal.w_offset[e]; b <= a; b++) {
-            MatrixEF half = MatrixEF::Zero();
-            add_product(half, 1.0, normal.w[a], known.f[i][i - static_cast<size_t>(normal.w_index[b])]);
-            add_product_transposed(b < a ? crossed : middle, 1.0, half, normal.w[b]);
+            MatrixFE half = MatrixFE::Zero();
+            add_product(half, 1.0, known.f[i][i - static_cast<size_t>(normal.w_index[b])], normal.w[b]);
+            add_transposed_product(b < a ? crossed : middle, 1.0, normal.w[a], half);
         }
         if (normal.border > 0) {
             MatrixEG half = MatrixEG::Zero(E, normal.border);
-            add_product(half, 1.0, normal.w[a], known.fg[i]);
+            add_transposed_product(half, 1.0, normal.w[a], known.fg[i]);
             add_product_transposed(crossed, 1.0, half, normal.h_eg[e]);
         }
     }

@@ -1,6 +1,5 @@
-// Algebra of small blocks, in plain loops. As Eigen expressions each product here is a dozen types, of which the
-// compiler reads some hundred members each: the optimiser took it half a minute in every file that has a problem to
-// solve.
+// Algebra of small blocks, column by column: the compiler finds vectors in Eigen's expressions of one column, which it
+// does not in loops over its elements, and they are fewer types to read than those of whole products.
 #pragma once
 
 #include <Eigen/Core>
@@ -10,37 +9,30 @@
 namespace pipefish::optim
 {
 
-// c += s a b. Sums of products are made before they are added, here and below.
+// A column of a matrix shaped like C.
+template <class C> using ColumnOf = Eigen::Matrix<double, C::RowsAtCompileTime, 1>;
+
+// c += s a b, a with one column at least. Sums of products are made before they are added, here and below.
 template <class C, class A, class B> void add_product(C &c, double s, const A &a, const B &b)
 {
-    constexpr int ROWS = C::RowsAtCompileTime;
     for (Eigen::Index j = 0; j < c.cols(); j++) {
-        double sum[ROWS] = {};
-        for (Eigen::Index k = 0; k < a.cols(); k++) {
-            for (int i = 0; i < ROWS; i++) {
-                sum[i] += a(i, k) * b(k, j);
-            }
+        ColumnOf<C> sum = a.col(0) * b(0, j);
+        for (Eigen::Index k = 1; k < a.cols(); k++) {
+            sum += a.col(k) * b(k, j);
         }
-        for (int i = 0; i < ROWS; i++) {
-            c(i, j) += s * sum[i];
-        }
+        c.col(j) += s * sum;
     }
 }
 
-// c += s a b^T
+// c += s a b^T, likewise
 template <class C, class A, class B> void add_product_transposed(C &c, double s, const A &a, const B &b)
 {
-    constexpr int ROWS = C::RowsAtCompileTime;
     for (Eigen::Index j = 0; j < c.cols(); j++) {
-        double sum[ROWS] = {};
-        for (Eigen::Index k = 0; k < a.cols(); k++) {
-            for (int i = 0; i < ROWS; i++) {
-                sum[i] += a(i, k) * b(j, k);
-            }
+        ColumnOf<C> sum = a.col(0) * b(j, 0);
+        for (Eigen::Index k = 1; k < a.cols(); k++) {
+            sum += a.col(k) * b(j, k);
         }
-        for (int i = 0; i < ROWS; i++) {
-            c(i, j) += s * sum[i];
-        }
+        c.col(j) += s * sum;
     }
 }
 
@@ -58,20 +50,17 @@ template <class C, class A, class B> void add_transposed_product(C &c, double s,
     }
 }
 
-// c += s a^T b of `rows` rows, row-major: a has as many columns as c has rows.
-template <class C> void add_rows(C &c, double s, int rows, const double *a, const double *b, Eigen::Index columns)
+// c += s a^T b of `rows` rows, row-major: a has as many columns as c has rows, b as many as c. `rows`: int, or a
+// constant of the type, which unrolls the loop.
+template <class C, class Count> void add_rows(C &c, double s, Count rows, const double *a, const double *b)
 {
-    constexpr int ROWS = C::RowsAtCompileTime;
-    for (Eigen::Index j = 0; j < columns; j++) {
-        double sum[ROWS] = {};
-        for (int k = 0; k < rows; k++) {
-            for (int i = 0; i < ROWS; i++) {
-                sum[i] += a[k * ROWS + i] * b[k * columns + j];
-            }
+    using Row = Eigen::Map<const ColumnOf<C>>;
+    for (Eigen::Index j = 0; j < c.cols(); j++) {
+        ColumnOf<C> sum = Row(a) * (s * b[j]);
+        for (int k = 1; k < rows; k++) {
+            sum += Row(a + k * C::RowsAtCompileTime) * (s * b[k * c.cols() + j]);
         }
-        for (int i = 0; i < ROWS; i++) {
-            c(i, j) += s * sum[i];
-        }
+        c.col(j) += sum;
     }
 }
 

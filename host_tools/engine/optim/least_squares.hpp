@@ -64,8 +64,12 @@ public:
         if (!std::isfinite(cost)) {
             throw std::invalid_argument("least squares: the start has no finite cost");
         }
-        normal_.linearize(problem, options.threads);
+        bool moved = true; // since it was linearised, which the state returned never is
         for (summary.iterations = 0; summary.iterations < options.max_iterations; summary.iterations++) {
+            if (moved) {
+                normal_.linearize(problem, options.threads);
+                moved = false;
+            }
             if (normal_.scaled_gradient() <= options.gradient_tolerance * std::sqrt(std::max(cost, 1e-300))) {
                 summary.status = Status::converged;
                 return summary;
@@ -106,8 +110,8 @@ public:
             lambda = std::max(lambda, 1e-15);
             growth = 2.0;
             problem.save();
+            moved = true;
             cost = summary.final_cost = trial;
-            normal_.linearize(problem, options.threads);
             if (decrease <= options.cost_tolerance * cost) {
                 summary.status = Status::converged;
                 summary.iterations++;

@@ -18,6 +18,7 @@
 #include <algorithm>
 #include <cmath>
 #include <span>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -35,7 +36,7 @@ template <int E, int F> class NormalMatrix
 public:
     using MatrixE = Eigen::Matrix<double, E, E>;
     using MatrixF = Eigen::Matrix<double, F, F>;
-    using MatrixEF = Eigen::Matrix<double, E, F>;
+    using MatrixFE = Eigen::Matrix<double, F, E>;
     using MatrixEG = Eigen::Matrix<double, E, Eigen::Dynamic>;
     using MatrixFG = Eigen::Matrix<double, F, Eigen::Dynamic>;
     using VectorE = Eigen::Matrix<double, E, 1>;
@@ -55,13 +56,17 @@ public:
     class Sink
     {
     public:
-        // `rows` whitened residuals r that share one robust loss. j_e: rows x E or null; f[k] with j_f[k], rows x F;
-        // j_g: rows x border() or null. All row-major.
+        // `rows` whitened residuals r, one at least, that share one robust loss. j_e: rows x E or null; f[k] with
+        // j_f[k], rows x F; j_g: rows x border() or null. All row-major.
         void add(int rows, const double *r, const RobustLoss &loss, const double *j_e, std::span<const int> f,
                  std::span<const double *const> j_f, const double *j_g);
 
     private:
         friend class NormalMatrix;
+        template <class Count>
+        void add_weighted(Count rows, double weight, const double *r, const double *j_e, std::span<const int> f,
+                          std::span<const double *const> j_f, const double *j_g);
+
         NormalMatrix *owner_ = nullptr;
         Piece *piece_ = nullptr;
         size_t e_ = 0;
@@ -71,7 +76,7 @@ public:
     Eigen::Index border = 0;
     std::vector<size_t> w_offset; // of each e block in w
     std::vector<int> w_index;     // f block of each coupling
-    std::vector<MatrixEF> w;      // H_ef
+    std::vector<MatrixFE> w;      // H_fe: its columns are long, for the loops over them
     std::vector<MatrixE> h_ee;
     std::vector<VectorE> b_e;
     std::vector<MatrixEG> h_eg;
@@ -135,6 +140,7 @@ public:
                 return;
             }
             for (size_t e = first_of(number); e < first_of(number + 1); e++) {
+                clear_eliminated(e);
                 sink.e_ = e;
                 problem.linearize(static_cast<int>(e), sink);
             }
@@ -154,9 +160,10 @@ private:
     static constexpr int PIECES = 16; // fixed: the sums' order must not depend on the number of threads
 
     void clear(int number, Piece &piece);
+    void clear_eliminated(size_t e);
     void sum_up(std::vector<Piece> &pieces);
 
-    MatrixEF &coupling(size_t e, int f)
+    MatrixFE &coupling(size_t e, int f)
     {
         const auto first = w_index.begin() + static_cast<std::ptrdiff_t>(w_offset[e]);
         const auto last = w_index.begin() + static_cast<std::ptrdiff_t>(w_offset[e + 1]);
@@ -196,27 +203,40 @@ void NormalMatrix<E, F>::Sink::add(int rows, const double *r, const RobustLoss &
         s += r[i] * r[i];
     }
     const double weight = loss(s).weight;
+    if (rows == 2) { // a pixel
+        add_weighted(std::integral_constant<int, 2>(), weight, r, j_e, f, j_f, j_g);
+    } else {
+        add_weighted(rows, weight, r, j_e, f, j_f, j_g);
+    }
+}
+
+template <int E, int F>
+template <class Count>
+void NormalMatrix<E, F>::Sink::add_weighted(Count rows, double weight, const double *r, const double *j_e,
+                                            std::span<const int> f, std::span<const double *const> j_f,
+                                            const double *j_g)
+{
     const Eigen::Index g = owner_->border;
     if (j_e) {
-        add_rows(owner_->h_ee[e_], weight, rows, j_e, j_e, E);
-        add_rows(owner_->b_e[e_], weight, rows, j_e, r, 1);
+        add_rows(owner_->h_ee[e_], weight, rows, j_e, j_e);
+        add_rows(owner_->b_e[e_], weight, rows, j_e, r);
         if (j_g) {
-            add_rows(owner_->h_eg[e_], weight, rows, j_e, j_g, g);
+            add_rows(owner_->h_eg[e_], weight, rows, j_e, j_g);
         }
     }
     for (size_t k = 0; k < f.size(); k++) {
         const size_t i = static_cast<size_t>(f[k]) - piece_->first;
-        add_rows(piece_->b_f[i], weight, rows, j_f[k], r, 1);
+        add_rows(piece_->b_f[i], weight, rows, j_f[k], r);
         if (j_e) {
-            add_rows(owner_->coupling(e_, f[k]), weight, rows, j_e, j_f[k], F);
+            add_rows(owner_->coupling(e_, f[k]), weight, rows, j_f[k], j_e);
         }
         if (j_g) {
-            add_rows(piece_->h_fg[i], weight, rows, j_f[k], j_g, g);
+            add_rows(piece_->h_fg[i], weight, rows, j_f[k], j_g);
         }
         for (size_t l = 0; l < f.size(); l++) {
             if (f[l] <= f[k]) {
                 add_rows(piece_->h_ff[owner_->banded_at(i, static_cast<size_t>(f[k] - f[l]))], weight, rows, j_f[k],
-                         j_f[l], F);
+                         j_f[l]);
             }
         }
     }
@@ -241,13 +261,16 @@ template <int E, int F> void NormalMatrix<E, F>::clear(int number, Piece &piece)
     piece.b_f.assign(last - first, VectorF::Zero());
     piece.h_gg = Eigen::MatrixXd::Zero(border, border);
     piece.b_g = Eigen::VectorXd::Zero(border);
-    for (size_t e = first_of(number); number < PIECES && e < first_of(number + 1); e++) {
-        h_ee[e].setZero();
-        b_e[e].setZero();
-        h_eg[e].setZero();
-        for (size_t k = w_offset[e]; k < w_offset[e + 1]; k++) {
-            w[k].setZero();
-        }
+}
+
+// When its turn comes, not all at once before: it is then in the cache.
+template <int E, int F> void NormalMatrix<E, F>::clear_eliminated(size_t e)
+{
+    h_ee[e].setZero();
+    b_e[e].setZero();
+    h_eg[e].setZero();
+    for (size_t k = w_offset[e]; k < w_offset[e + 1]; k++) {
+        w[k].setZero();
     }
 }
 

@@ -20,14 +20,14 @@ double sag_of(double first, double now, double f)
 TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::span<const int> frame,
                        std::span<const int> track, const double *uv, const double *covariance, double sigma)
 {
-    const std::vector<Sight> sights = geometry::make_sights(camera, frame.size(), uv, covariance, sigma);
     all_.reserve(frame.size());
     for (size_t i = 0; i < frame.size(); i++) {
-        if (!sights[i].valid) {
+        const Sight sight = geometry::make_sight(camera, uv + 2 * i, covariance ? covariance + 4 * i : nullptr, sigma);
+        if (!sight.valid) {
             outside_++;
             continue;
         }
-        all_.push_back({frame[i], track[i], sights[i], sights[i].root.inverse()});
+        all_.push_back({frame[i], track[i], sight, sight.root.inverse()});
     }
     const auto before = [](const Observation &a, const Observation &b) {
         return a.track != b.track ? a.track < b.track : a.frame < b.frame;
