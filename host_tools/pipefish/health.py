@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .assumed import PUPIL_MOST
+from .assumed import PUPIL_MOST, PUPIL_REST
 from .camera import PARAMETERS, Camera
 from .errors import ArgumentError
 from .intervals import Z95
+from .lens_ripple import RADIAL, into_radial, radial_fit, ripple_covariance
 from .structure import Encoder, Reconstruction, RollingShutter, changed_camera, reconstruct
 from .survey import Tracks
 from .tube import fit_tube
@@ -30,10 +31,9 @@ BUDGET = 0.005  # of the diameter: what profilers are required to hold, and cali
 FALSE_ALARM = 0.01  # probability: half of what is allowed, as the noise is never quite the one stated
 CPOLY_POWERS = (1,) * 2 + (2,) * 6 + (3,) * 6  # of theta, by coefficient
 FREE = ("f_u", "f_v", "c_u", "c_v", "k2", "k3", "k4", "k5", "pupil_e1", *(f"cpoly[{n}]" for n in range(14)))
-# What a good profile does not know of its lens, pixels: ripples of the radius over LENS_LENGTH radians, and terms that
-# are not round, each at the rim. Three directions of drift are radial curves that are nearly alike, so that 0.07 px of
-# ripple look like 1.7 % of the angle scale with 1 % along alpha and a bend, to a sigma of 0.4 %.
-LENS_RADIAL_PX, LENS_LENGTH, LENS_ASYMMETRIC_PX = 0.1, 0.4, 0.2
+RADIAL_FREE = [FREE.index(name) for name in RADIAL]
+# What a good profile does not know of its lens beside ripples, pixels: terms that are not round, each at the rim.
+LENS_ASYMMETRIC_PX = 0.2
 #: How a profile may drift: directions, and their sigmas. A knock or another temperature moves these, no others.
 DRIFT = {
     "angle scale": 0.03,  # all angles by a factor
@@ -100,27 +100,6 @@ class ProfileCheck:
         return out
 
 
-def _radial_slope(camera: Camera, theta: Floats) -> Floats:
-    """(N,5): how the radius at angles (N,) from the axis, in units of f, answers to ln f and k2 to k5."""
-    powers = theta[:, None] ** np.array([3, 5, 7, 9])
-    return np.column_stack([theta + powers @ [camera.k2, camera.k3, camera.k4, camera.k5], powers])
-
-
-def _radial_fit(camera: Camera, theta: Floats) -> Floats:
-    """(5,N): change of ln f and k2 to k5 by a change of the radius, in units of f, at angles (N,)."""
-    design = _radial_slope(camera, theta)
-    scale = np.abs(design).max(axis=0)
-    return np.linalg.pinv(design / scale) / scale[:, None]
-
-
-def _into_free(camera: Camera) -> Floats:
-    """(23,5): what ln f and k2 to k5 do to FREE."""
-    out = np.zeros((len(FREE), 5))
-    out[0, 0], out[1, 0] = camera.f_u, camera.f_v
-    out[4:8, 1:] = np.eye(4)
-    return out
-
-
 def _directions(camera: Camera, theta_end: float) -> Floats:
     """(23,5): what each way to drift, by its unit, does to FREE."""
     theta = np.linspace(0.02, 1.0, 60) * theta_end
@@ -128,7 +107,8 @@ def _directions(camera: Camera, theta_end: float) -> Floats:
     rise = 1 + (theta[:, None] ** np.array([2, 4, 6, 8]) * np.array([3, 5, 7, 9])) @ k
     out = np.zeros((len(FREE), len(DRIFT)))
     out[0, 0], out[1, 0] = camera.f_u, camera.f_v
-    out[:, 1] = _into_free(camera) @ _radial_fit(camera, theta) @ (rise * np.sin(theta) * np.cos(theta))
+    along = rise * np.sin(theta) * np.cos(theta)
+    out[RADIAL_FREE, 1] = into_radial(camera) @ radial_fit(camera, theta) @ along
     out[4, 2] = out[2, 3] = out[3, 4] = 1.0
     return out
 
@@ -137,11 +117,9 @@ def _own_covariance(camera: Camera, theta_end: float) -> Floats:
     """The covariance of FREE without a drift, (23,23): the profile's, and what it does not know of its lens."""
     # A bound, taken for a sigma: twice as wide as the diameter's budget has it, for what is blamed here is the lens.
     # A wall 75 mm away looks through a shift that the profile does not know as if the angles had drifted.
-    pupil = 1e-4 if "pupil_e1" in camera.covariance_parameters else PUPIL_MOST
-    theta = np.linspace(0.2, 1.0, 60) * theta_end
-    ripple = (LENS_RADIAL_PX / camera.f_u) ** 2 * np.exp(-0.5 * ((theta[:, None] - theta) / LENS_LENGTH) ** 2)
-    fit = _into_free(camera) @ _radial_fit(camera, theta)
-    out = fit @ ripple @ fit.T
+    pupil = 2 * PUPIL_REST if "pupil_e1" in camera.covariance_parameters else PUPIL_MOST
+    out = np.zeros((len(FREE), len(FREE)))
+    out[np.ix_(RADIAL_FREE, RADIAL_FREE)] = ripple_covariance(camera, theta_end)
     own = np.zeros(len(FREE))
     own[:2] = 2e-4 * np.array([camera.f_u, camera.f_v])
     own[2:4] = LENS_ASYMMETRIC_PX

@@ -159,7 +159,7 @@ def _adjusted_once(readings: Readings, method: str, threads: int | None, tell: C
     return _while_telling(
         lambda: reconstruct(
             readings.weighed,
-            assumed(readings.camera),
+            assumed(readings.camera, metric=readings.chainage is not None),
             readings.chainage,
             encoder=readings.encoder,
             attitude=readings.attitude,

@@ -10,7 +10,7 @@ import pytest
 
 import pipefish as pf
 from pipefish import _engine
-from pipefish.assumed import ASYMMETRY, RESIDUAL_PX, assumed
+from pipefish.assumed import ASYMMETRY, PUPIL_REST, RESIDUAL_PX, assumed
 from pipefish.camera import PARAMETERS
 from pipefish.measure import _residuals
 from pipefish.measuretruth import _places
@@ -31,8 +31,25 @@ def test_the_assumed_asymmetry_moves_the_picture_by_what_the_calibration_left() 
         slope = camera.project_jacobian(rays)[3][:, :, [PARAMETERS.index(name) for name in ASYMMETRY]]
         variance = np.einsum("nia,ab,nib->ni", slope, camera.covariance, slope)
         assert np.sqrt(np.nanmean(variance.sum(axis=1))) == pytest.approx(stated, rel=0.1)  # a distance, as rms_px is
-    told = dataclasses.replace(fisheye(95), covariance=np.eye(1), covariance_parameters=("f_u",))
-    assert assumed(told) is told
+
+
+def test_a_profile_with_a_covariance_still_does_not_know_its_lenss_ripples_nor_all_of_its_pupil() -> None:
+    """0.1 px rms of the radius all over the field, beside what is stated; where nothing tells lengths, no pupil."""
+    told = dataclasses.replace(
+        fisheye(95), pupil_e1=0.001, covariance=np.diag([0.01, 1e-12]), covariance_parameters=("c_u", "pupil_e1")
+    )
+    camera = assumed(told)
+    index = [PARAMETERS.index(name) for name in camera.covariance_parameters]
+    theta = np.linspace(0.3, 0.95 * told.theta_max, 100)
+    rays = np.column_stack([0 * theta, np.sin(theta), np.cos(theta)])  # upwards, where c_u does nothing
+    slope = told.project_jacobian(rays)[3][:, 1, index]
+    moved = np.sqrt(np.einsum("na,ab,nb->n", slope, camera.covariance, slope))
+    assert np.sqrt(np.mean(moved**2)) == pytest.approx(0.1, rel=0.1)
+    at = camera.covariance_parameters.index
+    assert camera.covariance[at("c_u"), at("c_u")] == pytest.approx(0.01)
+    assert camera.covariance[at("pupil_e1"), at("pupil_e1")] == pytest.approx(1e-12 + PUPIL_REST**2)
+    blind = assumed(told, metric=False)
+    assert blind.covariance[at("pupil_e1"), at("pupil_e1")] == pytest.approx(1e-12)
 
 
 def test_a_held_camera_stays_and_no_survey_sharpens_it() -> None:

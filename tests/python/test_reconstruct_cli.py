@@ -46,9 +46,11 @@ def objects_of(
     nominal: float = 0.3,
     seed: int = 3,
     settled: float = 0.0,
+    jitter: float = 0.0005,
 ) -> list[Object]:
     """The objects of a drive as a device sends them. keep: (observations,) bool; gain: of the encoder; frames: which,
-    in the order given; seed: of the encoder's noise; settled: pixels by which places were moved, and told to be."""
+    in the order given; seed: of the encoder's noise, jitter: its sigma a step, metres; settled: pixels by which places
+    were moved, and told to be."""
     order = np.arange(len(drive.poses)) if frames is None else frames
     camera, jpeg = drive.camera, picture(16, 16, 0)
     begin = pb.SurveyStart(survey_id=SURVEY, name="made-up pipe", software="test", width=camera.width)
@@ -60,7 +62,7 @@ def objects_of(
     tracks, random = drive.tracks, np.random.default_rng(seed)
     keep = np.ones(len(tracks.frame), bool) if keep is None else keep
     steps = np.abs(np.diff(drive.driven[order], prepend=drive.driven[order[0]]))
-    driven = np.cumsum(steps + random.normal(0, 0.0005, len(order)) * (np.arange(len(order)) > 0))
+    driven = np.cumsum(steps + random.normal(0, jitter, len(order)) * (np.arange(len(order)) > 0))
     for index, frame in enumerate(order):
         message = pb.Keyframe(survey_id=SURVEY, index=index, frame_sequence=5 * index, cause=2, after_break=index == 0)
         message.width, message.height, message.jpeg = camera.width, camera.height, jpeg

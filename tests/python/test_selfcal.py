@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 import pipefish as pf
-from pipefish import _engine, health, measured_remarks, selfcal_input
+from pipefish import _engine, health, lens_ripple, measured_remarks, selfcal_input
 from pipefish.cli import main
 from pipefish.health import _chi2_tail
 from pipefish.measure import measure
@@ -461,7 +461,7 @@ def test_a_profile_without_the_pupil_shift_is_not_accused(monkeypatch):
 
 def test_a_lens_of_ripples_that_is_a_little_oval_is_not_accused(monkeypatch):
     """0.08 px of what no profile has: curves of drift are so much alike that they would show per cents of each."""
-    ripple = health._radial_fit(fisheye(100), np.linspace(0.2, 1.6, 60)) @ (
+    ripple = lens_ripple.radial_fit(fisheye(100), np.linspace(0.2, 1.6, 60)) @ (
         0.08 / 300 * np.cos(5 * np.linspace(0.2, 1.6, 60))
     )
     f, (k2, k3, k4, k5) = 300 * math.exp(ripple[0]), np.array([-0.02, 0.002, 0, 0]) + ripple[1:]
@@ -469,7 +469,7 @@ def test_a_lens_of_ripples_that_is_a_little_oval_is_not_accused(monkeypatch):
     drive, readings = bent_drive(f_u=f, f_v=f, k2=k2, k3=k3, k4=k4, k5=k5, cpoly=cpoly)
     known = {"encoder": ENCODER, "sigma": 0.2, "threads": 1}
     assert health.check_profile(drive.tracks, fisheye(100), readings, **known).verdict == "profile still valid"
-    monkeypatch.setattr(health, "LENS_RADIAL_PX", 1e-4)
+    monkeypatch.setattr(lens_ripple, "LENS_RADIAL_PX", 1e-4)
     monkeypatch.setattr(health, "LENS_ASYMMETRIC_PX", 1e-4)
     assert health.check_profile(drive.tracks, fisheye(100), readings, **known).verdict == "drifted, recalibrate"
 
