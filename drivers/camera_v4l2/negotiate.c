@@ -78,21 +78,41 @@ static double best_rate(pf_v4l2 *c, uint32_t fourcc, uint32_t width, uint32_t he
     return best;
 }
 
-/* Whether the camera makes this format in this size; it may change what it is asked for. */
-static bool can_make(pf_v4l2 *c, const pf_pixel_format *format, uint32_t width, uint32_t height)
+static bool is_as_asked(const shape *s, const pf_pixel_format *format, uint32_t width, uint32_t height)
+{
+    return s->fourcc == format->fourcc && s->width == width && s->height == height && s->field == V4L2_FIELD_NONE;
+}
+
+/* Bytes from row to row; some cameras tell none. */
+static uint32_t stride_of(const shape *s, const pf_pixel_format *format)
+{
+    const uint32_t row = pf_pixel_format_row(format, s->width);
+    return s->stride > row ? s->stride : row;
+}
+
+/* Whether a frame has room in what the camera gives it: else every frame would count as damaged. */
+static bool has_room(const shape *s, const pf_pixel_format *format)
+{
+    return pf_pixel_format_fits(format, s->width, s->height, stride_of(s, format), s->size);
+}
+
+/* Whether the camera makes this format in this size; it may change what it is asked for. *roomy: and has_room(). */
+static bool can_make(pf_v4l2 *c, const pf_pixel_format *format, uint32_t width, uint32_t height, bool *roomy)
 {
     struct v4l2_format f = make_format(c, format->fourcc, width, height);
     if (c->io.ioctl(c->io.self, c->fd, VIDIOC_TRY_FMT, &f) != 0)
         return false;
-    shape s = read_shape(c, &f);
-    return s.fourcc == format->fourcc && s.width == width && s.height == height && s.field == V4L2_FIELD_NONE;
+    const shape s = read_shape(c, &f);
+    *roomy = has_room(&s, format);
+    return is_as_asked(&s, format, width, height);
 }
 
-/* Our first format that the camera makes at the size, of those fast enough if there is one. */
+/* Our first format that the camera makes at the size, of those fast enough if there is one; one that it has no room for
+ * only if there is no other. */
 static const pf_pixel_format *choose(pf_v4l2 *c, const pf_session_wish *wish, uint32_t width, uint32_t height,
                                      char *has, size_t has_n)
 {
-    const pf_pixel_format *listed[ENUMERATED_MAX], *fallback = NULL;
+    const pf_pixel_format *listed[ENUMERATED_MAX], *slow = NULL, *cramped = NULL;
     uint32_t n = 0, known;
     const pf_pixel_format *ours = pf_pixel_formats(&known);
     has[0] = '\0';
@@ -106,18 +126,22 @@ static const pf_pixel_format *choose(pf_v4l2 *c, const pf_session_wish *wish, ui
         n += listed[n] != NULL;
     }
     for (uint32_t k = 0; k < known; k++) {
-        bool is_listed = false;
+        bool is_listed = false, roomy;
         for (uint32_t i = 0; i < n; i++)
             is_listed = is_listed || listed[i] == &ours[k];
-        if (!is_listed || (wish->format != NULL && wish->format != &ours[k]) || !can_make(c, &ours[k], width, height))
+        if (!is_listed || (wish->format != NULL && wish->format != &ours[k]) ||
+            !can_make(c, &ours[k], width, height, &roomy))
             continue;
+        if (!roomy) {
+            cramped = cramped != NULL ? cramped : &ours[k];
+            continue;
+        }
         double rate = wish->frame_rate > 0 ? best_rate(c, ours[k].fourcc, width, height) : 0;
         if (rate == 0 || rate >= wish->frame_rate * RATE_SLACK)
             return &ours[k];
-        if (fallback == NULL)
-            fallback = &ours[k];
+        slow = slow != NULL ? slow : &ours[k];
     }
-    return fallback;
+    return slow != NULL ? slow : cramped;
 }
 
 /* Sets the rate, where the camera lets it be set; what it is then. */
@@ -162,16 +186,15 @@ pf_status pf_v4l2_negotiate(pf_v4l2 *c, const pf_session_wish *wish, pf_session_
     status = pf_v4l2_call(c, VIDIOC_S_FMT, &f, "the format cannot be set");
     if (status != PF_OK)
         return status;
-    shape s = read_shape(c, &f);
-    if (s.fourcc != format->fourcc || s.width != width || s.height != height || s.field != V4L2_FIELD_NONE)
+    const shape s = read_shape(c, &f);
+    if (!is_as_asked(&s, format, width, height))
         return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: promised %s %u x %u, set %.4s %u x %u", c->device,
                        format->name, width, height, (const char *)&s.fourcc, s.width, s.height);
-    uint32_t row = pf_pixel_format_row(format, width);
     info->format = format;
     info->width = width;
     info->height = height;
-    info->stride = s.stride > row ? s.stride : row;
-    if (!pf_pixel_format_fits(format, width, height, info->stride, s.size)) /* every frame would count as damaged */
+    info->stride = stride_of(&s, format);
+    if (!has_room(&s, format))
         return pf_fail(c->failure, PF_ERR_UNSUPPORTED, "%s: its %u bytes, %u a row, hold no %s of %u x %u", c->device,
                        s.size, s.stride, format->name, width, height);
     info->frame_rate = set_rate(c, wish->frame_rate);

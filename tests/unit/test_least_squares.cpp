@@ -19,15 +19,17 @@ using namespace pipefish::optim;
 
 constexpr int E = 3, F = 6, G = 4, POINTS = 60, CHAIN = 14;
 
+template <int Columns> using Rows = Eigen::Matrix<double, Eigen::Dynamic, Columns, Eigen::RowMajor>;
+
 // Residuals A x - y + curvature (a . x)^2 over random sparse rows: with curvature 0 the solution is that of dense least
-// squares. Each point is seen from three to five neighbours in the chain; neighbours are tied; the border is seen by
-// all.
+// squares. One to three rows share a loss; pixels have two, and a way of their own. Each point is seen from three to
+// five neighbours in the chain; neighbours are tied; the border is seen by all.
 struct Toy {
     struct Row {
         int e;
         std::vector<int> f;
-        Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> a; // columns: E, F for each of f, G
-        Eigen::Vector2d y;
+        Rows<Eigen::Dynamic> a; // columns: E, F for each of f, G
+        Eigen::VectorXd y;
     };
     std::vector<std::vector<Row>> rows; // by e; the last: without e
     std::vector<std::vector<int>> seen;
@@ -41,8 +43,12 @@ struct Toy {
         std::mt19937_64 random(seed);
         std::normal_distribution<double> normal;
         const auto row = [&](int e, std::vector<int> f) {
-            Row r{e, std::move(f), {}, {normal(random), normal(random)}};
-            r.a.resize(2, (e >= 0 ? E : 0) + F * static_cast<int>(r.f.size()) + G);
+            Row r{e, std::move(f), {}, {}};
+            r.y.resize(e >= 0 && e % 3 == 0 ? 1 + 2 * (e % 2) : 2);
+            for (double &y : r.y) {
+                y = normal(random);
+            }
+            r.a.resize(r.y.size(), (e >= 0 ? E : 0) + F * static_cast<int>(r.f.size()) + G);
             for (Eigen::Index i = 0; i < r.a.size(); i++) {
                 r.a.data()[i] = normal(random);
             }
@@ -93,28 +99,28 @@ struct Toy {
         return v;
     }
 
-    Eigen::Vector2d residual(const Row &row, Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> *jacobian) const
+    Eigen::VectorXd residual(const Row &row, Rows<Eigen::Dynamic> *jacobian) const
     {
-        const Eigen::Vector2d linear = row.a * local(row, x);
+        const Eigen::VectorXd linear = row.a * local(row, x);
         if (jacobian) {
             *jacobian = row.a;
-            for (int i = 0; i < 2; i++) {
+            for (Eigen::Index i = 0; i < linear.size(); i++) {
                 jacobian->row(i) *= 1.0 + 2.0 * curvature * linear[i];
             }
             if (!border_seen) {
                 jacobian->rightCols(1).setZero();
             }
         }
-        return linear - row.y + curvature * linear.cwiseProduct(linear);
+        return linear - row.y + curvature * Eigen::VectorXd(linear.cwiseProduct(linear));
     }
 
     template <class Sink> void linearize(int e, Sink &sink) const
     {
         for (const Row &row : of(e)) {
-            Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> j;
-            const Eigen::Vector2d r = residual(row, &j);
-            const Eigen::Matrix<double, 2, E, Eigen::RowMajor> j_e = j.leftCols(E); // of no meaning where e < 0
-            std::vector<Eigen::Matrix<double, 2, F, Eigen::RowMajor>> j_f;
+            Rows<Eigen::Dynamic> j;
+            const Eigen::VectorXd r = residual(row, &j);
+            const Rows<E> j_e = j.leftCols(E); // of no meaning where e < 0
+            std::vector<Rows<F>> j_f;
             std::vector<const double *> j_f_at;
             for (size_t k = 0; k < row.f.size(); k++) {
                 j_f.push_back(j.middleCols((row.e >= 0 ? E : 0) + static_cast<Eigen::Index>(k) * F, F));
@@ -122,8 +128,9 @@ struct Toy {
             for (const auto &block : j_f) {
                 j_f_at.push_back(block.data());
             }
-            const Eigen::Matrix<double, 2, G, Eigen::RowMajor> j_g = j.rightCols(G);
-            sink.add(2, r.data(), loss, row.e >= 0 ? j_e.data() : nullptr, row.f, j_f_at, j_g.data());
+            const Rows<G> j_g = j.rightCols(G);
+            sink.add(static_cast<int>(r.size()), r.data(), loss, row.e >= 0 ? j_e.data() : nullptr, row.f, j_f_at,
+                     j_g.data());
         }
     }
 
@@ -156,10 +163,10 @@ struct Toy {
         std::vector<double> right;
         for (const auto &group : rows) {
             for (const Row &row : group) {
-                Eigen::Matrix<double, 2, Eigen::Dynamic, Eigen::RowMajor> j;
-                const Eigen::Vector2d value = residual(row, &j);
+                Rows<Eigen::Dynamic> j;
+                const Eigen::VectorXd value = residual(row, &j);
                 const double root = std::sqrt(loss(value.squaredNorm()).weight);
-                for (int i = 0; i < 2; i++) {
+                for (Eigen::Index i = 0; i < value.size(); i++) {
                     Eigen::VectorXd full = Eigen::VectorXd::Zero(x.size());
                     Eigen::Index at = 0;
                     if (row.e >= 0) {

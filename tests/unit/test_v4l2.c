@@ -165,6 +165,10 @@ static void test_a_camera_without_room_for_its_own_format_is_told_of(void)
     k.image_size = W * H * 10 / 8;
     TEST_ASSERT_EQUAL_INT(PF_ERR_UNSUPPORTED, open_with(W, H, "", 0));
     TEST_ASSERT_NOT_NULL_MESSAGE(strstr(error, "its 3840 bytes, 80 a row, hold no Y10 of 64 x 48"), error);
+    k.formats[1].fourcc = V4L2_PIX_FMT_MJPEG; /* which has room, and comes after Y10 in our order */
+    k.n_formats = 2;
+    TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, open_with(W, H, "", 0), error);
+    TEST_ASSERT_EQUAL_HEX32(V4L2_PIX_FMT_MJPEG, k.fourcc);
 }
 
 static void test_a_camera_that_is_not_there_yet_is_waited_for(void)

@@ -64,7 +64,7 @@ public:
         if (!std::isfinite(cost)) {
             throw std::invalid_argument("least squares: the start has no finite cost");
         }
-        bool moved = true; // since it was linearised, which the state returned never is
+        bool moved = true; // since it was linearised; the state that a last step leads to never is
         for (summary.iterations = 0; summary.iterations < options.max_iterations; summary.iterations++) {
             if (moved) {
                 normal_.linearize(problem, options.threads);
