@@ -12,11 +12,12 @@ import numpy as np
 from pipefish.cloudfile import read_columns
 from pipefish.colours import DIVERGING
 from pipefish.errors import FormatError
+from pipefish.files import rounded
 from pipefish.intervals import Z95
 from pipefish.measured_files import COLOUR_SPAN, RING
 from pipefish.measured_limits import LIMITS, whole_sigma
 from pipefish.measured_texts import column, events_text
-from pipefish.page import Chart, rounded
+from pipefish.page import Chart
 from pipefish.report_charts import Charts
 
 MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # a phone turns that
