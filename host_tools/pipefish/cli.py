@@ -71,6 +71,10 @@ Result = tuple[dict[str, Any], str] | tuple[dict[str, Any], str, int]
 class Parser(argparse.ArgumentParser):
     """argparse's, with wrong usage as an exception: main tells it in the form that was asked for."""
 
+    def format_help(self) -> str:
+        """As the terminal may have it."""
+        return printable(super().format_help(), sys.stdout.encoding)
+
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
         if message.startswith("argument COMMAND: invalid choice"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -177,6 +178,14 @@ def test_help_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_comes_on_a_terminal_without_the_letters():
+    """It was an internal error."""
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    code = "from pipefish.cli import main; raise SystemExit(main(['reconstruct', '--help']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and "[+- 1 %]" in " ".join(done.stdout.split()) and not done.stderr
 
 
 def test_a_terminal_without_the_letters_gets_others():
