@@ -128,6 +128,17 @@ def test_noise_is_grey_and_a_limit_has_full_colour(measured):
     )
 
 
+def test_grey_against_the_mean_is_without_what_all_radii_share(measured):
+    """A scale that is off makes the mean as much off: what a pipe differs by along it was grey by the scale's share."""
+    charts = Charts(measured / "out")
+    by_nominal = Scene(charts, []).colour_range()[0]
+    charts.summary["nominal"] = None
+    scene = Scene(charts, [])
+    own = np.array([v for v in charts.document["stations"]["d_max_sigma"] if v is not None])
+    assert scene.against == "the mean" and scene.colour_range()[0] == pytest.approx(980 * np.median(own))
+    assert scene.colour_range()[0] < by_nominal
+
+
 def test_names_of_near_findings_do_not_lie_over_each_other():
     assert named([1.0, 1.02, 1.5, 1.55, 1.61], ["a", "b", "c", "d", "e"], 0.1) == ["a", "", "c", "", "e"]
     joints = ["joint", "deposit", "joint", "joint"]
