@@ -191,4 +191,5 @@ def test_help_comes_on_a_terminal_without_the_letters():
 def test_a_terminal_without_the_letters_gets_others():
     """It would have got a traceback, after minutes of measuring."""
     assert cli.printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
+    assert cli.printable("± 1 in \udcff.csv", "utf-8") == "± 1 in \\udcff.csv", "a name that is no text takes no ± away"
     assert cli.printable("29.9 ± 0.25°", "latin-1") == cli.printable("29.9 ± 0.25°") == "29.9 ± 0.25°"
