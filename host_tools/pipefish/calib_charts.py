@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from .calibration import Board
 from .camera import Camera
+from .files import rounded
 from .lensreport import curve
-from .page import Chart, rounded
+from .page import Chart
 
 Array = npt.NDArray[np.float64]
 

@@ -30,11 +30,12 @@ def printable(text: str, encoding: str | None = None) -> str:
     """As a terminal of this encoding [UTF-8] may have it: a survey's or a device's texts could hold codes that clear it
     or fake other lines. What it has no letter for is told otherwise: a long measurement must not end in an error."""
     known = encoding or "utf-8"
+    text = "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else f"\\u{ord(c):04x}" for c in text)
     try:
         text.encode(known)
     except UnicodeEncodeError:
         text = text.replace("±", "+-").replace("°", " deg").encode(known, "backslashreplace").decode(known)
-    return "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else f"\\u{ord(c):04x}" for c in text)
+    return text
 
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
@@ -70,6 +71,10 @@ Result = tuple[dict[str, Any], str] | tuple[dict[str, Any], str, int]
 
 class Parser(argparse.ArgumentParser):
     """argparse's, with wrong usage as an exception: main tells it in the form that was asked for."""
+
+    def format_help(self) -> str:
+        """As the terminal may have it."""
+        return printable(super().format_help(), sys.stdout.encoding)
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)

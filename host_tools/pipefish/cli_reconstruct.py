@@ -292,4 +292,5 @@ def run_report(args: argparse.Namespace) -> Result:
         raise UsageError(f"report: --limit {error}") from error
     document = {"file": str(out), "bytes": out.stat().st_size, "limits": verdicts}
     rows = [(f"limit {v['name']}", v["text"]) for v in verdicts]
+    rows += [("intervals", SAID)] if verdicts else []
     return document, table([*rows, ("written", str(out))]), DONE if all_hold(verdicts) else FAILED

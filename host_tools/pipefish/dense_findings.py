@@ -12,7 +12,7 @@ from typing import Any
 
 from pipefish.errors import FormatError, PipefishError
 from pipefish.intervals import Z95
-from pipefish.measured_texts import length_text
+from pipefish.measured_texts import interval_text, length_text
 
 FORMAT, VERSION = "pipefish-dense", 2
 COLUMNS = (
@@ -53,10 +53,7 @@ def findings_table(findings: list[dict[str, Any]]) -> bytes:
 
 
 def _sized(name: str, value: float, sigma: float | None, unit: str) -> str:
-    text = length_text(value, unit)
-    if sigma is not None:
-        text = text.replace(" ", f" ± {length_text(Z95 * sigma, unit).split()[0]} ", 1)
-    return f"{name} {text}"
+    return f"{name} {interval_text(value, sigma, unit)}"
 
 
 def finding_parts(e: dict[str, Any], unit: str) -> list[str]:

@@ -7,6 +7,7 @@ import csv
 import io
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def rounded(values: Iterable[float], digits: int = 4) -> list[float | None]:
+    """Numbers for JSON, short; what is not finite is null: a gap in a chart."""
+    return [round(float(v), digits) if math.isfinite(v) else None for v in values]
 
 
 def csv_bytes(columns: dict[str, Any]) -> bytes:

@@ -20,7 +20,7 @@ import numpy as np
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
-from pipefish.intervals import Z95
+from pipefish.intervals import SAID, Z95
 from pipefish.scene import STATES, frames_in
 from pipefish.structure import REASONS
 from pipefish.survey import Keyframe, Observations, Survey
@@ -374,10 +374,10 @@ def summary_rows(summary: dict[str, Any] | None) -> list[tuple[str, object]]:
             ("measured live", f"{summary['from']:.2f} to {summary['to']:.2f} m, {summary['stations']} stations")
         )
         shared = 1000 * Z95 * summary["systematic"]
-        rows.append(
-            ("mean diameter", f"{d:.1f} mm ± {shared:.1f} (95 %; scale and camera), {low:.1f} to {high:.1f} mm")
-        )
+        rows.append(("mean diameter", f"{d:.1f} ± {shared:.1f} mm (scale and camera), {low:.1f} to {high:.1f} mm"))
     if "ovality_most" in summary:
         rows.append(("most oval", f"{100 * summary['ovality_most']:.2f} % at {summary['ovality_most_at']:.2f} m"))
     rows.append(("warnings", len(summary["warnings"]) or "none"))
+    if summary["unit"] == "metre":  # without lengths there is none
+        rows.append(("intervals", SAID))
     return rows

@@ -15,6 +15,7 @@ from pipefish.assumed import assumed
 from pipefish.camera import Camera
 from pipefish.errors import ArgumentError, PipefishError
 from pipefish.health import ProfileCheck, check_profile, doubted, drift_prior
+from pipefish.intervals import Z95
 from pipefish.jitter import smoothed
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.pupil import pupil_sigma
@@ -147,7 +148,7 @@ def _adjusted(readings: Readings, method: str, threads: int | None, tell: Tell) 
         return readings, structure
     chainage, encoder, white = smooth
     remark = (
-        f"The encoder's readings jitter by {1000 * white:.1f} mm each (one sigma), which the device does not state: "
+        f"The encoder's readings jitter by ± {1000 * Z95 * white:.1f} mm each, which the device does not state: "
         "they were smoothed along what the pictures say was driven from one to the next."
     )
     better = dataclasses.replace(readings, chainage=chainage, encoder=encoder, remarks=[*readings.remarks, remark])

@@ -14,6 +14,7 @@ from pipefish.errors import FormatError
 from pipefish.intervals import Z95
 
 FORMAT, VERSION = "pipefish-reconstruction", 1
+MOST_DIGITS = 5  # of a length
 
 #: What an ovality of the tables is of, in words.
 OVALITIES = {
@@ -28,11 +29,28 @@ OVALITIES = {
 # ---- texts
 
 
+def _form(unit: str, metres: bool) -> tuple[float, int, str]:
+    """How a length is shown: by which factor, digits, unit."""
+    if unit != "metre":
+        return 1.0, 3, "diameters"
+    return (1.0, 2, "m") if metres else (1000.0, 1, "mm")
+
+
 def length_text(value: float, unit: str, metres: bool = False) -> str:
     """A length for people."""
-    if unit != "metre":
-        return f"{value:.3f} diameters"
-    return f"{value:.2f} m" if metres else f"{1000 * value:.1f} mm"
+    factor, digits, word = _form(unit, metres)
+    return f"{factor * value:.{digits}f} {word}"
+
+
+def interval_text(value: float, sigma: float | None, unit: str, metres: bool = False) -> str:
+    """A length with its 95 % interval, if that is known, and with more digits where else it would be told as 0."""
+    if sigma is None:
+        return length_text(value, unit, metres)
+    factor, digits, word = _form(unit, metres)
+    half = factor * Z95 * sigma
+    while 0 < half < 0.5 * 10**-digits and digits < MOST_DIGITS:
+        digits += 1
+    return f"{factor * value:.{digits}f} ± {half:.{digits}f} {word}"
 
 
 def percent_text(value: float) -> str:
@@ -55,17 +73,13 @@ def size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
     if e["kind"] == "bend":
         yield f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
         if e.get("radius"):
-            number, word = length_text(e["radius"], unit, metres=True).split()
-            yield f"radius {number} ± {length_text(Z95 * e['radius_sigma'], unit, metres=True).split()[0]} {word}"
+            yield f"radius {interval_text(e['radius'], e['radius_sigma'], unit, metres=True)}"
         yield f"from {length_text(e['start'], unit, metres=True)} to {length_text(e['end'], unit, metres=True)}"
         return
     for name in ("gap", "step", "height", "length", "width"):
         if e.get(name) is not None:
             sigma = e.get("size_sigma" if name in ("length", "width") else f"{name}_sigma")
-            text = length_text(e[name], unit)
-            if sigma is not None:
-                text = text.replace(" ", f" ± {length_text(Z95 * sigma, unit).split()[0]} ", 1)
-            yield f"{name} {text}"
+            yield f"{name} {interval_text(e[name], sigma, unit)}"
     if e["kind"] == "joint" and e.get("angle") is not None:
         yield f"angle {math.degrees(e['angle']):.2f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
 

@@ -15,7 +15,7 @@ import numpy as np
 from pipefish import __version__
 from pipefish.colours import AGE_MAX, scale_colours
 from pipefish.errors import PipefishError
-from pipefish.files import write_atomically
+from pipefish.files import rounded, write_atomically
 from pipefish.show import Painter, Style, animation, spread
 from pipefish.survey import Survey
 from pipefish.trackstats import charts as statistics_charts
@@ -42,11 +42,6 @@ Chart = dict[str, Any]
 def data_uri(data: bytes, kind: str) -> str:
     """Bytes as a data: address."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def rounded(values: Iterable[float], digits: int = 4) -> list[float | None]:
-    """Numbers for JSON, short; NaN becomes null (a gap)."""
-    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
 
 
 def _axis(title: str, **more: Any) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from pipefish.files import write_atomically
 from pipefish.intervals import SAID, Z95
 from pipefish.measured_limits import LIMITS, check_limits, most_oval, verdict, whole_sigma
 from pipefish.measured_reach import UNSEEN, reach_text
-from pipefish.measured_texts import clock_text, column, length_text, scale_texts, size_parts
+from pipefish.measured_texts import clock_text, column, interval_text, length_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
@@ -177,9 +177,9 @@ class Report(Charts):
         # What has no place stands last.
         events.sort(key=lambda e: (e[0]["chainage"] is None, e[0]["chainage"] or 0.0))
         for e, by_map in events:
-            at = length_text(e["chainage"], self.unit, metres=True) if e["chainage"] is not None else "unknown"
-            if e.get("s_sigma") is not None:
-                at = at.replace(" ", f" ± {Z95 * e['s_sigma']:.2f} ", 1)
+            at = "unknown"
+            if e["chainage"] is not None:
+                at = interval_text(e["chainage"], e.get("s_sigma"), self.unit, metres=True)
             clock = clock_text(e["clock"]) if e.get("clock") is not None else ""
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
             cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipefish.files import rounded
 from pipefish.intervals import Z95
 from pipefish.measured_limits import whole_sigma
 from pipefish.measured_remarks import TREND_PX
@@ -29,10 +29,6 @@ COLOURS = ("#1f8a94", "#c8641b", "#6d4bc4", "#4d8a22", "#b83a63")
 
 def _axis(title: str, **more: Any) -> dict[str, Any]:
     return {"title": {"text": title}, **more}
-
-
-def _numbers(values: Iterable[float], digits: int = 3) -> list[float | None]:
-    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
 
 
 def _runs(x: np.ndarray, y: np.ndarray, stretch: np.ndarray) -> list[np.ndarray]:
@@ -59,10 +55,10 @@ def _band(
     """A line with its band, broken where nothing was measured."""
     line_x, line_y, area_x, area_y = ([] for _ in range(4))
     for run in _runs(x, y, stretch):
-        line_x += [*_numbers(x[run]), None]
-        line_y += [*_numbers(y[run]), None]
-        area_x += [*_numbers(x[run]), *_numbers(x[run][::-1]), None]
-        area_y += [*_numbers(high[run]), *_numbers(low[run][::-1]), None]
+        line_x += [*rounded(x[run], 3), None]
+        line_y += [*rounded(y[run], 3), None]
+        area_x += [*rounded(x[run], 3), *rounded(x[run][::-1], 3), None]
+        area_y += [*rounded(high[run], 3), *rounded(low[run][::-1], 3), None]
     area = {"type": "scatter", "mode": "none", "x": area_x, "y": area_y, "fill": "toself", "fillcolor": colour + "38"}
     line = {
         "type": "scatter",
@@ -210,7 +206,7 @@ class Charts:
         line = {"type": "scatter", "mode": "lines", "line": {"width": 2, "color": COLOURS[0]}}
 
         def cut(values: np.ndarray) -> list[float | None]:
-            return _numbers(np.insert(values, np.flatnonzero(breaks), np.nan), 4)
+            return rounded(np.insert(values, np.flatnonzero(breaks), np.nan), 4)
 
         unit = self.along_unit
         known = "by the inclinometer" if down else "up in the first keyframe's picture"
@@ -252,7 +248,7 @@ class Charts:
             "type": "bar",
             "name": "rms",
             "x": names,
-            "y": _numbers(b["rms_px"] for b in bins),
+            "y": rounded((b["rms_px"] for b in bins), 3),
             "customdata": [b["count"] for b in bins],
             "hovertemplate": "%{y:.3f} px rms of %{customdata}<extra></extra>",
         }
@@ -261,7 +257,7 @@ class Charts:
             "mode": "lines+markers",
             "name": "mean outwards",
             "x": names,
-            "y": _numbers(b["mean_radial_px"] for b in bins),
+            "y": rounded((b["mean_radial_px"] for b in bins), 3),
             "hovertemplate": "%{y:+.3f} px outwards<extra></extra>",
         }
         return {
@@ -281,7 +277,7 @@ class Charts:
             "id": "points",
             "title": "Points behind each section",
             "text": "Points within 0.375 diameters of each station. Under 20 nothing is given.",
-            "data": [{**line, "x": _numbers(self.x), "y": _numbers(column(self.document, "inliers"), 0)}],
+            "data": [{**line, "x": rounded(self.x, 3), "y": rounded(column(self.document, "inliers"), 0)}],
             "layout": {
                 "xaxis": self.along(),
                 "yaxis": _axis("points", rangemode="tozero"),
@@ -307,7 +303,7 @@ class Charts:
             "title": "Camera's path against the encoder",
             "text": f"How much further the camera's path is than the encoder says.{share} Steps are slips of the wheel "
             "or of the tracking.",
-            "data": [{**line, "x": _numbers(along), "y": _numbers(1000 * excess, 2)}],
+            "data": [{**line, "x": rounded(along, 3), "y": rounded(1000 * excess, 2)}],
             "layout": {"xaxis": _axis("chainage by the encoder, m"), "yaxis": _axis("mm")},
         }
         return [chart]

@@ -12,11 +12,12 @@ import numpy as np
 from pipefish.cloudfile import read_columns
 from pipefish.colours import DIVERGING
 from pipefish.errors import FormatError
+from pipefish.files import rounded
 from pipefish.intervals import Z95
 from pipefish.measured_files import COLOUR_SPAN, RING
 from pipefish.measured_limits import LIMITS, whole_sigma
 from pipefish.measured_texts import column, events_text
-from pipefish.page import Chart, rounded
+from pipefish.page import Chart
 from pipefish.report_charts import Charts
 
 MOST_RINGS, AROUND, MOST_POINTS = 360, 36, 6000  # a phone turns that
@@ -91,7 +92,8 @@ class Scene:
         """Half width of the 95 % interval of a radius, and the deviation from which on the colour is full."""
         name = "d_max" if np.isfinite(column(self.document, "d_max_sigma")).any() else "d_mean"
         # Against the mean only what differs along and around the pipe counts, and that the scale does not change.
-        sigma = whole_sigma(self.document, name) if self.metric else column(self.document, f"{name}_sigma")
+        by_nominal = self.against == "nominal"
+        sigma = whole_sigma(self.document, name) if by_nominal else column(self.document, f"{name}_sigma")
         half = self.charts.factor * Z95 * float(np.nanmedian(sigma)) / 2
         most = self.charts.factor * min(float(np.nanpercentile(np.abs(self.deviation), 99)), COLOUR_SPAN * self.size)
         limits = [off for limit in self.limits if (off := self._off(*limit)) > 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -36,6 +37,8 @@ light.npz                 colour in A = gain1 * colour in B + offset1, pixel by 
 warped1.png               B brought into A, in A's light, cut out; warped2.png: A brought into B
 residual1.png             A less warped1.png, four times, around grey; residual2.png: the same of B
 """
+#: What lies in the folder of a layer.
+LAYER_FILES = ("flow.npz", "light.npz", "warped1.png", "residual1.png", "warped2.png", "residual2.png")
 Bytes = NDArray[np.uint8]
 
 
@@ -197,12 +200,27 @@ def _arrays(**arrays: NDArray[Any]) -> bytes:
     return out.getvalue()
 
 
+def _forget_layers(folder: Path, kept: int) -> None:
+    """Removes the layers beyond so many that an earlier run left: they are not of these pictures. What else lies in
+    their folders stays."""
+    for old in folder.glob("layer_*"):
+        number = old.name.removeprefix("layer_")
+        if not (number.isdecimal() and int(number) > kept and old.is_dir()):
+            continue
+        for name in LAYER_FILES:
+            (old / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it holds something else
+            old.rmdir()
+
+
 def write_segmentation(folder: str | os.PathLike[str], one: Floats32, two: Floats32, s: Segmentation) -> list[str]:
     """Writes a segmentation of pictures (C,H,W): README.txt, which tells what each file is, labels1.png,
     labels2.png, segmentation.png, layers.json, and for each layer a folder layer_1, layer_2, ... with flow.npz,
-    light.npz, and warped and residual pictures. Returns the names. Raises OSError."""
+    light.npz, and warped and residual pictures; layers of an earlier run are removed. Returns the names. Raises
+    OSError."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    _forget_layers(folder, len(s.layers))
     contents = {
         "README.txt": README.encode(),
         "labels1.png": draw_labels(s.labels1),

@@ -289,7 +289,7 @@ def _reason(status: str, found: dict[str, Any]) -> str:
     if status in ("no_rotation", "axial", "weak"):
         alone = found["alpha_alone"] > ALONE_LIMIT
         sigma, limit = (found["alpha_alone"], ALONE_LIMIT) if alone else (found["alpha_sigma"], ALPHA_LIMIT)
-        known = f"± {100 * Z95 * sigma:.2g} %" if sigma < 1 else "200 % and more"
+        known = f"± {100 * Z95 * sigma:.2g} %" if sigma < 1 else "± 200 % and more"
         text += f"; they leave its stretch along the axis open by {known} (95 %{', by themselves' if alone else ''}; "
         text += f"± {100 * Z95 * limit:.0f} % is the most). "
         degrees = max(1, round(math.degrees(found["needed"] or TILT_USUAL)))
@@ -303,7 +303,7 @@ def _reason(status: str, found: dict[str, Any]) -> str:
         area = math.floor(1000 * found["area"]) / 10
         text += f" ({area:g} %; {100 * AREA_LEAST:.0f} % are needed"
         if found["found"] and found["alpha_sigma"] < 1:
-            text += f"; its stretch along the axis is open by ± {100 * Z95 * found['alpha_sigma']:.2g} %"
+            text += f"; its stretch along the axis is open by ± {100 * Z95 * found['alpha_sigma']:.2g} % (95 %)"
         text += "). Take a scene that fills it"
     if status == "planar":
         text += ". Take a scene in depth: near and far things, not a wall or a board alone"

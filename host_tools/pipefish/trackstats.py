@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipefish.files import rounded
 from pipefish.scene import REASONS, STATES, frames_in
 from pipefish.survey import Survey
 
@@ -28,20 +29,16 @@ def statistics(survey: Survey) -> dict[str, np.ndarray]:
     return result
 
 
-def _numbers(values: np.ndarray, digits: int = 3) -> list[float | None]:
-    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
-
-
 def charts(survey: Survey, along: np.ndarray, title: str) -> list[dict[str, Any]]:
     """Charts over `along` (N,), whose axis is called `title`; [] if the device counted nothing. See pipefish.page."""
     stats = statistics(survey)
     if not np.isfinite(stats["tracked"]).any():
         return []
-    x = _numbers(along, 4)
+    x = rounded(along)
     xaxis = {"title": {"text": title}}
 
     def line(name: str, y: np.ndarray, **more: Any) -> dict[str, Any]:
-        return {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": _numbers(y), **more}
+        return {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": rounded(y, 3), **more}
 
     lost = [(name, words) for name, words in REASONS if np.nansum(stats[name]) > 0]
     result = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -179,7 +180,16 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_help_comes_on_a_terminal_without_the_letters():
+    """It was an internal error."""
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    code = "from pipefish.cli import main; raise SystemExit(main(['reconstruct', '--help']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and "[+- 1 %]" in " ".join(done.stdout.split()) and not done.stderr
+
+
 def test_a_terminal_without_the_letters_gets_others():
     """It would have got a traceback, after minutes of measuring."""
     assert cli.printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
+    assert cli.printable("± 1 in \udcff.csv", "utf-8") == "± 1 in \\udcff.csv", "a name that is no text takes no ± away"
     assert cli.printable("29.9 ± 0.25°", "latin-1") == cli.printable("29.9 ± 0.25°") == "29.9 ± 0.25°"

@@ -236,3 +236,13 @@ def test_a_second_adjustment_that_fails_leaves_the_first(monkeypatch: pytest.Mon
     monkeypatch.setattr(measuring, "smoothed", lambda *_: (np.zeros(3), STATED, 0.005))
     used, structure = measuring._adjusted(given, "", None, lambda *_: None)
     assert structure is first and used is given and next(made, None) is None
+
+
+def test_the_remark_on_jitter_tells_an_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one sigma of 5 mm, as every other ±."""
+    nothing = dict.fromkeys(measuring.Readings.__dataclass_fields__)
+    given = measuring.Readings(**nothing | {"chainage": np.arange(3.0), "encoder": STATED, "remarks": []})
+    monkeypatch.setattr(measuring, "_adjusted_once", lambda *_: SimpleNamespace(status="ok"))
+    monkeypatch.setattr(measuring, "smoothed", lambda *_: (np.zeros(3), STATED, 0.005))
+    used, _ = measuring._adjusted(given, "", None, lambda *_: None)
+    assert len(used.remarks) == 1 and "jitter by ± 9.8 mm each" in used.remarks[0] and "sigma" not in used.remarks[0]

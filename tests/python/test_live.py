@@ -68,7 +68,10 @@ def test_the_newest_stretch_is_measured_as_it_arrives(objects, tmp_path):
     assert summary["ovality_most"] == pytest.approx(0.03, abs=0.006)
     text = progress_text(course.progress())
     assert text.startswith("2.50 m: diameter ") and "oval " in text
-    assert dict(summary_rows(summary))["warnings"] == "none"
+    rows = dict(summary_rows(summary))
+    half = 1960 * summary["systematic"]
+    assert rows["warnings"] == "none" and f" ± {half:.1f} mm (scale and camera)" in rows["mean diameter"]
+    assert rows["intervals"] == "every ± is a 95 % interval"
 
 
 def test_without_an_encoder_places_are_where_the_pictures_say(drive, tmp_path):

@@ -21,7 +21,7 @@ from pipefish.dense_files import strips_of, write_dense
 from pipefish.dense_findings import fingerprint
 from pipefish.intervals import Z95
 from pipefish.measured_limits import whole_sigma
-from pipefish.measured_texts import OVALITIES, column
+from pipefish.measured_texts import OVALITIES, column, interval_text, length_text
 from pipefish.report import Report
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart
@@ -128,6 +128,17 @@ def test_noise_is_grey_and_a_limit_has_full_colour(measured):
     )
 
 
+def test_grey_against_the_mean_is_without_what_all_radii_share(measured):
+    """A scale that is off makes the mean as much off: what a pipe differs by along it was grey by the scale's share."""
+    charts = Charts(measured / "out")
+    by_nominal = Scene(charts, []).colour_range()[0]
+    charts.summary["nominal"] = None
+    scene = Scene(charts, [])
+    own = np.array([v for v in charts.document["stations"]["d_max_sigma"] if v is not None])
+    assert scene.against == "the mean" and scene.colour_range()[0] == pytest.approx(980 * np.median(own))
+    assert scene.colour_range()[0] < by_nominal
+
+
 def test_names_of_near_findings_do_not_lie_over_each_other():
     assert named([1.0, 1.02, 1.5, 1.55, 1.61], ["a", "b", "c", "d", "e"], 0.1) == ["a", "", "c", "", "e"]
     joints = ["joint", "deposit", "joint", "joint"]
@@ -146,11 +157,23 @@ def test_names_of_near_rings_on_the_wall_stand_below_each_other():
     assert tops[1.0] == tops[2.0] == 0 < tops[1.05] < tops[1.1]
 
 
-def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path):
+def test_no_interval_is_told_as_nothing():
+    """A joint stood at 1.31 ± 0.00 m."""
+    assert interval_text(1.30722, 0.000713, "metre", metres=True) == "1.307 ± 0.001 m"
+    assert interval_text(1.30722, 0.00713, "metre", metres=True) == "1.31 ± 0.01 m"
+    assert interval_text(0.0117, 0.00071, "metre") == "11.7 ± 1.4 mm"
+    assert interval_text(4.2, 1e-5, "diameter") == "4.20000 ± 0.00002 diameters"
+    assert interval_text(4.2, None, "diameter") == length_text(4.2, "diameter") == "4.200 diameters"
+    assert interval_text(4.2, 0.0, "metre", metres=True) == "4.20 ± 0.00 m"
+
+
+def test_undecided_is_explained_only_where_a_limit_is(measured, page, tmp_path, capsys):
     assert "passed" in page.read_text() and "Undecided" not in page.read_text()
     summary = read_wall(measured / "out").document["summary"]
     out, close = tmp_path / "report.html", f"ovality={100 * summary['ovality_most']:.3f}"
     assert main(["report", str(measured / "out"), "-o", str(out), "--limit", close]) == 1
+    told = capsys.readouterr().out
+    assert "±" in told and told.count("95 %") == 1, "what the ± of a limit is"
     assert "Undecided: the interval at the worst station" in out.read_text()
 
 

@@ -15,7 +15,8 @@ from PIL import Image
 import pipefish as pf
 from pipefish import _engine
 from pipefish.cli import main
-from pipefish.segmentation_files import document, motion_text
+from pipefish.segmentation import planes
+from pipefish.segmentation_files import LAYER_FILES, document, motion_text, write_segmentation
 from segment_scenes import (
     Pair,
     boundary_score,
@@ -266,6 +267,22 @@ def test_the_command_writes_labels_fields_and_pictures(tmp_path: Path, capsys: p
     cut = np.asarray(Image.open(out / "layer_1/warped1.png"))
     assert ((cut[..., 3] > 0) == (labels == 1)).all() and np.ptp(cut[labels == 1]) > 50
     assert Image.open(out / "segmentation.png").size == (3 * 240 + 12, 16 + 2 * 186)
+
+
+def test_layers_of_an_earlier_run_are_gone_and_what_else_lay_there_stays(tmp_path: Path):
+    """They looked like layers of these pictures."""
+    pair, s = scene(seed=1), segmented(seed=1)
+    one, two = (planes(image, "image") for image in pair.images)
+    write_segmentation(tmp_path, one, two, s)
+    (tmp_path / "layer_2/notes.txt").write_text("mine")
+    (tmp_path / "layer_old").mkdir()
+    nothing = replace(s, layers=[], labels1=0 * s.labels1, labels2=0 * s.labels2)
+    write_segmentation(tmp_path, one, two, nothing)
+    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.glob("layer_*/**/*"))
+    assert left == ["layer_2/notes.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["layer_2", "layer_old"]
+    files = write_segmentation(tmp_path, one, two, s)
+    assert {Path(f).name for f in files if Path(f).parent.name == "layer_1"} == set(LAYER_FILES)
 
 
 def test_a_layer_tells_how_far_it_moved_and_turned():

@@ -182,6 +182,7 @@ def test_a_camera_that_tilted_is_not_told_that_it_did_not():
     assert _status(found) == "weak"
     assert "nearly flat" in _reason("weak", found) and "± 59 % (95 %, by themselves; ± 4 %" in _reason("weak", found)
     assert _status(found_with(("ok",), alpha_alone=0.3, tilt=math.radians(1))) == "no_rotation"
+    assert "± 2 % (95 %)" in _reason("low_coverage", found_with(("ok",)))  # of alpha_sigma 0.01
 
 
 def test_chance_is_no_camera():
