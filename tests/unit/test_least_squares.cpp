@@ -42,9 +42,10 @@ struct Toy {
     {
         std::mt19937_64 random(seed);
         std::normal_distribution<double> normal;
+        int next = 0;
         const auto row = [&](int e, std::vector<int> f) {
             Row r{e, std::move(f), {}, {}};
-            r.y.resize(e >= 0 && e % 3 == 0 ? 1 + 2 * (e % 2) : 2);
+            r.y.resize(e >= 0 ? 3 - next++ % 3 : 2); // any two of a point determine it
             for (double &y : r.y) {
                 y = normal(random);
             }
