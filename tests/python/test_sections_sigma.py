@@ -171,24 +171,32 @@ def seen_by_another_pupil(drive: Drive) -> Drive:
     return dataclasses.replace(drive, tracks=dataclasses.replace(tracks, pixels=pixels))
 
 
-def test_a_pupil_that_moves_otherwise_than_the_profiles_tapers_no_narrow_pipe(tmp_path, monkeypatch):
+def test_with_the_lens_open_another_pupil_tapers_narrow_pipes_by_less_and_within_their_intervals(tmp_path, monkeypatch):
     """A wall 75 mm away, a profile as a calibration has it: right at the rim, up to 0.2 mm of pupil wrong within, and
-    sure of itself. A round pipe is measured as one; without what the profile does not know of its lens it tapers
-    beyond its intervals."""
+    sure of itself. Five drives together, since they differ (0.09 to 0.75 % of scatter): stations of one drive are one
+    smooth curve, mostly a taper, and so count as one in the binomial error of the share that is held. Of 21 drives the
+    rms scatter is 0.31 of the closed lens's; of five by chance up to 0.31 (1 + 2 / sqrt(2 5)) = 0.5 of it."""
     camera = fisheye(95, pupil_e1=0.00103)
     known = dataclasses.replace(camera, covariance=np.array([[1e-11]]), covariance_parameters=("pupil_e1",))
-    drive = tube_drive(61, 0.96, step=0.02, diameter=0.15, ovality=0.0, density=1500.0, sigma=0.1, camera=camera)
-    path = tmp_path / "drive.mcap"
-    write_survey(path, objects=objects_of(seen_by_another_pupil(drive), profile=known, seed=61, jitter=0.0003))
-    right, known_for_all = [], measure_module.assumed
-    for about in (known_for_all, lambda camera, metric: camera):
-        monkeypatch.setattr(measure_module, "assumed", about)
-        table = measure(Survey.open(path), pictures=False, threads=2).measured[0].tube.stations
-        error = table["d_mean"] / 0.15 - 1
-        inside = np.abs(error) < 1.96 * np.hypot(table["d_mean_sigma"], table["d_mean_systematic"]) / 0.15
-        right.append((error.std(), inside.mean()))
-    assert right[0][0] < 0.004 and right[0][1] == 1.0, "a share of the diameter; of the stations"
-    assert right[1][0] > 0.008 and right[1][1] < 0.7
+    known_for_all, drives, held, variance = measure_module.assumed, range(61, 66), [], []
+    for seed in drives:
+        drive = tube_drive(seed, 0.96, step=0.02, diameter=0.15, ovality=0.0, density=1500.0, sigma=0.1, camera=camera)
+        path = tmp_path / f"{seed}.mcap"
+        write_survey(path, objects=objects_of(seen_by_another_pupil(drive), profile=known, seed=seed, jitter=0.0003))
+        for about in (known_for_all, lambda camera, metric: camera):
+            monkeypatch.setattr(measure_module, "assumed", about)
+            table = measure(Survey.open(path), pictures=False, threads=2).measured[0].tube.stations
+            error = table["d_mean"] / 0.15 - 1
+            sigma = np.hypot(table["d_mean_sigma"], table["d_mean_systematic"]) / 0.15
+            held.append((np.abs(error) < 1.96 * sigma).mean())
+            variance.append(error.var())
+    (held_open, held_closed), (scatter_open, scatter_closed) = (
+        np.reshape(held, (-1, 2)).mean(axis=0),
+        np.sqrt(np.reshape(variance, (-1, 2)).mean(axis=0)),
+    )
+    least = 0.95 - np.sqrt(0.95 * 0.05 / len(drives))
+    assert held_open >= least and held_closed < least
+    assert scatter_open < 0.5 * scatter_closed and scatter_closed > 0.008
 
 
 def test_the_cameras_part_of_ovality_is_what_another_camera_would_measure(tmp_path):
