@@ -162,10 +162,9 @@ def _figures(document: dict[str, Any]) -> list[tuple[str, object]]:
     if s["diameter_from_prior"]:
         mean = "given, not measured" if unit == "metre" else "not measured: no scale (lengths in diameters)"
     else:
-        value, own, shared = (
-            length_text(v, unit) for v in (s["d_mean"], Z95 * s["d_mean_sigma"], Z95 * s["d_mean_systematic"])
-        )
-        mean = f"{value} ± {own} (repeatability) ± {shared} (systematic: scale and camera, the same all along)"
+        of_all, most = Z95 * s["d_mean_systematic"], Z95 * s["station_systematic_most"]
+        value, own, shared, there = (length_text(v, unit) for v in (s["d_mean"], Z95 * s["d_mean_sigma"], of_all, most))
+        mean = f"{value} ± {own} (repeatability) ± {shared} (systematic: scale and camera; at stations up to ± {there})"
     span = f"{length_text(s['d_mean_least'], unit)} to {length_text(s['d_mean_most'], unit)}"
     rows: list[tuple[str, object]] = [
         ("status", document["status"]),

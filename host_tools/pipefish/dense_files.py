@@ -149,13 +149,13 @@ def radius_sigmas(summary: dict[str, Any]) -> dict[str, Any]:
     """What the radii of all cells have in common and the sigmas of deviations do not hold, from the summary of
     reconstruction.json:
     radius_sigma    repeatability of the fitted tube, of one place
-    scale_sigma     relative: the scale and the camera; None where neither is known
+    scale_sigma     relative: the scale and the camera, median of the stations; None where neither is known
     """
-    station, shared = summary.get("station_sigma"), summary.get("systematic")
+    station, shared = summary.get("station_sigma"), summary.get("station_systematic")
     prior = summary.get("diameter_from_prior")
     return {
         "radius_sigma": 0.5 * station if station is not None else None,
-        "scale_sigma": shared["relative"] if shared and not prior else None,
+        "scale_sigma": shared / summary["d_mean"] if shared and not prior else None,
     }
 
 

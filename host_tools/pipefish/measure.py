@@ -195,7 +195,6 @@ def _measurement(survey: Survey, readings: Readings, structure: Reconstruction) 
         scale=Scale("none", "diameter", 0.0),
         nominal=(survey.start.nominal_diameter_m if survey.start else 0.0) or None,
         stretches=[],
-        camera_sigma=None,
         residuals=_residuals(readings.tracks, structure, camera),
         backwards=bool(ahead.sum() < 0),
         remarks=list(readings.remarks),
@@ -389,18 +388,18 @@ def _sigmas(m: Measurement) -> None:
     camera nor wheel. Random: what the encoder's noise, the poses and the points leave open, the wheel's scale taken
     out; systematic: that scale, the camera and what is assumed of its pupil."""
     found = {s.segment: diameter_sigma(m.structure, s.segment, s.tube) for s in m.measured}
-    cameras: dict[int, np.ndarray] = {}  # of each stretch, relative, at the stations
     for stretch in m.measured:
         exact, factor, stations = found[stretch.segment], m.factors[stretch.segment], stretch.tube.stations
         stretch.d_mean_sigma = stretch.tube.summary["d_mean_sigma"]
         if exact is None:
             continue
         d = stations["d_mean"]
-        if exact.camera is not None and m.camera.covariance is not None:  # what is assumed of others has no radial part
-            cameras[stretch.segment] = factor * np.interp(stations["s"], exact.s, exact.camera) / d
-            stretch.camera = cameras[stretch.segment]
         # Where the mean diameter is the scale, a station's is known as far as the structure's own scale holds along it.
-        by_prior = m.scale.diameter_from_prior
+        by_prior, mean = m.scale.diameter_from_prior, stretch.tube.summary["d_mean"]
+        if exact.mean_camera is not None and m.camera.covariance is not None:  # of others no radial part is assumed
+            camera = exact.wander_camera if by_prior else exact.camera
+            stretch.camera = factor * np.interp(stations["s"], exact.s, camera) / d
+            stretch.mean_camera = 0.0 if by_prior else factor * exact.mean_camera / mean
         wheel = 0.0 if by_prior else float(m.structure.scale_sigma or 0.0)  # 0 where there is none in the adjustment
         random = np.interp(stations["s"], exact.s, exact.wander if by_prior else exact.random)
         beyond = np.maximum(0, (factor * random) ** 2 - (wheel * d) ** 2)
@@ -414,10 +413,8 @@ def _sigmas(m: Measurement) -> None:
             stations["reduction_nominal_sigma"] = stations["d_min_sigma"] / stretch.tube.nominal
         if by_prior:
             continue
-        mean = stretch.tube.summary["d_mean"]
         rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
-    m.camera_sigma = float(np.nanmedian(np.concatenate(list(cameras.values())))) if cameras else None
     if m.scale.unit == "metre" and not m.scale.diameter_from_prior:  # else it is in what the diameter was set to
         seen = m.residuals.inlier
         m.pupil_sigma = pupil_sigma(

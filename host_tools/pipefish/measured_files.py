@@ -80,6 +80,8 @@ def summary(m: Measurement) -> dict[str, Any]:
         "d_mean_least": float(np.nanmin(d)),
         "d_mean_most": float(np.nanmax(d)),
         "station_sigma": float(np.nanmedian(table["d_mean_sigma"])),
+        "station_systematic": float(np.nanmedian(table["d_mean_systematic"])),
+        "station_systematic_most": float(np.nanmax(table["d_mean_systematic"])),
         "systematic": {
             "relative": m.systematic,
             "scale": m.scale.sigma,

@@ -72,7 +72,7 @@ def whole_sigma(document: dict[str, Any], quantity: str) -> np.ndarray:
     if quantity in ("d_max", "d_min"):
         return np.hypot(sigma, column(document, f"{quantity}_systematic"))
     if quantity == "reduction_nominal":
-        return np.sqrt(sigma**2 + scale["systematic"]["relative"] ** 2 + (0.5 * camera) ** 2)
+        return np.hypot(sigma, column(document, "d_min_systematic") / (scale["nominal"] or math.nan))
     return sigma
 
 

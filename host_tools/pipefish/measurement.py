@@ -22,7 +22,8 @@ OUTLIER_SIGMA = 3.5  # residuals beyond do not count in the quality page and are
 @dataclass
 class Stretch:
     """One segment of the structure, its frames and its tube. chainage = origin + sign * s. d_mean_sigma: random, of the
-    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known).
+    mean diameter over all of it. camera: relative sigma by the camera's covariance, at the stations (0: not known);
+    mean_camera: of their mean, in which errors that change their sign along the pipe cancel; None: not known.
     water: see `tube_water.mirrored`, whose points are not in the tube."""
 
     segment: int
@@ -32,6 +33,7 @@ class Stretch:
     sign: int
     d_mean_sigma: float = math.nan
     camera: Any = 0.0
+    mean_camera: float | None = None
     water: list[dict[str, Any]] = field(default_factory=list)
 
     def chainage(self, s: Any) -> Any:
@@ -66,9 +68,8 @@ class Measurement:
     encoder     (K,) metres by the encoder, NaN where unknown; None without a usable one. Without the jitter of its
                 readings where they have one
     structure   in the unit of `scale`
-    camera_sigma   relative systematic sigma of a diameter by the camera's covariance (median of the stations); None:
-                not known
-    pupil_sigma    the same by a pupil shift that the profile does not know, and so assumed
+    pupil_sigma    relative systematic sigma of a diameter by a pupil shift that the profile does not know, and so
+                assumed
     health      what the survey says of its profile
     repeats     how often the wall looks the same elsewhere; None: its pictures were not looked at
     jumped      frames at which tracks had gone on to the next repeat, and were cut
@@ -85,7 +86,6 @@ class Measurement:
     scale: Scale
     nominal: float | None
     stretches: list[Stretch]
-    camera_sigma: float | None
     residuals: Residuals
     backwards: bool
     pupil_sigma: float = 0.0
@@ -101,8 +101,15 @@ class Measurement:
         return [s for s in self.stretches if s.tube.status == "ok"]
 
     @property
+    def camera_sigma(self) -> float | None:
+        """Relative systematic sigma of mean_diameter() by the camera's covariance, 0 where that is given; None: not
+        known. What is wrong with a camera is wrong in all stretches: their sigmas add up as they are."""
+        known = [(s.tube.summary["measured"], s.mean_camera) for s in self.measured if s.mean_camera is not None]
+        return float(np.average([c for _, c in known], weights=[w for w, _ in known])) if known else None
+
+    @property
     def systematic(self) -> float:
-        """Relative sigma that all diameters share."""
+        """Relative sigma of mean_diameter(), beside its random one. That of a station is in its own columns."""
         return math.hypot(self.scale.sigma, self.camera_sigma or 0.0, self.pupil_sigma)
 
     @property

@@ -128,12 +128,12 @@ class Report(Charts):
         return " and ".join(words.get(name, name) for name in used)
 
     def camera_text(self) -> str:
-        """What the camera's calibration leaves open in all diameters."""
+        """What the camera's calibration leaves open in the mean diameter."""
         camera = self.summary["systematic"]["camera"]
         return f"± {Z95 * 100 * camera:.2f} %" if camera is not None else "unknown: the profile has no covariance"
 
     def pupil_text(self) -> str:
-        """What the pupil's shift leaves open in all diameters. Documents of older versions have none."""
+        """What the pupil's shift leaves open in the mean diameter. Documents of older versions have none."""
         if "pupil" not in self.summary["systematic"]:
             return "not counted by the version that measured"
         pupil = self.summary["systematic"]["pupil"]
@@ -148,17 +148,20 @@ class Report(Charts):
         if s["diameter_from_prior"]:
             why = "the scale is the given diameter" if self.unit == "metre" else "there is no scale"
             rows = [("mean diameter", f"not measured: {why}")]
+            if s["systematic"]["camera"] is None:
+                rows.append(("camera, by its calibration", self.camera_text()))
         else:
             rows = [
                 ("repeatability of the mean diameter", f"± {Z95 * 1000 * s['d_mean_sigma']:.2f} mm"),
                 ("repeatability of one station", f"± {Z95 * 1000 * s['station_sigma']:.2f} mm"),
-                ("systematic, shared by all diameters", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
+                ("systematic, of the mean diameter", f"± {Z95 * 1000 * s['d_mean_systematic']:.2f} mm"),
                 (f"  of which scale ({self.scale_source()})", f"± {Z95 * 100 * s['systematic']['scale']:.2f} %"),
+                ("  of which camera, by its calibration", self.camera_text()),
+                ("  of which pupil shift", self.pupil_text()),
             ]
-        rows += [
-            ("  of which camera, by its calibration", self.camera_text()),
-            ("  of which pupil shift", self.pupil_text()),
-        ]
+        if self.unit == "metre" and "station_systematic_most" in s:  # documents of older versions have none
+            median, most = (1000 * Z95 * s[k] for k in ("station_systematic", "station_systematic_most"))
+            rows.append(("systematic, of one station", f"± {median:.2f} mm, up to ± {most:.2f}"))
         if "ovality_sigma" in s:
             rows.append(
                 ("ovality at one station, repeatability", f"± {Z95 * 100 * s['ovality_sigma']:.2f} percentage points")

@@ -136,13 +136,14 @@ class Charts:
                 "line": {"dash": "dot", "width": 1.5, "color": "#888"},
             }
             shapes.append({**line, "y0": 1000 * self.summary["nominal"], "y1": 1000 * self.summary["nominal"]})
-        shared = Z95 * self.factor * self.summary["d_mean_systematic"]
+        shared = Z95 * self.factor * column(self.document, "d_mean_systematic")
         digits = 1 if self.unit == "metre" else 4
+        ends = dict.fromkeys(f"{value:.{digits}f}" for value in (np.nanmin(shared), np.nanmax(shared)))
         return {
             "id": "diameter",
             "title": "Diameter along the pipe",
-            "text": "Bands: repeatability. What all values share (scale, camera) is not in them: "
-            f"± {shared:.{digits}f} {self.short}. Dotted: nominal. Grey: not measured. Names in the legend switch on "
+            "text": "Bands: repeatability. What is wrong with the scale or the camera is not in them: "
+            f"± {' to '.join(ends)} {self.short}. Dotted: nominal. Grey: not measured. Names in the legend switch on "
             "and off.",
             "data": data,
             "layout": {

@@ -24,9 +24,9 @@ class DiameterSigma:
     """Of the mean diameter along a stretch, in the structure's own unit.
 
     s (K,); random (K,) standard deviations, the encoder's scale included; camera
-    (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all;
-    wander (K,) random, of the difference to the mean over all in proportion: what is left where that mean is the scale
-    """
+    (K,) what the camera's covariance adds, None where it is not known; mean_random, mean_camera: of the mean over all,
+    where errors that change their sign on the way cancel; wander, wander_camera (K,) of the difference to the mean over
+    all in proportion: what is left where that mean is the scale"""
 
     s: np.ndarray
     random: np.ndarray
@@ -34,6 +34,7 @@ class DiameterSigma:
     mean_random: float
     mean_camera: float | None
     wander: np.ndarray
+    wander_camera: np.ndarray | None
 
 
 def shared_of(structure: Reconstruction, segment: int, factor: float = 1.0, ellipse: float = 1.0) -> Shared:
@@ -73,36 +74,42 @@ def diameter_function(tube: Tube, s: float, diameter: float) -> tuple[np.ndarray
 def diameter_sigma(structure: Reconstruction, segment: int, tube: Tube) -> DiameterSigma | None:
     """None where no station has enough points. The tube's points are those of the segment, in their order."""
     first = int(np.searchsorted(structure.point_segment, segment))
+    known_camera = structure.parts[segment][1] is not None
+
+    def variances(on: np.ndarray, by: np.ndarray) -> tuple[float, float]:
+        """Of a function of points: random, and what the camera adds."""
+        random = float(structure.functions_covariance(first + on, by[None])[0, 0])
+        if not known_camera:
+            return random, 0.0
+        return random, float(structure.functions_covariance(first + on, by[None], systematic=True)[0, 0]) - random
+
     table = tube.stations
     known = np.flatnonzero(np.isfinite(table["d_mean"]))
     chosen = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), MOST)).round().astype(int))]
     total = np.zeros((len(tube.points["s"]), 3))
-    places, random, camera, functions = [], [], [], []
-    whole = structure.parts[segment][1] is not None
+    places, own, functions, weights = [], [], [], []
     for k in chosen:
         on, by = diameter_function(tube, float(table["s"][k]), float(table["d_mean"][k]))
         if not len(on):
             continue
-        total[on] += by
+        weights.append(float(table["d_mean_sigma"][k]) ** -2)  # in the mean, as the tube's summary has it
+        total[on] += weights[-1] * by
         functions.append((on, by, float(table["d_mean"][k])))
         places.append(float(table["s"][k]))
-        random.append(float(structure.functions_covariance(first + on, by[None])[0, 0]))
-        if whole:
-            camera.append(float(structure.functions_covariance(first + on, by[None], systematic=True)[0, 0]))
+        own.append(variances(on, by))
     if not places:
         return None
     on = np.flatnonzero(total.any(axis=1))
-    by = total[None, on] / len(places)
-    mean = float(structure.functions_covariance(first + on, by)[0, 0])
-    added = added_mean = None
-    if whole:
-        added = np.sqrt(np.maximum(0, np.array(camera) - random))
-        added_mean = float(structure.functions_covariance(first + on, by, systematic=True)[0, 0]) - mean
-        added_mean = float(np.sqrt(max(0.0, added_mean)))
-    across = np.mean([d for _, _, d in functions])
+    by = total[on] / sum(weights)
+    across = np.average([d for _, _, d in functions], weights=weights)
     wander = []
     for there, slope, d in functions:
-        rest = by[0] * (-d / across)
+        rest = by * (-d / across)
         rest[np.searchsorted(on, there)] += slope
-        wander.append(float(structure.functions_covariance(first + on, rest[None])[0, 0]))
-    return DiameterSigma(np.array(places), np.sqrt(random), added, float(np.sqrt(mean)), added_mean, np.sqrt(wander))
+        wander.append(variances(on, rest))
+    (random, camera), (mean_random, mean_camera), (apart, apart_camera) = (
+        np.sqrt(np.maximum(0, np.transpose(v))) for v in (own, variances(on, by), wander)
+    )
+    if not known_camera:
+        return DiameterSigma(np.array(places), random, None, float(mean_random), None, apart, None)
+    return DiameterSigma(np.array(places), random, camera, float(mean_random), float(mean_camera), apart, apart_camera)

@@ -256,6 +256,8 @@ def test_the_terminal_says_once_what_plus_minus_is(out):
     text, s = "\n".join(lines.values()), document["summary"]
     assert text.count("95 %") == 1 and "sigma" not in text and "+-" not in text
     assert f"± {1960 * s['d_mean_sigma']:.1f} mm (repeatability) ± {1960 * s['d_mean_systematic']:.1f} mm" in text
+    most = max(document["stations"]["d_mean_systematic"])
+    assert s["station_systematic_most"] == most and f"at stations up to ± {1960 * most:.1f} mm)" in text
     k = document["stations"]["ovality"].index(s["ovality_most"])
     half = 196 * np.hypot(*(document["stations"][f"ovality_{n}"][k] for n in ("sigma", "systematic")))
     assert f"most {100 * s['ovality_most']:.2f} ± {half:.2f} % at" in text
@@ -532,6 +534,19 @@ def test_limits_hold_the_interval_against_the_bound(out):
     document["summary"]["nominal"] = None
     document["stations"]["reduction_nominal"] = [None] * len(document["stations"]["s"])
     assert "no nominal diameter was given" in verdict(document, "reduction_nominal", 5)["text"]
+
+
+def test_a_limit_of_the_reduction_counts_what_is_systematic_at_its_own_station(out):
+    """What a camera leaves open at the ends of a drive is not in the mean's, and was counted for that."""
+    from pipefish.measured_limits import whole_sigma
+    from pipefish.measured_texts import read_measured
+
+    document = read_measured(out)
+    stations = document["stations"]
+    stations["d_min_systematic"] = np.linspace(0.001, 0.004, len(stations["s"])).tolist()
+    random, here = (np.array(stations[name], float) for name in ("reduction_nominal_sigma", "d_min_systematic"))
+    assert document["summary"]["nominal"] == 0.3
+    assert whole_sigma(document, "reduction_nominal") == pytest.approx(np.hypot(random, here / 0.3), nan_ok=True)
 
 
 def test_texts_of_the_survey_cannot_break_the_report(out, tmp_path):

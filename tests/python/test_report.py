@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import json
 import re
@@ -197,6 +198,19 @@ def test_bands_of_ovality_hold_what_the_limits_count(measured):
         assert half.min() > 100 * Z95 * 0.0049  # half of the camera's part at least
         seen += 1
     assert seen >= 3
+
+
+def test_the_page_says_what_is_systematic_at_stations_beside_what_is_in_the_mean(measured, tmp_path):
+    """A lens that is a little wrong tapers a pipe: the two ends by more than the mean."""
+    folder = shutil.copytree(measured / "out", tmp_path / "out")
+    document = json.loads((folder / "reconstruction.json").read_text())
+    summary, stations = document["summary"], document["stations"]
+    stations["d_mean_systematic"] = np.linspace(0.0005, 0.002, len(stations["s"])).tolist()
+    summary |= {"d_mean_systematic": 0.0004, "station_systematic": 0.001, "station_systematic_most": 0.002}
+    (folder / "reconstruction.json").write_text(json.dumps(document))
+    assert main(["report", str(folder), "-o", str(tmp_path / "r.html")]) == 0
+    text = html.unescape((tmp_path / "r.html").read_text())
+    assert "± 0.78 mm" in text and "± 1.96 mm, up to ± 3.92" in text and "± 1.0 to 3.9 mm. Dotted" in text
 
 
 def test_commands_in_texts_are_shown_as_code(measured, tmp_path):

@@ -27,11 +27,13 @@ from tube_tracks import Drive, fisheye, tube_drive
 TRUE = 0.3 * (1 + 0.015**2 / 4)  # perimeter / pi of the drives' ellipse
 
 
-def measured(folder: Path, seed: int, profile=None, camera=None, length: float = 2.0) -> Measurement:
+def measured(
+    folder: Path, seed: int, profile=None, camera=None, length: float = 2.0, encoder: bool = True, **given: float
+) -> Measurement:
     drive = tube_drive(seed, length, density=500.0, camera=camera)
     path = folder / f"{seed}-{len(list(folder.iterdir()))}.mcap"
-    write_survey(path, objects=objects_of(drive, profile=profile, seed=seed))
-    return measure(Survey.open(path), threads=2)
+    write_survey(path, objects=objects_of(drive, profile=profile, seed=seed, encoder=encoder))
+    return measure(Survey.open(path), threads=2, **given)
 
 
 def test_station_intervals_hold_the_truth_and_are_no_wider_than_the_scatter_asks(tmp_path):
@@ -108,7 +110,36 @@ def test_the_cameras_part_is_what_another_camera_would_measure(tmp_path, monkeyp
     stated = np.interp(s, table["s"], camera)
     assert np.median(stated) == pytest.approx(np.median(moved), rel=0.4)
     assert (np.abs(stated - moved) < 0.5 * moved + 1e-4).all(), "station by station: it changes its sign on the way"
-    assert m.camera_sigma == pytest.approx(np.median(camera)) and 0.05 * sigma < m.camera_sigma < 2 * sigma
+
+
+@pytest.mark.parametrize("encoder", [True, False])
+def test_the_cameras_part_of_the_mean_is_what_other_cameras_move_the_mean_by(tmp_path, monkeypatch, encoder):
+    """Two coefficients of the radius off by one sigma each, one after the other: diameters move by as much as is
+    stated, station by station. Their mean moves by less, since errors cancel along the pipe, and not at all where it is
+    given: there a station's part is that of its difference to it. Small sigmas: of large ones the survey tells a part.
+    """
+    monkeypatch.setattr(lens_ripple, "LENS_RADIAL_PX", 1e-6)
+    names, sigma = ("k2", "k3"), 3e-5
+    known = dataclasses.replace(fisheye(95), covariance=sigma**2 * np.eye(2), covariance_parameters=names)
+    m = measured(tmp_path, 61, profile=known, encoder=encoder, diameter=TRUE)
+    table = m.measured[0].tube.stations
+    value, random = mean_diameter(m)
+    moved, mean_moved = np.zeros(len(table["s"])), 0.0
+    for name in names:
+        profile = dataclasses.replace(known, **{name: getattr(known, name) + sigma})
+        other = measured(tmp_path, 61, profile=profile, encoder=encoder, diameter=TRUE)
+        there = other.measured[0].tube.stations
+        moved += (np.interp(table["s"], there["s"], there["d_mean"]) / table["d_mean"] - 1) ** 2
+        mean_moved += (mean_diameter(other)[0] / value - 1) ** 2
+    stated, moved, mean_moved = m.measured[0].camera, np.sqrt(moved), np.sqrt(mean_moved)
+    assert (np.abs(stated - moved) < 0.2 * moved + 3e-5).all()
+    if not encoder:
+        assert m.scale.diameter_from_prior and m.camera_sigma == m.systematic == 0.0
+        assert mean_moved < 1e-6 and stated.max() > 0.003 and stated.min() < 0.0005
+        return
+    assert m.camera_sigma == pytest.approx(mean_moved, rel=0.3) and m.camera_sigma < 0.7 * np.median(stated)
+    check = next(row for row in m.scale.sources if row["name"] == "diameter")
+    assert check["sigma"] == pytest.approx(np.sqrt((random / value) ** 2 + m.camera_sigma**2 + m.pupil_sigma**2))
 
 
 def test_a_pupil_that_the_profile_does_not_know_is_in_the_systematic_part(tmp_path):
@@ -140,24 +171,32 @@ def seen_by_another_pupil(drive: Drive) -> Drive:
     return dataclasses.replace(drive, tracks=dataclasses.replace(tracks, pixels=pixels))
 
 
-def test_a_pupil_that_moves_otherwise_than_the_profiles_tapers_no_narrow_pipe(tmp_path, monkeypatch):
+def test_with_the_lens_open_another_pupil_tapers_narrow_pipes_by_less_and_within_their_intervals(tmp_path, monkeypatch):
     """A wall 75 mm away, a profile as a calibration has it: right at the rim, up to 0.2 mm of pupil wrong within, and
-    sure of itself. A round pipe is measured as one; without what the profile does not know of its lens it tapers
-    beyond its intervals."""
+    sure of itself. Five drives together, since they differ (0.09 to 0.75 % of scatter): stations of one drive are one
+    smooth curve, mostly a taper, and so count as one in the binomial error of the share that is held. Of 21 drives the
+    rms scatter is 0.31 of the closed lens's; of five by chance up to 0.31 (1 + 2 / sqrt(2 5)) = 0.5 of it."""
     camera = fisheye(95, pupil_e1=0.00103)
     known = dataclasses.replace(camera, covariance=np.array([[1e-11]]), covariance_parameters=("pupil_e1",))
-    drive = tube_drive(61, 0.96, step=0.02, diameter=0.15, ovality=0.0, density=1500.0, sigma=0.1, camera=camera)
-    path = tmp_path / "drive.mcap"
-    write_survey(path, objects=objects_of(seen_by_another_pupil(drive), profile=known, seed=61, jitter=0.0003))
-    right, known_for_all = [], measure_module.assumed
-    for about in (known_for_all, lambda camera, metric: camera):
-        monkeypatch.setattr(measure_module, "assumed", about)
-        table = measure(Survey.open(path), pictures=False, threads=2).measured[0].tube.stations
-        error = table["d_mean"] / 0.15 - 1
-        inside = np.abs(error) < 1.96 * np.hypot(table["d_mean_sigma"], table["d_mean_systematic"]) / 0.15
-        right.append((error.std(), inside.mean()))
-    assert right[0][0] < 0.004 and right[0][1] == 1.0, "a share of the diameter; of the stations"
-    assert right[1][0] > 0.008 and right[1][1] < 0.7
+    known_for_all, drives, held, variance = measure_module.assumed, range(61, 66), [], []
+    for seed in drives:
+        drive = tube_drive(seed, 0.96, step=0.02, diameter=0.15, ovality=0.0, density=1500.0, sigma=0.1, camera=camera)
+        path = tmp_path / f"{seed}.mcap"
+        write_survey(path, objects=objects_of(seen_by_another_pupil(drive), profile=known, seed=seed, jitter=0.0003))
+        for about in (known_for_all, lambda camera, metric: camera):
+            monkeypatch.setattr(measure_module, "assumed", about)
+            table = measure(Survey.open(path), pictures=False, threads=2).measured[0].tube.stations
+            error = table["d_mean"] / 0.15 - 1
+            sigma = np.hypot(table["d_mean_sigma"], table["d_mean_systematic"]) / 0.15
+            held.append((np.abs(error) < 1.96 * sigma).mean())
+            variance.append(error.var())
+    (held_open, held_closed), (scatter_open, scatter_closed) = (
+        np.reshape(held, (-1, 2)).mean(axis=0),
+        np.sqrt(np.reshape(variance, (-1, 2)).mean(axis=0)),
+    )
+    least = 0.95 - np.sqrt(0.95 * 0.05 / len(drives))
+    assert held_open >= least and held_closed < least
+    assert scatter_open < 0.5 * scatter_closed and scatter_closed > 0.008
 
 
 def test_the_cameras_part_of_ovality_is_what_another_camera_would_measure(tmp_path):
