@@ -28,7 +28,7 @@ from accept_rows import Row, at_least, at_most, exactly, figure, kept_series, pr
 from calib_data_sets import jy_stereo, ov_plane  # noqa: E402
 from pipefish.camera import Camera  # noqa: E402
 from pipefish.demo import find_programs, survey_over_the_line  # noqa: E402
-from pipefish.health import BUDGET, FALSE_ALARM  # noqa: E402
+from pipefish.health import BUDGET, FALSE_ALARM, WORDS  # noqa: E402
 from pipefish.matching_files import read_grey  # noqa: E402
 from pipefish.measure import measure  # noqa: E402
 from pipefish.selfcal import self_calibrate  # noqa: E402
@@ -253,9 +253,8 @@ def check_changes(case: str, count: int) -> Iterator[Row]:
         rows = kept_series(KEEP, f"health_{case}_{change}", count, lambda s, x=change: health_of(s, case, x, **FEWER))
         share = sum(r["verdict"].startswith("drifted") for r in rows) / len(rows)
         yield at_least(f"health.{case}_{change}_detected", share, 0.95)
-        yield at_least(
-            f"health.{case}_{change}_named", sum(f"{name} changed by" in r["text"] for r in rows) / len(rows), 0.95
-        )
+        named = sum(f"{WORDS[name]} changed by" in r["text"] for r in rows) / len(rows)
+        yield at_least(f"health.{case}_{change}_named", named, 0.95)
         off = [abs(r["changes"][name][0] - true) / r["changes"][name][1] for r in rows]
         yield at_least(f"health.{case}_{change}_within_3_sigma", sum(o < 3 for o in off) / len(rows), 0.95)
 
