@@ -259,7 +259,9 @@ static void run_session(uint64_t seed)
             world_restart(&w, (uint32_t)world_random(&w, 2));
         pf_sim_line_connect(w.line, true);
     }
-    expect_done(seed, 600000 * WORLD_MS);
+    /* To end what hangs, not to judge: with 1e-3 a bit and 30 % of frames lost one in ten of the largest frames passes,
+     * its acknowledgement as seldom, at 115200 baud. The slowest of some thousand lines takes 20 minutes. */
+    expect_done(seed, 4800000 * WORLD_MS);
 }
 
 static uint64_t first_session = 1000,
@@ -298,7 +300,7 @@ static void test_late_answers_are_waited_for(void)
 
 /* ---- priorities ---- */
 
-/* A slow line full of bulk and previews: status still comes, and and bulk keeps its half. */
+/* A slow line full of bulk and previews: status still comes, and bulk keeps its half. */
 static void test_latest_gets_through_a_saturated_line(void)
 {
     begin(&(pf_sim_line_config){.baud = 115200, .fifo = 1100, .seed = 5});
