@@ -13,20 +13,32 @@
 #define ROW_MAX 512u
 
 struct pf_index {
-    int fd;
-    bool has_failed;
+    int fd; /* -1: it could not be written any more */
+    off_t size;
     char path[PF_CONFIG_TEXT_MAX + 32];
 };
 
 static const char headings[] =
     "sequence,time_ns,encoder_count,roll_rad,pitch_rad,attitude_sigma_rad,exposure_us,gain,lamp,sha256\n";
 
+/* A row that has no room leaves no part of it behind. */
 static bool put(pf_index *index, const char *text, size_t n)
 {
     ssize_t done = write(index->fd, text, n);
-    if (done != (ssize_t)n)
-        errno = done < 0 ? errno : ENOSPC;
-    return done == (ssize_t)n;
+    if (done == (ssize_t)n) {
+        index->size += done;
+        return true;
+    }
+    const int why = done < 0 ? errno : ENOSPC;
+    (void)!ftruncate(index->fd, index->size);
+    errno = why;
+    return false;
+}
+
+/* What is wrong with the medium, and not with the setting, is no reason not to survey: it may happen at any start. */
+static bool is_of_the_medium(int why)
+{
+    return why == ENOSPC || why == EDQUOT || why == EROFS || why == EIO;
 }
 
 bool pf_index_open(pf_index **index, const char *folder, const uint8_t survey_id[16], uint32_t boot, char *error,
@@ -41,9 +53,13 @@ bool pf_index_open(pf_index **index, const char *folder, const uint8_t survey_id
                    survey_id[2], survey_id[3], boot);
     i->fd = open(i->path, O_WRONLY | O_CREAT | O_TRUNC | O_APPEND | O_CLOEXEC, 0644);
     if (i->fd < 0 || !put(i, headings, sizeof headings - 1)) {
-        (void)snprintf(error, n, "camera.index: %s: %s", i->path, strerror(errno));
+        const int why = errno;
+        (void)snprintf(error, n, "camera.index: %s: %s", i->path, strerror(why));
         pf_index_close(i);
-        return false;
+        *index = NULL;
+        if (is_of_the_medium(why))
+            pf_log(PF_LOG_ERROR, "%s; the frames of this start are not listed", error);
+        return is_of_the_medium(why);
     }
     *index = i;
     return true;
@@ -61,6 +77,8 @@ void pf_index_add(pf_index *index, const pf_shot *shot)
 {
     const pf_msg_telemetry *t = &shot->telemetry;
     char row[ROW_MAX];
+    if (index->fd < 0)
+        return;
     size_t n = (size_t)snprintf(row, sizeof row, "%" PRIu64 ",%" PRIu64 ",", shot->frame.sequence, shot->frame.time_ns);
     if (t->has_encoder)
         n += (size_t)snprintf(row + n, sizeof row - n, "%" PRId64, t->encoder_count);
@@ -75,10 +93,11 @@ void pf_index_add(pf_index *index, const pf_shot *shot)
     for (size_t i = 0; i < sizeof shot->frame.sha256; i++)
         n += (size_t)snprintf(row + n, sizeof row - n, "%02x", shot->frame.sha256[i]);
     row[n++] = '\n';
-    if (!put(index, row, n) && !index->has_failed) {
-        index->has_failed = true;
+    if (!put(index, row, n)) {
         pf_log(PF_LOG_ERROR, "camera.index: %s: %s; rows are missing from frame %" PRIu64 " on", index->path,
                strerror(errno), shot->frame.sequence);
+        (void)close(index->fd);
+        index->fd = -1;
     }
 }
 

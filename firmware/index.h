@@ -8,11 +8,13 @@
 
 typedef struct pf_index pf_index;
 
-/* Begins the file FOLDER/<first 8 digits of the survey's id>-<boot, 3 digits>.csv. False: error[n] names it. */
+/* Begins the file FOLDER/<first 8 digits of the survey's id>-<boot, 3 digits>.csv. On a medium that takes none now that
+ * is told in the log, and *index is NULL. False: error[n] names it. */
 bool pf_index_open(pf_index **index, const char *folder, const uint8_t survey_id[16], uint32_t boot, char *error,
                    size_t n);
 
-/* Adds a row in one write; its frame must have a hash. A medium that fails is told once, in the log. */
+/* Adds a row in one write; its frame must have a hash. A medium that fails is told in the log, and takes no more: what
+ * is there are all frames up to one. */
 void pf_index_add(pf_index *index, const pf_shot *shot);
 
 void pf_index_close(pf_index *index); /* NULL is allowed */

@@ -117,9 +117,10 @@ static const char *parse_line(parser *p, pf_ini_handler handler, void *user, cha
 bool pf_ini_parse(const char *text, size_t n, const char *file, pf_ini_handler handler, void *user, char *error,
                   size_t error_n)
 {
+    static const char mark[] = "\xEF\xBB\xBF"; /* of UTF-8, which some editors put before the first line */
     parser p = {.number = 0};
     char detail[1024];
-    size_t at = 0;
+    size_t at = n >= 3 && memcmp(text, mark, 3) == 0 ? 3 : 0;
 
     while (at < n) {
         const char *end = memchr(text + at, '\n', n - at);

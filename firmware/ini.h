@@ -1,5 +1,5 @@
 /* INI files: [section], key = value, comments after # or ; at the start of a line or after white space. A value may
- * stand in double quotes to keep spaces, # and ; in it.
+ * stand in double quotes to keep spaces, # and ; in it. Lines may end as Windows ends them, behind a byte order mark.
  */
 #ifndef PIPEFISHD_INI_H
 #define PIPEFISHD_INI_H

@@ -1,5 +1,6 @@
 #include "keeper.h"
 
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
@@ -105,16 +106,31 @@ static void take_into_use(pf_keeper *k)
     pf_log(PF_LOG_INFO, "profile %s, serial %s%s", k->profile.name, k->profile.serial, is_trial ? ", on trial" : "");
 }
 
-static bool open_store(pf_keeper *k, bool is_read_only, char *error, size_t n)
+/* Counts this start. What cannot be written now keeps nobody from surveying with the profile that is confirmed; one on
+ * trial cannot be counted there, and might keep the daemon from starting for ever. */
+static pf_status count_start(pf_keeper *k, bool can_write)
+{
+    pf_status status = can_write ? pf_profile_store_start(&k->store) : PF_ERR_IO;
+    if (status != PF_ERR_IO)
+        return status;
+    set_problem(k, "the store cannot be written");
+    status = pf_profile_store_open(&k->store, &k->flash, k->scratch);
+    k->store.state.trial = PF_PROFILE_STORE_NONE;
+    return status;
+}
+
+/* is_check: nothing is to change. */
+static bool open_store(pf_keeper *k, bool is_check, char *error, size_t n)
 {
     const char *path = k->daemon->config.camera.profile_store;
-    pf_flash_file_config config = {path, is_read_only};
+    const bool can_write = access(path, W_OK) == 0 || errno != EROFS;
+    pf_flash_file_config config = {path, is_check || !can_write};
     char why[256] = "";
     pf_status status = pf_flash_file_open(&k->flash, &config, why, sizeof why);
     if (status == PF_OK) {
         status = pf_profile_store_open(&k->store, &k->flash, k->scratch);
-        if (status == PF_OK && !is_read_only)
-            status = pf_profile_store_start(&k->store);
+        if (status == PF_OK && !is_check)
+            status = count_start(k, can_write);
         if (status != PF_OK) {
             (void)snprintf(why, sizeof why, "%.200s: %s", path, pf_status_text(status));
             pf_flash_file_close(&k->flash);

@@ -1,5 +1,6 @@
 #include "log.h"
 
+#include <pthread.h>
 #include <stdarg.h>
 #include <stdatomic.h>
 #include <stdio.h>
@@ -8,8 +9,50 @@
 #include <unistd.h>
 
 #include "config.h"
+#include "pipefish/drivers/clock.h"
+
+#define KINDS     256u /* of lines: their formats. More than the daemon has; what has no place is told */
+#define BURST     60u  /* lines of one kind that may follow each other at once */
+#define REFILL_NS UINT64_C(1000000000) /* until one more may */
+
+typedef struct kind {
+    const char *format;
+    uint64_t since_ns; /* when `left` was right */
+    uint32_t left, withheld;
+} kind;
 
 static _Atomic uint32_t most = PF_LOG_INFO;
+static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER; /* of the kinds */
+static kind kinds[KINDS];
+
+/* A switch that chatters or a disk that fails tells itself again and again: on a card a log of that drives out all
+ * else. *withheld: lines of this kind that were not told since the last one. */
+static bool may_tell(const char *format, uint32_t *withheld)
+{
+    const uint64_t now = pf_now();
+    uint32_t i = 0;
+    bool may = true;
+    *withheld = 0;
+    pthread_mutex_lock(&mutex);
+    while (i < KINDS && kinds[i].format != NULL && kinds[i].format != format)
+        i++;
+    if (i < KINDS) {
+        kind *k = &kinds[i];
+        if (k->format == NULL)
+            *k = (kind){.format = format, .since_ns = now, .left = BURST};
+        const uint64_t more = (now - k->since_ns) / REFILL_NS;
+        k->left = more >= BURST - k->left ? BURST : k->left + (uint32_t)more;
+        k->since_ns = k->left == BURST ? now : k->since_ns + more * REFILL_NS;
+        may = k->left > 0;
+        if (may) {
+            k->left--;
+            *withheld = k->withheld;
+        }
+        k->withheld = may ? 0 : k->withheld + 1;
+    }
+    pthread_mutex_unlock(&mutex);
+    return may;
+}
 
 void pf_log_set_level(uint32_t level)
 {
@@ -22,7 +65,8 @@ void pf_log(uint32_t level, const char *format, ...)
     char line[1024];
     size_t n;
     va_list arguments;
-    if (level > most)
+    uint32_t withheld;
+    if (level > most || !may_tell(format, &withheld))
         return;
     /* systemd sets this and reads the priority from the prefix; people need not see it. */
     if (getenv("JOURNAL_STREAM"))
@@ -36,6 +80,9 @@ void pf_log(uint32_t level, const char *format, ...)
     (void)vsnprintf(line + n, sizeof line - n - 1, format, arguments);
     va_end(arguments);
     n = strlen(line);
+    if (withheld > 0)
+        n += (size_t)snprintf(line + n, sizeof line - n, " (and %u more like it)", withheld);
+    n = n < sizeof line - 1 ? n : sizeof line - 2;
     line[n] = '\n';
     /* One write, so that lines of two threads do not mix. */
     if (write(STDERR_FILENO, line, n + 1) < 0)

@@ -196,7 +196,8 @@ static pf_status open_live(pf_daemon *d, char *error, size_t n)
                                      .exposure_max_us = c->camera.exposure_max_us,
                                      .circle_u = has_circle ? (uint32_t)u : 0,
                                      .circle_v = has_circle ? (uint32_t)v : 0,
-                                     .circle_radius = has_circle ? (uint32_t)radius : 0};
+                                     .circle_radius = has_circle ? (uint32_t)radius : 0,
+                                     .alive = pf_pulse_work};
     return (is_v4l2 ? pf_v4l2_open : pf_libcamera_open)(&d->camera, &config, error, n);
 }
 

@@ -5,6 +5,9 @@
 #include <string.h>
 #include <sys/random.h>
 
+#include "config.h"
+#include "log.h"
+
 #define FORMAT 2u  /* of the packed survey: its first byte */
 #define HEADER 61u /* bytes before the ranges */
 
@@ -68,11 +71,12 @@ bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool,
             return true;
         }
         *before = *survey;
-        memset(survey, 0, sizeof *survey);
-    } else if (status == PF_OK) {
-        (void)snprintf(error, n, "the survey that the spool remembers was written by another version");
-        return false;
+    } else if (status == PF_OK || status == PF_ERR_SPACE) { /* it will never be better: nobody waits for that */
+        pf_log(PF_LOG_ERROR, "the survey that the spool remembers is damaged, or of another version: another begins, "
+                             "and that one has no end");
+        status = PF_OK;
     }
+    memset(survey, 0, sizeof *survey);
     if (status != PF_OK && status != PF_ERR_END) {
         (void)snprintf(error, n, "%s", spool->ops->error(spool->self));
         return false;

@@ -23,8 +23,8 @@ typedef struct pf_survey {
 } pf_survey;
 
 /* Goes on with the survey that the spool remembers if it has the same setup, or begins one with a random id. *before
- * gets the survey of another setup that was interrupted, and must be ended; boots = 0: there is none. False: error[n]
- * says what failed. */
+ * gets the survey of another setup that was interrupted, and must be ended; boots = 0: there is none. What the spool
+ * remembers may not be a survey: that is told in the log, and one begins. False: error[n] says what failed. */
 bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,
                     size_t n);
 

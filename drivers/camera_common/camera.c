@@ -287,7 +287,7 @@ static pf_status wait_for_frame(driver *c, uint64_t end, held *h, pf_frame *fram
         }
         if (status == PF_ERR_CHECKSUM) {
             c->damaged++;
-            pf_recovery_frame(&c->recovery, now); /* damaged, but not silent */
+            pf_recovery_damaged(&c->recovery, now);
         } else if (status == PF_ERR_CLOSED) {
             pf_recovery_unplug(&c->recovery);
         } else if (status == PF_ERR_IO) {

@@ -61,7 +61,7 @@ void pf_recovery_init(pf_recovery *r, uint64_t period_ns, uint64_t now_ns)
 {
     memset(r, 0, sizeof *r);
     r->period_ns = period_ns;
-    r->since_ns = r->retry_ns = now_ns;
+    r->since_ns = r->whole_ns = r->retry_ns = now_ns;
 }
 
 static uint64_t patience(const pf_recovery *r)
@@ -85,13 +85,14 @@ pf_recovery_action pf_recovery_next(pf_recovery *r, uint64_t now_ns)
 void pf_recovery_pause(pf_recovery *r, uint64_t elapsed_ns)
 {
     r->since_ns += elapsed_ns;
+    r->whole_ns += elapsed_ns;
 }
 
 static void begin(pf_recovery *r, uint64_t now_ns)
 {
     r->is_open = true;
     r->has_frame = r->is_broken = false;
-    r->since_ns = now_ns;
+    r->since_ns = r->whole_ns = now_ns;
 }
 
 void pf_recovery_opened(pf_recovery *r, uint64_t now_ns)
@@ -122,7 +123,13 @@ void pf_recovery_frame(pf_recovery *r, uint64_t now_ns)
     r->has_frame = true;
     r->fruitless = 0;
     r->was_restarted = r->is_broken = false;
-    r->since_ns = now_ns;
+    r->since_ns = r->whole_ns = now_ns;
+}
+
+void pf_recovery_damaged(pf_recovery *r, uint64_t now_ns)
+{
+    if (now_ns - r->whole_ns < PF_RECOVERY_DAMAGED_NS)
+        r->since_ns = now_ns;
 }
 
 void pf_recovery_error(pf_recovery *r)

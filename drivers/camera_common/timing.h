@@ -42,6 +42,8 @@ void pf_numbering_take(pf_numbering *numbering, uint32_t sequence, uint64_t stam
 #define PF_RECOVERY_FIRST_NS                                                                                           \
     UINT64_C(1500000000)                /* for the first frame of a stream: sensors wake, USB cameras settle */
 #define PF_RECOVERY_LEAST_NS 700000000u /* of silence before a stream counts as stalled, or three periods */
+#define PF_RECOVERY_DAMAGED_NS                                                                                         \
+    UINT64_C(2000000000) /* after a whole frame; damaged ones that come later are no better than silence */
 
 typedef enum pf_recovery_action {
     PF_RECOVERY_WAIT = 0, /* for a frame, or for the time of the next try */
@@ -56,13 +58,13 @@ typedef struct pf_recovery {
     /* private */
     bool is_open, has_frame, was_restarted, is_broken;
     uint32_t fruitless; /* streams without a frame, one after the other */
-    uint64_t period_ns, since_ns, retry_ns;
+    uint64_t period_ns, since_ns, whole_ns, retry_ns;
 } pf_recovery;
 
 void pf_recovery_init(pf_recovery *recovery, uint64_t period_ns, uint64_t now_ns);
 
-/* What to do now. A stream that has been silent is restarted once; if that brings no frame, or the driver refuses, it
- * is reopened. */
+/* What to do now. A stream that has been silent, or gave nothing but damaged frames, is restarted once; if that brings
+ * no frame, or the driver refuses, it is reopened. */
 pf_recovery_action pf_recovery_next(pf_recovery *recovery, uint64_t now_ns);
 
 /* Nobody asked for frames for so long: that is no silence of the camera's. */
@@ -73,8 +75,9 @@ void pf_recovery_opened(pf_recovery *recovery, uint64_t now_ns);
 void pf_recovery_restarted(pf_recovery *recovery, uint64_t now_ns);
 void pf_recovery_closed(pf_recovery *recovery, uint64_t now_ns); /* or could not be opened */
 void pf_recovery_frame(pf_recovery *recovery, uint64_t now_ns);
-void pf_recovery_error(pf_recovery *recovery);  /* the queue has failed: do not wait for silence */
-void pf_recovery_unplug(pf_recovery *recovery); /* the device has gone */
+void pf_recovery_damaged(pf_recovery *recovery, uint64_t now_ns); /* a frame came, and is of no use */
+void pf_recovery_error(pf_recovery *recovery);                    /* the queue has failed: do not wait for silence */
+void pf_recovery_unplug(pf_recovery *recovery);                   /* the device has gone */
 
 #ifdef __cplusplus
 }

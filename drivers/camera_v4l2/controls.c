@@ -5,7 +5,7 @@
 static bool ask(pf_v4l2 *c, uint32_t id, struct v4l2_queryctrl *q)
 {
     *q = (struct v4l2_queryctrl){.id = id};
-    return c->io.ioctl(c->io.self, c->fd, VIDIOC_QUERYCTRL, q) == 0 &&
+    return pf_v4l2_ioctl(c, VIDIOC_QUERYCTRL, q) == 0 &&
            !(q->flags & (V4L2_CTRL_FLAG_DISABLED | V4L2_CTRL_FLAG_READ_ONLY));
 }
 
@@ -22,13 +22,13 @@ static bool query(pf_v4l2 *c, uint32_t id, pf_v4l2_control *control, pf_exposure
 static bool set(pf_v4l2 *c, uint32_t id, int64_t value)
 {
     struct v4l2_control control = {id, (int32_t)value};
-    return c->io.ioctl(c->io.self, c->fd, VIDIOC_S_CTRL, &control) == 0;
+    return pf_v4l2_ioctl(c, VIDIOC_S_CTRL, &control) == 0;
 }
 
 static int64_t get(pf_v4l2 *c, uint32_t id, int64_t fallback)
 {
     struct v4l2_control control = {.id = id};
-    return c->io.ioctl(c->io.self, c->fd, VIDIOC_G_CTRL, &control) == 0 ? control.value : fallback;
+    return pf_v4l2_ioctl(c, VIDIOC_G_CTRL, &control) == 0 ? control.value : fallback;
 }
 
 /* Microseconds of a line of the sensor, for cameras whose exposure counts lines; 0 = it does not tell. */
@@ -37,7 +37,7 @@ static double line_us(pf_v4l2 *c, uint32_t width)
     struct v4l2_ext_control rate = {.id = V4L2_CID_PIXEL_RATE};
     struct v4l2_ext_controls controls = {.which = V4L2_CTRL_WHICH_CUR_VAL, .count = 1, .controls = &rate};
     int64_t blank = get(c, V4L2_CID_HBLANK, -1);
-    if (blank < 0 || c->io.ioctl(c->io.self, c->fd, VIDIOC_G_EXT_CTRLS, &controls) != 0 || rate.value64 <= 0)
+    if (blank < 0 || pf_v4l2_ioctl(c, VIDIOC_G_EXT_CTRLS, &controls) != 0 || rate.value64 <= 0)
         return 0;
     return (double)(blank + width) * 1e6 / (double)rate.value64;
 }

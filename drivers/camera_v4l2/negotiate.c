@@ -66,7 +66,7 @@ static double best_rate(pf_v4l2 *c, uint32_t fourcc, uint32_t width, uint32_t he
     double best = 0;
     for (uint32_t i = 0; i < ENUMERATED_MAX; i++) {
         struct v4l2_frmivalenum e = {.index = i, .pixel_format = fourcc, .width = width, .height = height};
-        if (c->io.ioctl(c->io.self, c->fd, VIDIOC_ENUM_FRAMEINTERVALS, &e) != 0)
+        if (pf_v4l2_ioctl(c, VIDIOC_ENUM_FRAMEINTERVALS, &e) != 0)
             break;
         const struct v4l2_fract *t = e.type == V4L2_FRMIVAL_TYPE_DISCRETE ? &e.discrete : &e.stepwise.min;
         double rate = t->numerator > 0 ? (double)t->denominator / t->numerator : 0;
@@ -100,7 +100,7 @@ static bool has_room(const shape *s, const pf_pixel_format *format)
 static bool can_make(pf_v4l2 *c, const pf_pixel_format *format, uint32_t width, uint32_t height, bool *roomy)
 {
     struct v4l2_format f = make_format(c, format->fourcc, width, height);
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_TRY_FMT, &f) != 0)
+    if (pf_v4l2_ioctl(c, VIDIOC_TRY_FMT, &f) != 0)
         return false;
     const shape s = read_shape(c, &f);
     *roomy = has_room(&s, format);
@@ -118,7 +118,7 @@ static const pf_pixel_format *choose(pf_v4l2 *c, const pf_session_wish *wish, ui
     has[0] = '\0';
     for (uint32_t i = 0; i < ENUMERATED_MAX; i++) {
         struct v4l2_fmtdesc d = {.index = i, .type = c->type};
-        if (c->io.ioctl(c->io.self, c->fd, VIDIOC_ENUM_FMT, &d) != 0)
+        if (pf_v4l2_ioctl(c, VIDIOC_ENUM_FMT, &d) != 0)
             break;
         size_t used = strlen(has);
         (void)snprintf(has + used, has_n - used, " %.4s", (const char *)&d.pixelformat);
@@ -152,9 +152,9 @@ static double set_rate(pf_v4l2 *c, double wish)
     double rate = 0;
     if (wish > 0) {
         p.parm.capture.timeperframe = (struct v4l2_fract){1000, (uint32_t)(wish * 1000 + 0.5)};
-        (void)c->io.ioctl(c->io.self, c->fd, VIDIOC_S_PARM, &p);
+        (void)pf_v4l2_ioctl(c, VIDIOC_S_PARM, &p);
     }
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_G_PARM, &p) == 0 && t->numerator > 0)
+    if (pf_v4l2_ioctl(c, VIDIOC_G_PARM, &p) == 0 && t->numerator > 0)
         rate = (double)t->denominator / (double)t->numerator;
     return rate > 0.01 && rate < 10000 ? rate : wish;
 }

@@ -25,9 +25,16 @@ static struct v4l2_buffer *make_request(const pf_v4l2 *c, request *r, uint32_t i
     return &r->b;
 }
 
+int pf_v4l2_ioctl(pf_v4l2 *c, unsigned long number, void *argument)
+{
+    if (c->alive != NULL)
+        c->alive();
+    return c->io.ioctl(c->io.self, c->fd, number, argument);
+}
+
 pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long number, void *argument, const char *what)
 {
-    if (c->io.ioctl(c->io.self, c->fd, number, argument) == 0)
+    if (pf_v4l2_ioctl(c, number, argument) == 0)
         return PF_OK;
     return pf_fail(c->failure, PF_ERR_IO, "%s: %s: %s", c->device, what, strerror(errno));
 }
@@ -39,7 +46,7 @@ static void queue_all(pf_v4l2 *c)
         pf_v4l2_buffer *b = &c->buffer[i];
         request r;
         if (!b->is_held && !b->is_queued)
-            b->is_queued = c->io.ioctl(c->io.self, c->fd, VIDIOC_QBUF, make_request(c, &r, i)) == 0;
+            b->is_queued = pf_v4l2_ioctl(c, VIDIOC_QBUF, make_request(c, &r, i)) == 0;
     }
 }
 
@@ -47,7 +54,7 @@ static void v4l2_stop(void *self)
 {
     pf_v4l2 *c = self;
     if (c->is_streaming)
-        (void)c->io.ioctl(c->io.self, c->fd, VIDIOC_STREAMOFF, &c->type);
+        (void)pf_v4l2_ioctl(c, VIDIOC_STREAMOFF, &c->type);
     c->is_streaming = false;
     for (uint32_t i = 0; i < c->n; i++)
         c->buffer[i].is_queued = false; /* that is what STREAMOFF does */
@@ -88,7 +95,7 @@ static pf_status map_buffers(pf_v4l2 *c, uint32_t n)
 static pf_status take_buffers(pf_v4l2 *c, uint32_t wish, pf_session_info *info)
 {
     struct v4l2_requestbuffers r = {.count = wish, .type = c->type, .memory = V4L2_MEMORY_MMAP};
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_REQBUFS, &r) != 0)
+    if (pf_v4l2_ioctl(c, VIDIOC_REQBUFS, &r) != 0)
         return pf_fail(c->failure, errno == EBUSY ? PF_ERR_AGAIN : PF_ERR_IO, "%s: gives no buffers: %s", c->device,
                        strerror(errno)); /* busy: another program has it now */
     info->buffers = r.count < PF_SESSION_BUFFERS_MAX ? r.count : PF_SESSION_BUFFERS_MAX;
@@ -144,7 +151,7 @@ static pf_status v4l2_take(void *self, uint32_t timeout_ms, pf_session_frame *fr
     int ready = c->io.wait(c->io.self, c->fd, timeout_ms);
     if (ready == 0)
         return PF_ERR_AGAIN;
-    if (c->io.ioctl(c->io.self, c->fd, VIDIOC_DQBUF, make_request(c, &r, 0)) != 0) {
+    if (pf_v4l2_ioctl(c, VIDIOC_DQBUF, make_request(c, &r, 0)) != 0) {
         if (errno == EAGAIN && ready > 0)
             return PF_ERR_AGAIN;
         return pf_fail(failure, errno == ENODEV ? PF_ERR_CLOSED : PF_ERR_IO, "%s: %s", c->device, strerror(errno));
@@ -248,6 +255,7 @@ pf_status pf_v4l2_open_with(pf_camera_source *source, const pf_camera_config *co
     if (c == NULL)
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "v4l2: no memory"), error, n);
     c->io = *io;
+    c->alive = config->alive;
     c->fd = -1;
     session.self = c;
     return pf_camera_open(source, config, &session, "v4l2", error, n);

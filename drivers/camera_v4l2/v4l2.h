@@ -41,8 +41,9 @@ typedef struct pf_v4l2_control {
 /* A session (camera_common/session.h) on one device. */
 typedef struct pf_v4l2 {
     pf_v4l2_io io;
-    const char *device; /* the wish's */
-    int fd;             /* -1 = not open */
+    void (*alive)(void); /* pf_camera_config */
+    const char *device;  /* the wish's */
+    int fd;              /* -1 = not open */
     bool is_streaming, is_compressed;
     uint32_t type; /* V4L2_BUF_TYPE_VIDEO_CAPTURE or its _MPLANE */
     uint32_t n;
@@ -52,7 +53,10 @@ typedef struct pf_v4l2 {
     pf_failure *failure; /* of the call that is under way */
 } pf_v4l2;
 
-/* ioctl with the device's name in the failure. */
+/* All calls of the device go through it. */
+int pf_v4l2_ioctl(pf_v4l2 *c, unsigned long request, void *argument);
+
+/* The same with the device's name in the failure. */
 pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const char *what);
 
 /* negotiate.c: format, size and rate of an open device. Fills those of *info, or says why not. PF_ERR_AGAIN: it has no

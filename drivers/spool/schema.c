@@ -257,7 +257,8 @@ bool pf_spool_takes_first_page(const char *path)
         return false;
     const uint32_t size = (uint32_t)page[16] << 8 | page[17]; /* 1: 65536 */
     const bool says_size = memcmp(page, magic, sizeof magic) == 0 && (size & (size - 1)) == 0 && size != 0;
-    return (!says_size || size == PF_SPOOL_PAGE) && count_right_pages(path, &names_objects) >= 3;
+    const int right = count_right_pages(path, &names_objects);
+    return !says_size || size == PF_SPOOL_PAGE ? right >= 3 : right == 4 && names_objects;
 }
 
 bool pf_spool_has_first_header(const char *path)

@@ -43,8 +43,8 @@ uint32_t pf_spool_version_of(const char *path);
  * all ones: lost by the flash), or the pages after it are a spool's. Another program's file is left alone. */
 bool pf_spool_was_one(const char *path);
 
-/* Whether its tables lie where pf_spool_first_page() says: its pages are of that size, and three of the four that are
- * to be tables' or indices' are. */
+/* Whether its tables lie where pf_spool_first_page() says: three of the four pages that are to be tables' or indices'
+ * are; where its header says that its pages are of another size, all four, and the name in one of them. */
 bool pf_spool_takes_first_page(const char *path);
 
 /* Whether its header is that of pf_spool_first_page(), but for its counts. */

@@ -50,6 +50,28 @@ def test_the_package_brings_the_unit_the_user_and_the_settings(package: Path, tm
         assert (tmp_path / "DEBIAN" / script).stat().st_mode & 0o111
 
 
+def plug_in_what_has_another_driver(survey) -> None:
+    """A driver that is loaded first by what is plugged in while the service runs: its nodes are among those that the
+    unit allows. Asked of a node without a device, in the service's control group."""
+    board = survey.board
+    board.run("modprobe cdc_acm && grep -q '166 ttyACM' /proc/devices && mknod /dev/plugged c 166 0")
+    opened = "echo $$ >/sys/fs/cgroup/system.slice/pipefishd.service/cgroup.procs; exec cat /dev/plugged"
+    said = board.run(f"sh -c '{opened}' 2>&1", check=False)
+    assert "No such device or address" in said, said
+
+
+def show_beside_a_wheel(survey) -> int:
+    """The wheel is an input, which Raspberry Pi OS gives to its own group by a rule that comes after the package's."""
+    board = survey.board
+    rule = 'SUBSYSTEM==\\"input\\", GROUP=\\"input\\", MODE=\\"0660\\"'
+    board.run(f'modprobe uinput; modprobe evdev; echo "{rule}" >/etc/udev/rules.d/99-com.rules; udevadm control -R')
+    world = survey.show(0, 45, RATE, "/dev/video0", encoder="--rotary /mnt/counts.txt")
+    board.run("i=0; until [ -e /dev/input/event0 ]; do sleep 0.1; i=$((i+1)); [ $i -lt 50 ] || exit 1; done")
+    board.run("udevadm settle")
+    assert board.run("stat -c '%U:%G %a' /dev/input/event0").strip() == "root:pipefish 640"
+    return world
+
+
 def restart_one_that_stands_still(survey) -> None:
     """systemd's own watchdog: it ends a daemon that does not say that it is well, and starts another."""
     board = survey.board
@@ -75,8 +97,9 @@ def test_the_package_installed_by_dpkg_and_started_by_systemd_takes_a_survey(pac
         "root:pipefish 660",
         "pipefish:pipefish 750",
     ]
+    plug_in_what_has_another_driver(survey)
     survey.start_receiver(usb(survey))
-    world = survey.show(0, 45, RATE, "/dev/video0")
+    world = show_beside_a_wheel(survey)
     survey.wait_until(frames(15), "15 frames")
     process = board.run("systemctl show -P MainPID pipefishd").strip()
     shown = board.run(f"cat /proc/{process}/status")

@@ -87,6 +87,19 @@ def reserve_port() -> socket.socket:
     return holder
 
 
+@contextlib.contextmanager
+def mounted(folder: Path, options: str) -> Iterator[Path]:
+    """A file system of its own, in memory; skips the test where nothing may be mounted."""
+    folder.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.skip(f"a daemon on a file system that is READ-ONLY or FULL is NOT tested: {done.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
 class Crawler:
     """A daemon's settings and its process, which may be started again and again on the same spool.
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 from crawler import (
+    END,
     EVERY_FRAME,
     RESET_GAP,
     SEED,
     Crawler,
     Store,
+    mounted,
     receive_all,
     run,
     serve,
@@ -70,12 +72,7 @@ def test_a_spool_with_a_bad_page_is_replaced_and_what_is_whole_is_delivered(craw
 
 
 def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path, crawler: Crawler):
-    medium = tmp_path / "medium"
-    medium.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "tmpfs", medium], capture_output=True, text=True)
-    if mounted.returncode != 0:
-        pytest.skip(f"a daemon on a READ-ONLY file system is NOT tested: {mounted.stderr.strip()}")
-    try:
+    with mounted(tmp_path / "medium", "size=64m") as medium:
         on_medium = ("--set", f"spool.path={medium}/spool.db", *EVERY_FRAME)
         crawler.start("--set", "daemon.drain_s=0", *on_medium)
         assert crawler.wait() == 0
@@ -91,14 +88,32 @@ def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path
             subprocess.run(["mount", "-o", "remount,rw", medium], check=True)
             serve(crawler, client, lambda: False)
         assert crawler.wait() == 0
-    finally:
-        subprocess.run(["umount", "-l", medium], check=True)
     assert {*before} < {*store.objects} and set(store.arrivals.values()) == {1}
     first, second = store.ends
     for end in (first, second):
         got = {k.index for k in store.keyframes if k.survey_id == end.survey_id}
         assert got | lost_indices(end) == set(range(end.keyframes))
     assert lost_indices(second) == set(), "a fast replay waits until it can be stored"
+
+
+def test_a_frame_index_on_a_full_medium_ends_with_a_whole_row_and_keeps_no_survey_from_starting(
+    tmp_path: Path, crawler: Crawler
+):
+    frames = write_recording(tmp_path / "survey.y4m", 150)
+    with mounted(tmp_path / "medium", "size=16k") as medium:
+        index = ("--set", f"camera.index={medium}", "--set", "daemon.drain_s=0")
+        crawler.start(*index)
+        assert crawler.wait() == 0
+        [file] = medium.iterdir()
+        text = file.read_text()
+        rows = text.splitlines()[1:]
+        assert text.endswith("\n") and {row.count(",") for row in rows} == {9}
+        assert [row.rpartition(",")[2] for row in rows] == frames[: len(rows)] and 50 < len(rows) < 150
+        assert crawler.text().count(f"rows are missing from frame {len(rows)} on") == 1
+        crawler.start(*index, "--set", "survey.name=next")
+        assert crawler.wait() == 0
+        assert "No space left on device; the frames of this start are not listed" in crawler.text()
+    assert spooled(crawler)[END] == 2
 
 
 @pytest.mark.parametrize(

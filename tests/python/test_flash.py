@@ -6,6 +6,7 @@ import json
 import os
 import random
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from crawler import (
     WIDTH,
     Crawler,
     Store,
+    mounted,
     run,
     serve,
     wait_for_log,
@@ -118,6 +120,28 @@ def test_a_flashed_profile_is_used_from_the_next_start_on(tmp_path: Path, crawle
     assert wait_for_status(crawler, lambda s: s["profile"])["profile"]["sha256"] == status.profile.sha256.hex()
     assert cli.main(["status", f"tcp://127.0.0.1:{crawler.port}", *PATIENT]) == 0
     assert "old, serial S1" in capsys.readouterr().out
+
+
+def test_a_store_that_cannot_be_written_gives_the_profile_that_is_confirmed(tmp_path: Path, crawler: Crawler):
+    """Its medium is mounted read-only, as after an error: the survey goes on. What is on trial could not be counted."""
+    with mounted(tmp_path / "medium", "size=1m") as medium:
+        crawler.config.write_text(crawler.config.read_text().replace(str(crawler.store), str(medium / "store")))
+        restart(crawler)
+        install(crawler, OLD)
+        with device(crawler) as flasher:
+            flasher.send(NEW.to_binary())
+        crawler.kill()
+        subprocess.run(["mount", "-o", "remount,ro", medium], check=True)
+        assert run("--config", crawler.config, "--check-config").returncode == 0
+        state = restart(crawler)
+        assert (name_of(state.in_use), state.in_use.trial, name_of(state.stored)) == ("old", False, "old")
+        assert state.problem == "the store cannot be written"
+        with device(crawler) as flasher, pytest.raises(PipefishError, match="cannot be written"):
+            flasher.send(NEW.to_binary())
+        crawler.kill()
+        subprocess.run(["mount", "-o", "remount,rw", medium], check=True)
+        assert name_of(restart(crawler).in_use) == "new", "it was not tried meanwhile"
+        crawler.kill()
 
 
 def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawler: Crawler, capsys):

@@ -90,6 +90,25 @@ def test_the_daemons_package_brings_its_unit_rules_settings_and_scripts(packages
     assert "adduser" in fields(packages[DAEMON])["Depends"]
 
 
+@pytest.mark.parametrize(("script", "argument"), [("postinst", "configure"), ("prerm", "remove"), ("postrm", "remove")])
+def test_a_service_that_does_not_start_or_stop_leaves_no_package_half_installed(
+    tmp_path: Path, script: str, argument: str
+):
+    text = (ROOT / "packaging" / script).read_text()
+    for folder in ("/run/", "/etc/", "/usr/share/"):
+        text = text.replace(f" {folder}", f" {tmp_path}{folder}")
+    for folder in ("run/systemd/system", "run/udev", "etc/pipefish", "bin"):
+        (tmp_path / folder).mkdir(parents=True)
+    settings = tmp_path / "etc/pipefish/pipefishd.ini"
+    settings.write_text("[survey]\nname = mine\n")
+    for name, code in (("getent", 0), ("adduser", 0), ("udevadm", 1), ("systemctl", 1)):
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\necho {name} $* >>{tmp_path}/called\nexit {code}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    output("sh", "-c", text, script, argument, env={"PATH": f"{tmp_path}/bin:/usr/bin:/bin"})
+    assert "systemctl" in (tmp_path / "called").read_text()
+    assert settings.read_text() == "[survey]\nname = mine\n", "an upgrade keeps the settings"
+
+
 def test_the_librarys_package_brings_every_header_and_what_finds_it(packages: dict[str, Path]):
     files = contents(packages[LIBRARY])
     assert set(files.values()) == {"-rw-r--r--"}

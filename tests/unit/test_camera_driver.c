@@ -20,6 +20,7 @@ static struct {
     bool is_plugged, is_open, is_started, is_silent, stays_silent, has_controls, is_stamp_first, is_over;
     uint32_t buffers, sequence, starts, opens;
     int refuse_starts, refuse_opens, damaged; /* so many of the next */
+    bool stays_damaged;                       /* whatever the stream is restarted */
     const char *format;
     uint8_t pool[2][BUFFERS][BYTES], (*memory)[BYTES]; /* those of one opening, and of the one before */
     int state[BUFFERS];
@@ -83,6 +84,7 @@ static pf_status fake_start(void *self, pf_failure *failure)
         return pf_fail(failure, PF_ERR_IO, "does not start");
     k.is_started = true;
     k.is_silent = k.is_silent && k.stays_silent;
+    k.damaged = k.stays_damaged ? k.damaged : 0;
     k.starts++;
     k.sequence = 0; /* as drivers do */
     k.next = k.now + k.period;
@@ -374,6 +376,37 @@ static void test_a_stalled_camera_comes_back(void)
     release(&held);
 }
 
+/* Proves: a camera that gives frames in time, all of them damaged, is restarted, and opened anew if that does not help;
+ * as long as a whole one comes between, it is left alone. */
+static void test_a_camera_that_gives_only_damaged_frames_is_restarted(void)
+{
+    pf_frame f;
+    open_and_start(&plain);
+    for (int i = 0; i < 20; i++) {
+        skip(1);
+        k.damaged = 30; /* 1.5 s */
+        while (k.damaged > 0)
+            TEST_ASSERT_EQUAL_INT(PF_ERR_AGAIN, camera.ops->next(camera.self, 50, &f));
+    }
+    TEST_ASSERT_EQUAL_UINT64(0, stats().restarts);
+    skip(1);
+    k.damaged = INT32_MAX;
+    const uint64_t start = k.now;
+    while (camera.ops->next(camera.self, 100, &f) != PF_OK)
+        TEST_ASSERT_TRUE(k.now - start < 3500 * MS);
+    release(&f);
+    TEST_ASSERT_EQUAL_UINT64(1, stats().restarts);
+    TEST_ASSERT_EQUAL_UINT64(0, stats().reopens);
+    k.damaged = INT32_MAX;
+    k.stays_damaged = true;
+    for (int i = 0; i < 100 && k.opens < 2; i++)
+        (void)camera.ops->next(camera.self, 100, &f);
+    k.stays_damaged = false;
+    k.damaged = 0;
+    TEST_ASSERT_EQUAL_UINT32(2, k.opens);
+    skip(1);
+}
+
 /* Proves: an unplugged camera is waited for and found again; frames that were held outlive it; refusals on the way are
  * tried again. */
 static void test_an_unplugged_camera_comes_back(void)
@@ -501,6 +534,7 @@ int main(void)
     RUN_TEST(test_frames_lie_where_the_camera_put_them_if_it_has_buffers_to_spare);
     RUN_TEST(test_numbers_and_times);
     RUN_TEST(test_a_stalled_camera_comes_back);
+    RUN_TEST(test_a_camera_that_gives_only_damaged_frames_is_restarted);
     RUN_TEST(test_an_unplugged_camera_comes_back);
     RUN_TEST(test_opening_without_a_camera);
     RUN_TEST(test_colours_become_grey);

@@ -36,7 +36,8 @@ static const char *parse(const char *text, char *error, size_t n)
     return s.text;
 }
 
-/* Proves: the grammar: sections, white space, comments, quotes, CRLF, a last line without an end. */
+/* Proves: the grammar: sections, white space, comments, quotes, CRLF, a last line without an end, and the mark that
+ * Windows' editors begin a file with. */
 static void test_ini_takes_what_its_header_says(void)
 {
     char error[256];
@@ -46,6 +47,12 @@ static void test_ini_takes_what_its_header_says(void)
               "y = p#1;2\r\n; whole line\nz = e=f",
               error, sizeof error));
     TEST_ASSERT_EQUAL_STRING("", error);
+    TEST_ASSERT_EQUAL_STRING("2:a.x=<1>\n", parse("\xEF\xBB\xBF[a]\r\nx = 1\r\n", error, sizeof error));
+    TEST_ASSERT_EQUAL_STRING("", error);
+    TEST_ASSERT_EQUAL_STRING("", parse("\xEF\xBB\xBF", error, sizeof error));
+    TEST_ASSERT_EQUAL_STRING("", error);
+    (void)parse("[a]\n\xEF\xBB\xBFx = 1", error, sizeof error);
+    TEST_ASSERT_EQUAL_STRING("f:2: a key is made of letters, digits, _ and -", error);
 }
 
 /* Proves: each malformed line is refused, with file and line, and nothing after it is taken. */

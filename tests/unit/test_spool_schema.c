@@ -268,6 +268,34 @@ static void test_a_lost_first_page_costs_nothing(void)
     }
 }
 
+/* Proves: a damaged size of its pages costs nothing, be it one that SQLite takes, with or without a log behind the
+ * file. */
+static void test_a_damaged_size_of_its_pages_costs_nothing(void)
+{
+    static const uint8_t sizes[][2] = {{0x02, 0}, {0x04, 0}, {0x08, 0}, {0x20, 0},
+                                       {0x40, 0}, {0x80, 0}, {0, 1},    {0, 0}};
+    static uint8_t file[1 << 20], log[1 << 20];
+    sqlite3 *db;
+    make_as("size.db", "", false);
+    TEST_ASSERT_EQUAL_INT(SQLITE_OK, sqlite3_open(temporary_path("size.db"), &db));
+    for (int has_log = 0; has_log < 2; has_log++) {
+        if (has_log) /* a page in it that is not the first */
+            TEST_ASSERT_EQUAL_INT(SQLITE_OK,
+                                  sqlite3_exec(db, "UPDATE object SET kind = 3 WHERE row = 9", NULL, NULL, NULL));
+        const size_t size = slurp(temporary_path("size.db"), file, sizeof file);
+        const size_t log_size = has_log ? slurp(temporary_path("size.db-wal"), log, sizeof log) : 0;
+        TEST_ASSERT_TRUE(has_log == (log_size > 4096));
+        for (size_t i = 0; i < sizeof sizes / sizeof sizes[0]; i++) {
+            memcpy(file + 16, sizes[i], 2);
+            (void)temporary_write("other.db", file, size);
+            if (has_log)
+                (void)temporary_write("other.db-wal", log, log_size);
+            expect_all("other.db", 1);
+        }
+    }
+    TEST_ASSERT_EQUAL_INT(SQLITE_OK, sqlite3_close(db));
+}
+
 /* Proves: what another program or a newer one made is left as it is, also where it is damaged. */
 static void test_others_damaged_files_are_left_as_they_are(void)
 {
@@ -431,6 +459,7 @@ int main(void)
     RUN_TEST(test_a_damaged_spool_whose_tables_lie_elsewhere_is_read_by_its_own_first_page);
     RUN_TEST(test_a_root_on_another_page_of_its_table_is_damage);
     RUN_TEST(test_a_lost_first_page_costs_nothing);
+    RUN_TEST(test_a_damaged_size_of_its_pages_costs_nothing);
     RUN_TEST(test_others_damaged_files_are_left_as_they_are);
     RUN_TEST(test_ranks_in_part_are_completed);
     RUN_TEST(test_what_cannot_be_written_needs_only_the_table_of_objects);

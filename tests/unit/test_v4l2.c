@@ -336,6 +336,38 @@ static void test_any_single_call_may_fail_and_frames_still_come(void)
     }
 }
 
+static uint64_t alive_ns, longest_ns;
+
+static void note_alive(void)
+{
+    if (k.now - alive_ns > longest_ns)
+        longest_ns = k.now - alive_ns;
+    alive_ns = k.now;
+}
+
+/* Proves: a camera that lets each call wait for as long as the kernel does and then fail keeps its thread from waiting
+ * for others, but not from saying between any two that it is alive: whoever watches it would reset the board. */
+static void test_a_camera_that_does_not_answer_is_no_thread_that_hangs(void)
+{
+    pf_camera_config config = {.device = "/dev/video0", .width = W, .height = H, .alive = note_alive};
+    pf_frame frame;
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_v4l2_open_with(&camera, &config, &v4l2_kernel_io, error, sizeof error));
+    TEST_ASSERT_EQUAL_INT(PF_OK, camera.ops->start(camera.self));
+    frame = next_within(300);
+    release(&frame);
+    k.call_ns = 5000 * MS;
+    alive_ns = k.now;
+    longest_ns = 0;
+    const uint64_t end = k.now + 60000 * MS;
+    while (k.now < end)
+        (void)camera.ops->next(camera.self, 100, &frame);
+    note_alive();
+    TEST_ASSERT_TRUE(longest_ns >= 5000 * MS && longest_ns < 6000 * MS);
+    k.call_ns = 0;
+    frame = next_within(20000);
+    release(&frame);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -353,5 +385,6 @@ int main(void)
     RUN_TEST(test_exposure_is_given_back_to_the_camera);
     RUN_TEST(test_damaged_frames_are_left_out_with_a_gap);
     RUN_TEST(test_any_single_call_may_fail_and_frames_still_come);
+    RUN_TEST(test_a_camera_that_does_not_answer_is_no_thread_that_hangs);
     return UNITY_END();
 }

@@ -147,6 +147,11 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
 {
     (void)self;
     TEST_ASSERT_TRUE(k.is_open && fd == 5);
+    k.now += k.call_ns;
+    errno = ETIMEDOUT;
+    if (k.call_ns > 0 && request != VIDIOC_QUERYCAP && request != VIDIOC_ENUM_FMT && request != VIDIOC_TRY_FMT &&
+        request != VIDIOC_S_FMT && request != VIDIOC_REQBUFS && request != VIDIOC_QUERYBUF)
+        return -1;
     errno = ENODEV;
     if (!k.is_plugged || fails())
         return -1;

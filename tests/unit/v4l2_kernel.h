@@ -30,6 +30,7 @@ typedef struct v4l2_kernel {
     uint32_t n_maps, base;
     int32_t exposure_auto;         /* a control that outlives the program, as all do */
     int calls, fail_at, fail_with; /* the call number that fails; 0 = none */
+    uint64_t call_ns;              /* each takes so long, and fails: the camera does not answer */
 } v4l2_kernel;
 
 extern v4l2_kernel k;

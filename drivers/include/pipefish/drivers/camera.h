@@ -126,6 +126,8 @@ typedef struct pf_camera_config {
     double gain;                                /* FIXED, in the camera's units; 0 = as it is */
     uint32_t exposure_max_us;                   /* of AUTO and HOLD: motion blur; 0 = the camera's own limit */
     uint32_t circle_u, circle_v, circle_radius; /* what AUTO and HOLD look at, pixels; radius 0 = the whole picture */
+    void (*alive)(void); /* called before each of V4L2's calls, one of which may take five seconds and opening a camera
+                            that answers none a minute; by the thread that opens it or asks for frames. NULL: nobody */
 } pf_camera_config;
 
 /* On failure *source is untouched and error[n] says what. PF_OK; PF_ERR_IO (absent or in use, and no size is given; not
