@@ -239,13 +239,14 @@ static void take_visitor_event(void *context, pf_session *s, const pf_link_event
 
 /* ---- bytes */
 
-/* Logs what is wrong with the transport, once for each change of its words: it is asked again and again. */
+/* Logs what is wrong with the transport, once for each change of its words: it is asked again and again. Of one that
+ * listens anybody changes them at will: a line a second, and what is still so then. */
 static void tell_failure(pf_courier *c)
 {
     const pf_transport *t = &c->daemon->transport;
     char failure[sizeof c->failure];
     (void)snprintf(failure, sizeof failure, "%s", t->ops->error(t->self));
-    if (strcmp(failure, c->failure) == 0)
+    if (strcmp(failure, c->failure) == 0 || (t->ops->visitor != NULL && !pf_request_may_complain()))
         return;
     memcpy(c->failure, failure, sizeof c->failure);
     pf_log(PF_LOG_WARNING, "%s: %s", t->ops->name(t->self), failure);

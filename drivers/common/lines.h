@@ -12,6 +12,7 @@ typedef struct pf_line {
     int fd;          /* -1 = nobody */
     uint32_t events; /* that epoll watches */
     bool is_new;     /* a visitor whom nobody has taken over yet */
+    bool has_begun;  /* tcp: its first byte has come */
 } pf_line;
 
 typedef struct pf_lines {

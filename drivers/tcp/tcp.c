@@ -11,6 +11,10 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+/* A page in a browser can have any bytes sent to loopback, behind a request's first line. It must not have the line,
+ * nor try session after session until it hits one. */
+#define LINK_BEGINS 0 /* the delimiter in front of the first frame (lib/link/SPEC.md) */
+
 typedef struct tcp {
     pf_lines lines; /* first: what a line belongs to is a tcp */
     pf_line host, visitors[PF_VISITORS_MAX];
@@ -95,7 +99,10 @@ static pf_status tcp_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     if (capacity == 0)
         return PF_OK;
     ssize_t k = recv(l->fd, bytes, capacity, 0);
+    if (k > 0 && !l->has_begun && bytes[0] != LINK_BEGINS)
+        return hang_up(l, "what connected does not speak the link");
     if (k > 0) {
+        l->has_begun = true;
         *done = (size_t)k;
         pf_line_heard(l, pf_now());
     } else if (k == 0) {

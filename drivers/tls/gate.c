@@ -2,13 +2,13 @@
 
 #include <string.h>
 
-void pf_gate_address(const pf_address *peer, uint8_t address[16])
+void pf_gate_address(const pf_address *peer, const pf_address *own, uint8_t address[16])
 {
     memset(address, 0, 16);
     if (peer->any.sa_family == AF_INET) {
         address[10] = address[11] = 0xff;
         memcpy(address + 12, &peer->v4.sin_addr, 4);
-    } else if (IN6_IS_ADDR_V4MAPPED(&peer->v6.sin6_addr)) {
+    } else if (IN6_IS_ADDR_V4MAPPED(&peer->v6.sin6_addr) || memcmp(&peer->v6.sin6_addr, &own->v6.sin6_addr, 8) == 0) {
         memcpy(address, &peer->v6.sin6_addr, 16);
     } else {
         memcpy(address, &peer->v6.sin6_addr, 8);

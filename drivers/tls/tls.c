@@ -11,6 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #define GUESTS_MAX           4
@@ -111,6 +112,8 @@ static pf_status open_context(tls *t)
     (void)SSL_CTX_set_options(t->context, SSL_OP_NO_TICKET | SSL_OP_NO_COMPRESSION);
     (void)SSL_CTX_set_mode(t->context, SSL_MODE_ENABLE_PARTIAL_WRITE | SSL_MODE_ACCEPT_MOVING_WRITE_BUFFER |
                                            SSL_MODE_RELEASE_BUFFERS);
+    /* Else one call of SSL_read goes on for as long as a host sends new keys instead of data: nobody else is served. */
+    (void)SSL_CTX_clear_mode(t->context, SSL_MODE_AUTO_RETRY);
     SSL_CTX_set_max_cert_list(t->context, CERTIFICATE_MAX);
     SSL_CTX_set_verify(t->context, SSL_VERIFY_PEER | SSL_VERIFY_FAIL_IF_NO_PEER_CERT, NULL);
     SSL_CTX_set_cert_verify_callback(t->context, verify, t);
@@ -156,7 +159,7 @@ static guest *free_place(tls *t, const uint8_t address[16], uint64_t now)
 static pf_status take_guests(tls *t, uint64_t now)
 {
     for (int i = 0; i < ACCEPTS_MAX; i++) {
-        pf_address peer;
+        pf_address peer, own;
         uint8_t address[16];
         int fd = pf_listener_accept(t->lines.listener, &peer);
         if (fd < 0) {
@@ -164,7 +167,9 @@ static pf_status take_guests(tls *t, uint64_t now)
                 return PF_OK;
             return pf_fail(&t->lines.failure, PF_ERR_IO, "accept: %s", strerror(errno));
         }
-        pf_gate_address(&peer, address);
+        memset(&own, 0, sizeof own);
+        (void)getsockname(fd, &own.any, &(socklen_t){sizeof own});
+        pf_gate_address(&peer, &own, address);
         guest *g = pf_gate_is_open(&t->gate, address, now) ? free_place(t, address, now) : NULL;
         SSL *ssl = g != NULL ? SSL_new(t->context) : NULL;
         if (ssl == NULL || SSL_set_fd(ssl, fd) != 1) {

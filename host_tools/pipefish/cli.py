@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from pipefish import __version__
 from pipefish.errors import PipefishError
+from pipefish.files import plain
 
 DONE, FAILED, USAGE = 0, 1, 2
 DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
@@ -178,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
         args = build_parser().parse_args(argv)
         args.check(args)
         document, text, *code = args.run(args)
-        print(json.dumps(document, indent=2) if args.json else printable(text, sys.stdout.encoding), flush=True)
+        print(json.dumps(plain(document), indent=2) if args.json else printable(text, sys.stdout.encoding), flush=True)
         return code[0] if code else DONE
     except SystemExit as exit_:  # --help and --version
         return int(exit_.code or 0)

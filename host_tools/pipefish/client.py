@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
+from pipefish.survey import UPTIME_MAX_NS
 from pipefish.surveywrite import BootClock
 from pipefish.transport import Transport, TransportClosed
 
@@ -144,9 +145,11 @@ class Client:
 
     @property
     def clock(self) -> BootClock | None:
-        """The device's clock as measured on the link: unix time = monotonic + offset; None before the first answer."""
+        """The device's clock as measured on the link: unix time = monotonic + offset; None before the first answer, and
+        where it is one that no device can have."""
         stats = self.link.stats
-        if not self.up or stats["peer_clock_error_ns"] >= 2**63:
+        theirs = time.monotonic_ns() + stats["peer_clock_offset_ns"]
+        if not self.up or stats["peer_clock_error_ns"] >= 2**63 or not 0 <= theirs < UPTIME_MAX_NS:
             return None
         ours = time.time_ns() - time.monotonic_ns()
         return BootClock(ours - stats["peer_clock_offset_ns"], stats["peer_clock_error_ns"])

@@ -161,7 +161,7 @@ def position_of(survey: Survey, index: int | None) -> int:
 
 def natural_width(survey: Survey) -> int:
     """Width of an overlay: the picture's own or a multiple of it, so that tracks are legible on small ones."""
-    width = survey.keyframes[0].width if survey.keyframes else 640
+    width = survey.keyframes[0].image.width if survey.keyframes else 640
     return width * max(1, round(1100 / width))
 
 

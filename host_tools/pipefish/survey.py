@@ -161,13 +161,16 @@ class Keyframe:
 
     @property
     def image(self) -> Image:
-        """The picture, decoded (mode L). Raises FormatError if the JPEG is damaged."""
+        """The picture, decoded (mode L). Raises FormatError if it is no JPEG of the keyframe's size, or damaged."""
         from PIL import Image as PilImage
 
         try:
-            picture = PilImage.open(io.BytesIO(self.jpeg))
+            # No other format: Pillow runs another program for some of them. The size is known before memory is taken.
+            picture = PilImage.open(io.BytesIO(self.jpeg), formats=["JPEG"])
+            if picture.size != (self.width, self.height):
+                raise ValueError(f"{picture.width} x {picture.height} pixels, not {self.width} x {self.height}")
             return picture.convert("L")
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
             raise FormatError(
                 self._path, f"offset {self._chunk}", f"picture of keyframe {self.index}: {error}"
             ) from error

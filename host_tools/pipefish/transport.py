@@ -36,6 +36,8 @@ def _reason(error: Exception) -> str:
     """The system's text for an error number, without what libraries put around it."""
     if isinstance(error, socket.gaierror):
         return error.strerror
+    if isinstance(error, ssl.SSLEOFError | ssl.SSLZeroReturnError):
+        return "the device closed the connection"
     number = _number(error)
     if number == errno.ENOTTY:
         return "not a serial line"
@@ -44,7 +46,7 @@ def _reason(error: Exception) -> str:
 
 def _number(error: BaseException | None) -> int:
     """The system's error number, also where a library has wrapped the error; 0 if there is none."""
-    while error is not None:
+    while error is not None and not isinstance(error, ssl.SSLError):  # whose numbers are OpenSSL's own
         number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
         if isinstance(number, int) and number > 0:
             return number

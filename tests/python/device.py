@@ -28,6 +28,7 @@ class Device(threading.Thread):
     survey_id      what Info and Status tell; b"" tells nothing
     state          what Status tells
     stills         RawFrame messages, one for each get_still (b"": promised, never sent); then the survey is over
+    ahead_ns       of our clock, that its own is
     most           so many objects are given to the link, over all connections; may be raised at any time
     """
 
@@ -42,6 +43,7 @@ class Device(threading.Thread):
         nonce: int = 7,
         state: str = "draining",
         stills: Sequence[bytes] = (),
+        ahead_ns: int = 0,
     ) -> None:
         super().__init__(daemon=True)
         self.spool = {name: (kind, data) for name, kind, data in objects}
@@ -51,6 +53,7 @@ class Device(threading.Thread):
         self.cut_after, self.corrupt_every = cut_after, corrupt_every
         self.state = state
         self.stills = list(stills)
+        self.ahead_ns = ahead_ns
         self.most = sys.maxsize
         self.clock: pb.ClockSync | None = None
         self.connections = 0
@@ -61,6 +64,9 @@ class Device(threading.Thread):
         self._server.settimeout(0.05)
         self.address = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
         self.link = Link(role=ROLE_DEVICE, nonce=nonce, boot_id=boot, schema=1, max_control=1000)
+
+    def _now(self) -> int:
+        return time.monotonic_ns() + self.ahead_ns
 
     def stop(self) -> None:
         self._done.set()
@@ -83,25 +89,25 @@ class Device(threading.Thread):
             self.connections += 1
             with line, contextlib.suppress(OSError):
                 self._serve(line)
-            self.link.reset(time.monotonic_ns())
+            self.link.reset(self._now())
 
     def _serve(self, line: socket.socket) -> None:
         sent_here = 0
         while not self._done.is_set():
-            now = time.monotonic_ns()
+            now = self._now()
             wait = min(0.02, max(0, self.link.deadline(now) - now) / 1e9)
             readable, _, _ = select.select([line], [], [], wait)
             data = line.recv(65536) if readable else b""
             if readable and not data:
                 return
-            for event in self.link.input(data, time.monotonic_ns()):
+            for event in self.link.input(data, self._now()):
                 self._event(event)
             for name, (kind, data) in list(self.spool.items()):
                 is_held = len(self._under_way) >= self.most
                 if name not in self._under_way and not is_held and self.link.free_send_slots():
                     self._under_way.add(name)
                     self.link.send_object(name, kind, data)
-            now = time.monotonic_ns()
+            now = self._now()
             while out := self.link.output(4096, now):
                 line.sendall(self._spoil(out))
                 sent_here += len(out)
@@ -132,7 +138,7 @@ class Device(threading.Thread):
 
     def status(self) -> pb.Status:
         status = pb.Status(survey_id=self.survey_id, state=self.state, frames=60, keyframes=12, fps=30.0)
-        status.time.boot_id, status.time.monotonic_ns = self.boot, time.monotonic_ns()
+        status.time.boot_id, status.time.monotonic_ns = self.boot, self._now()
         status.spool.objects = len(self.spool)
         return status
 

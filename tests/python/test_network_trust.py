@@ -210,6 +210,34 @@ def test_an_address_that_failed_five_times_waits_while_others_come_in(device: Cr
     client.close()
 
 
+def test_strangers_with_ever_new_keys_do_not_fill_the_log(device: Crawler, tmp_path: Path):
+    let_in(device, "operator")
+    begin = time.monotonic()
+    for i in range(20):
+        own_certificate(tmp_path / "new", "2000-01-01", "2100-01-01")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context.load_cert_chain(tmp_path / "new")
+        with contextlib.suppress(OSError), context.wrap_socket(connect_from(f"127.0.1.{i + 1}", device.port)) as s:
+            s.settimeout(PATIENCE_S)
+            s.recv(1)
+    network(device, refused_unknown=20)
+    assert device.text().count("a host that is not known") <= time.monotonic() - begin + 1
+
+
+def test_a_device_that_hangs_up_on_a_handshake_is_told_in_words_of_its_own():
+    """The numbers of OpenSSL's errors are not the system's."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def hang_up() -> None:
+            with server.accept()[0] as line:
+                line.recv(65536)
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        with pytest.raises(TransportClosed, match="the device closed the connection"):
+            TlsTransport("127.0.0.1", server.getsockname()[1]).open()
+
+
 def test_a_stranger_cannot_choose_a_slow_key_exchange(device: Crawler):
     key = let_in(device, "operator")
     assert key

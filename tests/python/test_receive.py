@@ -62,6 +62,12 @@ def test_wall_time_comes_from_the_clock_measured_on_the_link(tmp_path):
     assert abs(offset - ours) < error + 1_000_000  # the wall clock itself may be slewed by 0.5 ms a second
 
 
+def test_a_device_whose_clock_none_can_have_is_received_all_the_same(tmp_path):
+    with Device(survey_objects(3), SURVEY, ahead_ns=2**63 + 10**15) as device:
+        receive_from(device, tmp_path / "a.mcap")
+    assert len(Survey.open(tmp_path / "a.mcap").keyframes) == 3
+
+
 def test_broken_connections_and_damaged_bytes_lose_and_double_nothing(tmp_path):
     objects = survey_objects(12)
     with Device(objects, SURVEY, cut_after=9000, corrupt_every=4001) as device:

@@ -6,16 +6,20 @@ Does not prove: that a disk which lies about fsync keeps anything.
 from __future__ import annotations
 
 import io
+import json
+import struct
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from PIL import Image
 
 from pipefish import pipefish_pb2 as pb
+from pipefish.cli import main
 from pipefish.errors import FormatError, PipefishError
 from pipefish.survey import Observations, Survey, lost_indices
 from pipefish.surveystore import SurveyStore
-from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, SurveyWriter
+from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START, SurveyWriter
 from synthetic import BOOT, CLOCK, SURVEY, as_object, end, keyframe, start, store_all, survey_objects, write_survey
 
 
@@ -230,6 +234,49 @@ def test_random_damage_never_crashes_the_reader(tmp_path):
                 _ = frame.image
         except FormatError:
             pass
+
+
+def picture_as(image_format: str, width: int = 160, height: int = 120, claimed: tuple[int, int] = (160, 120)) -> bytes:
+    """The bytes of a picture; of a JPEG its header then says `claimed`."""
+    out = io.BytesIO()
+    Image.new("L", (width, height), 128).save(out, image_format)
+    data = bytearray(out.getvalue())
+    if image_format == "JPEG":
+        at = data.index(b"\xff\xc0") + 5
+        data[at : at + 4] = struct.pack(">HH", claimed[1], claimed[0])
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("size", "jpeg", "why"),
+    [
+        ((160, 120), picture_as("JPEG", claimed=(9000, 9000)), "9000 x 9000 pixels, not 160 x 120"),
+        ((65000, 65000), picture_as("JPEG", claimed=(65000, 65000)), "decompression bomb"),
+        ((0, 0), picture_as("JPEG"), "160 x 120 pixels, not 0 x 0"),
+        ((160, 120), picture_as("EPS"), "cannot identify"),  # Pillow has Ghostscript draw it
+    ],
+    ids=["another size", "bomb", "none", "a program's"],
+)
+def test_pictures_that_are_made_up_cost_no_memory_and_are_named(tmp_path, size, jpeg, why, capsys):
+    message = pb.Keyframe.FromString(keyframe(0)[2])
+    message.width, message.height = size
+    message.jpeg = jpeg
+    write_survey(tmp_path / "a.mcap", objects=[start(), as_object(OBJECT_KEYFRAME, message), end(1)])
+    with pytest.raises(FormatError, match=f"picture of keyframe 0: .*{why}"):
+        _ = Survey.open(tmp_path / "a.mcap").keyframes[0].image
+    assert main(["show", str(tmp_path / "a.mcap"), "-o", str(tmp_path / "a.png")]) == 1
+    assert "internal error" not in capsys.readouterr().err
+
+
+def test_numbers_that_are_none_stand_in_json_as_null(tmp_path, capsys):
+    message = pb.SurveyStart.FromString(start()[2])
+    message.frame_rate = float("nan")
+    message.encoder.metres_per_count = 1e308
+    frames = [keyframe(i) for i in range(8)]
+    write_survey(tmp_path / "a.mcap", objects=[as_object(OBJECT_START, message), *frames, end(8)])
+    assert main(["info", str(tmp_path / "a.mcap"), "--json"]) == 0
+    info = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert info["frame_rate"] is None and info["keyframes"] == 8
 
 
 def test_the_bytes_must_match_the_name(tmp_path):

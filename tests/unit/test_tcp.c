@@ -37,7 +37,7 @@ static void open_listener(const char *address)
     TEST_ASSERT_TRUE(port_of_name() != 0);
 }
 
-static int connect_client(void)
+static int connect_anything(void)
 {
     struct sockaddr_in a = {.sin_family = AF_INET, .sin_port = htons(port_of_name())};
     a.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
@@ -46,10 +46,29 @@ static int connect_client(void)
     return fd;
 }
 
+/* As the link begins. */
+static int connect_client(void)
+{
+    int fd = connect_anything();
+    TEST_ASSERT_EQUAL_INT(1, write(fd, "", 1));
+    return fd;
+}
+
 static void wait_readable(void)
 {
     struct pollfd p = {line.ops->fd(line.self), POLLIN, 0};
     TEST_ASSERT_EQUAL_INT(1, poll(&p, 1, 60000));
+}
+
+static void expect_beginning(const pf_transport *t)
+{
+    uint8_t byte = 1;
+    size_t n = 0;
+    while (n == 0) {
+        wait_readable();
+        TEST_ASSERT_EQUAL_INT(PF_OK, t->ops->read(t->self, &byte, 1, &n));
+    }
+    TEST_ASSERT_EQUAL_UINT8(0, byte);
 }
 
 static void accept_client(void)
@@ -60,6 +79,7 @@ static void accept_client(void)
     TEST_ASSERT_TRUE(fresh);
     TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
     TEST_ASSERT_FALSE(fresh);
+    expect_beginning(&line);
 }
 
 static void expect_read(const char *text)
@@ -131,6 +151,7 @@ static pf_transport take_visitor(void)
     TEST_ASSERT_FALSE(fresh);
     TEST_ASSERT_TRUE(line.ops->visitor(line.self, &visitor));
     TEST_ASSERT_FALSE(line.ops->visitor(line.self, &visitor));
+    expect_beginning(&visitor);
     return visitor;
 }
 
@@ -162,7 +183,7 @@ static void test_others_look_on(void)
         client[i] = connect_client();
         visitor[i] = take_visitor();
     }
-    int fourth = connect_client();
+    int fourth = connect_anything();
     wait_readable();
     TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
     TEST_ASSERT_EQUAL_INT(0, recv(fourth, &byte, 1, 0)); /* sent away */
@@ -193,6 +214,45 @@ static void test_others_look_on(void)
     close(next);
     close(client[1]);
     close(client[2]);
+}
+
+static void expect_closed(const pf_transport *t)
+{
+    uint8_t byte;
+    size_t n;
+    pf_status status;
+    do {
+        wait_readable();
+        status = t->ops->read(t->self, &byte, 1, &n);
+        TEST_ASSERT_EQUAL_size_t(0, n);
+    } while (status == PF_OK);
+    TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, status);
+}
+
+/* Proves: what a page in a browser makes it send has neither the line nor a visitor's place, whatever follows. */
+static void test_a_request_of_a_browser_is_closed(void)
+{
+    static const char request[] = "POST / HTTP/1.1\r\n\r\n\0\0";
+    bool fresh = false;
+    open_listener("127.0.0.1");
+    int browser = connect_anything();
+    TEST_ASSERT_EQUAL_INT(sizeof request, write(browser, request, sizeof request));
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    expect_closed(&line);
+    TEST_ASSERT_NOT_NULL(strstr(line.ops->error(line.self), "does not speak the link"));
+    int host = connect_client();
+    accept_client();
+    int page = connect_anything();
+    TEST_ASSERT_EQUAL_INT(4, write(page, "GET ", 4));
+    pf_transport visitor = {NULL, NULL};
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_TRUE(line.ops->visitor(line.self, &visitor));
+    expect_closed(&visitor);
+    close(page);
+    close(host);
+    close(browser);
 }
 
 /* Proves: a client that is silent for too long loses the line to the next. */
@@ -294,6 +354,7 @@ static void test_ipv6(void)
         .sin6_family = AF_INET6, .sin6_port = htons(port_of_name()), .sin6_addr = in6addr_loopback};
     int fd = socket(AF_INET6, SOCK_STREAM | SOCK_CLOEXEC, 0);
     TEST_ASSERT_EQUAL_INT(0, connect(fd, (struct sockaddr *)&a, sizeof a));
+    TEST_ASSERT_EQUAL_INT(1, write(fd, "", 1));
     accept_client();
     TEST_ASSERT_EQUAL_INT(2, write(fd, "v6", 2));
     expect_read("v6");
@@ -305,6 +366,7 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_connect_disconnect_reconnect);
     RUN_TEST(test_others_look_on);
+    RUN_TEST(test_a_request_of_a_browser_is_closed);
     RUN_TEST(test_a_silent_client_makes_room);
     RUN_TEST(test_room_bounds_the_queue);
     RUN_TEST(test_other_addresses_are_refused);

@@ -100,7 +100,7 @@ static void test_lines_of_the_file(void)
         TEST_ASSERT_EQUAL_INT(PF_ERR_FORMAT, pf_peers_parse(&peers, whole, n, error, sizeof error));
 }
 
-static void address_of(const char *text, uint8_t address[16])
+static pf_address numeric(const char *text)
 {
     pf_address a;
     memset(&a, 0, sizeof a);
@@ -108,7 +108,14 @@ static void address_of(const char *text, uint8_t address[16])
         a.v4.sin_family = AF_INET;
     else if (inet_pton(AF_INET6, text, &a.v6.sin6_addr) == 1)
         a.v6.sin6_family = AF_INET6;
-    pf_gate_address(&a, address);
+    return a;
+}
+
+/* The device is at fe80::5 on its cable and at 2001:db8:1::5 in the house. */
+static void address_of(const char *text, uint8_t address[16])
+{
+    const pf_address peer = numeric(text), own = numeric(strncmp(text, "fe80", 4) == 0 ? "fe80::5" : "2001:db8:1::5");
+    pf_gate_address(&peer, &own, address);
 }
 
 /* Proves: five failures in a minute shut one address and no other, for the rest of that minute. */
@@ -154,6 +161,24 @@ static void test_a_flood_of_addresses_does_not_wash_out_one_that_is_shut(void)
     TEST_ASSERT_FALSE(pf_gate_is_open(&gate, bad, 3 * SECOND));
 }
 
+/* Proves: who fails on purpose does not shut the device to his neighbours, who have the first half of their addresses
+ * in common with him and with the device. */
+static void test_a_neighbour_on_the_link_is_another_address(void)
+{
+    static const char *const pairs[][2] = {{"2001:db8:1::66", "2001:db8:1::7"}, {"fe80::66", "fe80::7"}};
+    for (size_t i = 0; i < 2; i++) {
+        pf_gate gate;
+        uint8_t bad[16], good[16];
+        memset(&gate, 0, sizeof gate);
+        address_of(pairs[i][0], bad);
+        address_of(pairs[i][1], good);
+        for (unsigned k = 0; k < PF_GATE_FAILURES; k++)
+            pf_gate_note_failure(&gate, bad, SECOND);
+        TEST_ASSERT_FALSE(pf_gate_is_open(&gate, bad, 2 * SECOND));
+        TEST_ASSERT_TRUE(pf_gate_is_open(&gate, good, 2 * SECOND));
+    }
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -162,5 +187,6 @@ int main(void)
     RUN_TEST(test_lines_of_the_file);
     RUN_TEST(test_the_gate_shuts_after_five_failures_and_opens_again);
     RUN_TEST(test_a_flood_of_addresses_does_not_wash_out_one_that_is_shut);
+    RUN_TEST(test_a_neighbour_on_the_link_is_another_address);
     return UNITY_END();
 }
