@@ -14,7 +14,7 @@ from pipefish.files import write_atomically
 from pipefish.intervals import SAID, Z95
 from pipefish.measured_limits import LIMITS, check_limits, most_oval, verdict, whole_sigma
 from pipefish.measured_reach import UNSEEN, reach_text
-from pipefish.measured_texts import clock_text, column, interval_text, length_text, scale_texts, size_parts
+from pipefish.measured_texts import clock_text, column, length_text, place_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
@@ -180,12 +180,10 @@ class Report(Charts):
         # What has no place stands last.
         events.sort(key=lambda e: (e[0]["chainage"] is None, e[0]["chainage"] or 0.0))
         for e, by_map in events:
-            at = "unknown"
-            if e["chainage"] is not None:
-                at = interval_text(e["chainage"], e.get("s_sigma"), self.unit, metres=True)
             clock = clock_text(e["clock"]) if e.get("clock") is not None else ""
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
-            cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
+            found_by = "dense map" if by_map else "tube"
+            cells = (e["kind"].replace("_", " "), place_text(e, self.unit), clock, size, found_by)
             rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
         told = f"<p class='note'>{_with_code(self.reach_text())}</p>"
         if not rows:
