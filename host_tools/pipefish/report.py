@@ -37,6 +37,13 @@ FILES = {
     "colmap": "poses and points for COLMAP and what reads it",
     "reconstruction.json": "all of it, for programs",
 }
+FINDING_COLUMNS = ("what", "chainage", "clock", "size", "found by")
+
+
+def _finding_cell(of: str, text: str) -> str:
+    """A cell of the findings; where they stand below each other, as on a phone, it says what it is of."""
+    named = f" data-of='{of}'" if of not in ("what", "size") else ""
+    return f"<td{named}>{html.escape(text)}</td>"
 
 
 def _with_code(text: str) -> str:
@@ -184,11 +191,11 @@ class Report(Charts):
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
             found_by = "dense map" if by_map else "tube"
             cells = (e["kind"].replace("_", " "), place_text(e, self.unit), clock, size, found_by)
-            rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+            rows.append("<tr>" + "".join(map(_finding_cell, FINDING_COLUMNS, cells)) + "</tr>")
         told = f"<p class='note'>{_with_code(self.reach_text())}</p>"
         if not rows:
             return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
-        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size", "found by"))
+        head = "".join(f"<th scope='col'>{c}</th>" for c in FINDING_COLUMNS)
         table = f"<table class='list findings'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         return f"<div class='wide'>{table}</div>{told}"
 
