@@ -23,6 +23,7 @@ from .calibration import calibrate
 from .detect import detect_target
 from .errors import PipefishError
 from .stills import StillFolder, Stills, SurveyOver
+from .terminal import printable, say
 from .transport import Transport
 
 Array = npt.NDArray[np.float64]
@@ -219,11 +220,12 @@ class Screen:
             from rich.panel import Panel
             from rich.text import Text
 
-            body = Text(guide.map_text() + f"\n\n{line}\nCtrl-C: calibrate with what has been seen")
+            told = printable(line, sys.stderr.encoding)
+            body = Text(guide.map_text() + f"\n\n{told}\nCtrl-C: calibrate with what has been seen")
             self._live.update(Panel.fit(body, title="seen in the picture"), refresh=True)
         elif not self._quiet and line.partition(": ")[2] != self._said:
             self._said = line.partition(": ")[2]
-            print(line, file=sys.stderr, flush=True)
+            say(line)
 
     def close(self) -> None:
         """Leaves the last map standing."""

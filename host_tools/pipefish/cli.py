@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import unicodedata
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 from pipefish import __version__
 from pipefish.errors import PipefishError
 from pipefish.files import plain
+from pipefish.terminal import printable, say
 
 DONE, FAILED, USAGE = 0, 1, 2
 DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
@@ -25,18 +25,6 @@ DEVICE_HELP = (
     "serial:/dev/ttyUSB0@3000000 (hardware flow control: @3000000,rtscts), /dev/ttyUSB0 (speed from --baud), "
     "tls://host:port or tcp://host:port"
 )
-
-
-def printable(text: str, encoding: str | None = None) -> str:
-    """As a terminal of this encoding [UTF-8] may have it: a survey's or a device's texts could hold codes that clear it
-    or fake other lines. What it has no letter for is told otherwise: a long measurement must not end in an error."""
-    known = encoding or "utf-8"
-    text = "".join(c if c in "\n\t" or unicodedata.category(c)[0] != "C" else f"\\u{ord(c):04x}" for c in text)
-    try:
-        text.encode(known)
-    except UnicodeEncodeError:
-        text = text.replace("±", "+-").replace("°", " deg").encode(known, "backslashreplace").decode(known)
-    return text
 
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
@@ -192,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
             print(json.dumps(error_document(error, code), indent=2), flush=True)
         if "--debug" in argv:
             raise
-        print(f"pipefish: {printable(message_of(error), sys.stderr.encoding)}", file=sys.stderr)
+        say(f"pipefish: {message_of(error)}")
         return code
 
 

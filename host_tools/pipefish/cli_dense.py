@@ -63,7 +63,7 @@ def run_dense(args: argparse.Namespace) -> Result:
 def _text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
     from pipefish.dense_findings import finding_parts, findings_of
-    from pipefish.measured_texts import length_text
+    from pipefish.measured_texts import event_text, length_text
 
     unit = document["unit"]
     low, middle, high = document["deviation_p05_p50_p95"] or (0.0, 0.0, 0.0)
@@ -85,8 +85,7 @@ def _text(document: dict[str, Any], files: list[str]) -> str:
         rows.append(("scale", f"± {100 * Z95 * document['scale_sigma']:.2g} % of every radius, in common"))
     found_there = findings_of(document)
     for e in found_there[:40]:
-        at = f"at {length_text(e['chainage'], unit, metres=True)}, {e['clock_text']} o'clock"
-        rows.append((e["kind"], ", ".join([at, *finding_parts(e, unit)])))
+        rows.append((e["kind"], event_text(e, unit, finding_parts(e, unit))))
     if len(found_there) > 40:
         rows.append(("and", f"{len(found_there) - 40} more findings"))
     rows.append(("intervals", SAID))

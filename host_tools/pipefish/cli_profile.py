@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from pipefish.cli import Result, UsageError, add_command, not_negative, positive, table
 from pipefish.errors import ArgumentError, ProfileError
 from pipefish.intervals import Z95
+from pipefish.terminal import say
 
 # The forms of --from and --to: formats.READERS and WRITERS, whose import costs time here.
 READ = (
@@ -38,9 +38,8 @@ def load_profile(args: argparse.Namespace) -> Any:
         max_theta=_radians(args.max_theta),
         model=args.model,
     )
-    if not args.json:
-        for note in loaded.notes:
-            print(f"pipefish: {args.profile}: {note}", file=sys.stderr)
+    for note in loaded.notes:
+        say(f"pipefish: {args.profile}: {note}", args.json)
     return loaded
 
 

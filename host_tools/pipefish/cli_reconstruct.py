@@ -134,11 +134,11 @@ def run_reconstruct(args: argparse.Namespace) -> Result:
 def reconstruct_text(document: dict[str, Any], files: list[str]) -> str:
     """The result for people."""
     from pipefish.measured_reach import reach_text
-    from pipefish.measured_texts import events_text
+    from pipefish.measured_texts import event_text
 
     unit = document["summary"]["unit"]
     rows = _figures(document)
-    rows += [(e["kind"].replace("_", " "), events_text(e, unit)) for e in document["events"]]
+    rows += [(e["kind"].replace("_", " "), event_text(e, unit)) for e in document["events"]]
     rows.append(
         ("findings", reach_text(document["findings_reach"], unit) + " `pipefish dense` finds smaller ones, and cracks.")
     )

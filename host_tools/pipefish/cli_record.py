@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 from pipefish.cli import Result, add_command, add_device, not_negative, positive, table
+from pipefish.terminal import say
 
 
 def run_record(args: argparse.Namespace) -> Result:
     from pipefish.stills import record
     from pipefish.transport import open_transport
 
-    def tell(line: str) -> None:
-        if not args.json:
-            print(line, file=sys.stderr, flush=True)
-
-    if args.every is None and not args.json:
-        tell("Enter: a still. Ctrl-D: done.")
+    if args.every is None:
+        say("Enter: a still. Ctrl-D: done.", args.json)
     document = record(
         open_transport(args.device, args.baud),
         Path(args.output),
         every_s=args.every,
         count=args.count,
         timeout_s=args.timeout,
-        tell=tell,
+        tell=lambda line: say(line, args.json),
     )
     rows = [("stills", document["stills"]), ("ended", document["ended"]), ("written", document["folder"])]
     return document, table(rows)

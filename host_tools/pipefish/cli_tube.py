@@ -121,6 +121,8 @@ def write_tube(tube: Any, folder: Path, document: dict[str, Any]) -> list[str]:
 def _text(tube: Any, files: list[str]) -> str:
     import numpy as np
 
+    from pipefish.measured_texts import event_text
+
     s, t = tube.summary, tube.stations
     known = "ovality_rms" in s
     oval = (
@@ -140,7 +142,7 @@ def _text(tube: Any, files: list[str]) -> str:
     if s["points_apart"] > APART:
         text = f"{100 * s['points_apart']:.0f} % of the points are far from this pipe or beyond its ends: not measured"
         rows.append(("left out", text))
-    rows += [(e["kind"], event_text(e)) for e in tube.events]
+    rows += [(e["kind"], event_text(e | {"chainage": e["s"]}, "metre")) for e in tube.events]
     rows.append(("note", unit_note(s["d_mean"], tube.nominal)))
     rows.append(("intervals", SAID))
     return table([*rows, *(("written", f) for f in files)])
@@ -167,26 +169,3 @@ def ovality_text(station: dict[str, Any]) -> str:
     """The ovality at one station with its 95 % interval."""
     low, high = (100 * max(0.0, float(station[k])) for k in ("ovality_lo", "ovality_hi"))
     return f"{100 * float(station['ovality']):.2f} %, 95 % from {low:.2f} to {high:.2f} %"
-
-
-def event_text(e: dict[str, Any]) -> str:
-    """One line about an event."""
-    parts = [f"at {e['s']:.3f} m"]
-    if e.get("clock") is not None:
-        parts.append(f"{(e['clock'] * 6 / math.pi) % 12:.1f} o'clock")
-    if e["kind"] == "bend":
-        parts.append(f"{math.degrees(e['angle']):.1f} ± {math.degrees(Z95 * e['angle_sigma']):.1f} degrees")
-        if e["radius"]:
-            parts.append(f"radius {e['radius']:.2f} ± {Z95 * e['radius_sigma']:.2f} m")
-    for name, what in (
-        ("gap", "gap"),
-        ("step", "step"),
-        ("height", "height"),
-        ("length", "length"),
-        ("width", "width"),
-    ):
-        if e.get(name) is not None and e["kind"] != "bend":
-            parts.append(f"{what} {1000 * e[name]:.1f} mm")
-    if e["kind"] == "joint" and e.get("angle") is not None:
-        parts.append(f"angle {math.degrees(e['angle']):.2f} degrees")
-    return ", ".join(p for p in parts if p)

@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Any
 from pipefish import __version__
 from pipefish.errors import PipefishError
 from pipefish.intervals import SAID, Z95
+from pipefish.terminal import say
 
 PRESET = "demo"
 BAUD = 3_000_000
@@ -47,12 +47,6 @@ def find_programs(build_dir: str | None) -> Programs:
             raise PipefishError(f"{program} is not there; run `make build`, or name the build with --build-dir")
     bench = folder / "tests" / "bench" / "bench_link"
     return Programs(daemon.resolve(), line.resolve(), bench.resolve() if os.access(bench, os.X_OK) else None)
-
-
-def say(text: str, quiet: bool) -> None:
-    """What is going on, on stderr."""
-    if not quiet:
-        print(text, file=sys.stderr, flush=True)
 
 
 @dataclass

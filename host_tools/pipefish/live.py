@@ -220,7 +220,10 @@ class Course:
             out |= {"from": rows[0]["at"], "to": rows[-1]["at"], "d_mean": float(d.mean())}
             out |= {"d_mean_least": float(d.min()), "d_mean_most": float(d.max())}
             out |= {"station_sigma": float(np.median([r["d_mean_sigma"] for r in rows]))}
-            out |= {"systematic": float(np.median([r["systematic"] for r in rows]))}
+            # Of a mean, whatever its parts have in common: not more than the mean of theirs. Neighbours of one window
+            # share most, and by how much nobody asks here.
+            out |= {"d_mean_sigma_most": float(np.mean([r["d_mean_sigma"] for r in rows]))}
+            out |= {"systematic": float(np.mean([r["systematic"] for r in rows]))}
             if math.isfinite(worst["ovality"]):
                 out |= {"ovality_most": worst["ovality"], "ovality_most_at": worst["at"]}
         return out
@@ -357,7 +360,7 @@ def progress_text(progress: dict[str, Any]) -> str:
     oval = f", oval {100 * newest['ovality']:.1f} %" if math.isfinite(newest["ovality"]) else ""
     if progress["unit"] != "metre":
         return f"{where}: no scale{oval}"
-    d, half = 1000 * newest["d_mean"], 1000 * Z95 * newest["d_mean_sigma"]
+    d, half = 1000 * newest["d_mean"], 1000 * Z95 * math.hypot(newest["d_mean_sigma"], newest["systematic"])
     return f"{where}: diameter {d:.1f} ± {half:.1f} mm at {newest['at']:.2f} m{oval}"
 
 
@@ -373,8 +376,9 @@ def summary_rows(summary: dict[str, Any] | None) -> list[tuple[str, object]]:
         rows.append(
             ("measured live", f"{summary['from']:.2f} to {summary['to']:.2f} m, {summary['stations']} stations")
         )
-        shared = 1000 * Z95 * summary["systematic"]
-        rows.append(("mean diameter", f"{d:.1f} ± {shared:.1f} mm (scale and camera), {low:.1f} to {high:.1f} mm"))
+        own, shared = (1000 * Z95 * summary[k] for k in ("d_mean_sigma_most", "systematic"))
+        parts = f"± {own:.1f} (repeatability, at most) ± {shared:.1f} (systematic: scale and camera)"
+        rows += [("mean diameter", f"{d:.1f} mm {parts}"), ("along the pipe", f"{low:.1f} to {high:.1f} mm")]
     if "ovality_most" in summary:
         rows.append(("most oval", f"{100 * summary['ovality_most']:.2f} % at {summary['ovality_most_at']:.2f} m"))
     rows.append(("warnings", len(summary["warnings"]) or "none"))

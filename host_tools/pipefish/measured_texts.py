@@ -65,6 +65,7 @@ def clock_text(angle: float) -> str:
 
 
 def size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
+    """How large an event of a tube is, in words, with 95 % intervals."""
     if e["kind"] == "not_measured":
         if e["start"] is not None and e["end"] is not None:
             yield f"to {length_text(e['end'], unit, metres=True)}"
@@ -84,11 +85,18 @@ def size_parts(e: dict[str, Any], unit: str) -> Iterable[str]:
         yield f"angle {math.degrees(e['angle']):.2f} ± {math.degrees(Z95 * e['angle_sigma']):.2f}°"
 
 
-def events_text(e: dict[str, Any], unit: str) -> str:
-    """One line about an event, without its kind."""
-    at = f"at {length_text(e['chainage'], unit, metres=True)}" if e["chainage"] is not None else "place unknown"
+def place_text(e: dict[str, Any], unit: str) -> str:
+    """Where along the pipe an event is, with its 95 % interval."""
+    if e["chainage"] is None:
+        return "unknown"
+    return interval_text(e["chainage"], e.get("s_sigma"), unit, metres=True)
+
+
+def event_text(e: dict[str, Any], unit: str, sizes: Iterable[str] | None = None) -> str:
+    """One line about an event, without its kind. sizes: how large it is [as an event of a tube]."""
+    at = f"at {place_text(e, unit)}" if e["chainage"] is not None else "place unknown"
     clock = f"{clock_text(e['clock'])} o'clock" if e.get("clock") is not None else ""
-    return ", ".join(p for p in (at, clock, *size_parts(e, unit)) if p)
+    return ", ".join(p for p in (at, clock, *(size_parts(e, unit) if sizes is None else sizes)) if p)
 
 
 def scale_texts(scale: dict[str, Any]) -> list[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipefish.intervals import Z95
 from pipefish.measured_files import stations
 from pipefish.measurement import Measurement, Stretch
 from pipefish.simulate import Scene
@@ -79,7 +80,7 @@ def against_truth(m: Measurement, scene: Scene) -> dict[str, Any] | None:
         "diameter_mean_pct": 100 * float(error.mean()),
         "diameter_scatter_pct": 100 * float(error.std()),
         "diameter_max_pct": 100 * float(np.abs(error).max()),
-        "diameter_covered": float(np.mean(np.abs(error) <= 1.96 * sigma)),
+        "diameter_covered": float(np.mean(np.abs(error) <= Z95 * sigma)),
         "ovality_rms_points": None,
         "ovality_covered": None,
         "length_pct": 100 * (length / driven - 1),

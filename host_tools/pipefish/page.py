@@ -323,9 +323,15 @@ class Page:
         return [(heading, rows) for heading, rows in tables if rows]
 
 
+def _row_head(name: str) -> str:
+    """Names that begin with spaces, as on a terminal, are parts of what stands above."""
+    part = " class='part'" if name.startswith(" ") else ""
+    return f"<th scope='row'{part}>{html.escape(name.lstrip())}</th>"
+
+
 def table_html(heading: str, rows: list[tuple[str, str]], folded: bool = False, note: str = "") -> str:
     """A table of two columns under its heading, with a note below; folded: a click opens it."""
-    body = "".join(f"<tr><th scope='row'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows)
+    body = "".join(f"<tr>{_row_head(n)}<td>{html.escape(v)}</td></tr>" for n, v in rows)
     table = f"<table>{body}</table>" + (f"<p class='note'>{html.escape(note)}</p>" if note else "")
     if folded:
         return f"<details class='card'><summary><h3>{html.escape(heading)}</h3></summary>{table}</details>"

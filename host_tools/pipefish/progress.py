@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
+from pipefish.terminal import printable, say
+
 SHOW_AFTER_S = 2.0
 T = TypeVar("T")
 
@@ -39,7 +41,7 @@ class Progress:
             return
         if self._bar is None:
             self._open()
-        self._bar.update(self._task, completed=completed, total=self._total, note=note)
+        self._bar.update(self._task, completed=completed, total=self._total, note=printable(note, sys.stderr.encoding))
 
     @property
     def shows(self) -> bool:
@@ -49,9 +51,9 @@ class Progress:
     def say(self, text: str) -> None:
         """A line that stays, above the bar where there is one; nothing where all is to be quiet."""
         if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        elif not self._quiet:
-            print(text, file=sys.stderr, flush=True)
+            self._bar.console.print(printable(text, sys.stderr.encoding), markup=False, highlight=False)
+        else:
+            say(text, self._quiet)
 
     def _open(self) -> None:
         from rich.console import Console
@@ -63,7 +65,7 @@ class Progress:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             console=Console(stderr=True),
             transient=True,
         )

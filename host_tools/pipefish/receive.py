@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from pipefish.surveywrite import (
     partial_of,
     read_content,
 )
+from pipefish.terminal import say
 from pipefish.transport import Transport, TransportClosed
 
 FIRST_ANSWERS_S = 2.0  # the first object waits this long for the device's clock and the name of its survey
@@ -319,8 +319,7 @@ def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], qui
             except TransportClosed as error:  # it may be about to start, or about to be plugged in
                 if error.is_final:
                     raise
-                if not quiet:
-                    print(f"{error}; waiting for it", file=sys.stderr, flush=True)
+                say(f"{error}; waiting for it", quiet)
             receiver.run(timeout_s, stop)
     except KeyboardInterrupt:
         why = "interrupted"

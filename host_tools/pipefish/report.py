@@ -14,7 +14,7 @@ from pipefish.files import write_atomically
 from pipefish.intervals import SAID, Z95
 from pipefish.measured_limits import LIMITS, check_limits, most_oval, verdict, whole_sigma
 from pipefish.measured_reach import UNSEEN, reach_text
-from pipefish.measured_texts import clock_text, column, interval_text, length_text, scale_texts, size_parts
+from pipefish.measured_texts import clock_text, column, length_text, place_text, scale_texts, size_parts
 from pipefish.page import chart_html, fill, table_html, whole_page
 from pipefish.report_charts import Charts
 from pipefish.report_dense import DensePart, dense_part
@@ -37,6 +37,13 @@ FILES = {
     "colmap": "poses and points for COLMAP and what reads it",
     "reconstruction.json": "all of it, for programs",
 }
+FINDING_COLUMNS = ("what", "chainage", "clock", "size", "found by")
+
+
+def _finding_cell(of: str, text: str) -> str:
+    """A cell of the findings; where they stand below each other, as on a phone, it says what it is of."""
+    named = f" data-of='{of}'" if of not in ("what", "size") else ""
+    return f"<td{named}>{html.escape(text)}</td>"
 
 
 def _with_code(text: str) -> str:
@@ -180,17 +187,15 @@ class Report(Charts):
         # What has no place stands last.
         events.sort(key=lambda e: (e[0]["chainage"] is None, e[0]["chainage"] or 0.0))
         for e, by_map in events:
-            at = "unknown"
-            if e["chainage"] is not None:
-                at = interval_text(e["chainage"], e.get("s_sigma"), self.unit, metres=True)
             clock = clock_text(e["clock"]) if e.get("clock") is not None else ""
             size = "; ".join(finding_parts(e, self.unit) if by_map else size_parts(e, self.unit))
-            cells = (e["kind"].replace("_", " "), at, clock, size, "dense map" if by_map else "tube")
-            rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+            found_by = "dense map" if by_map else "tube"
+            cells = (e["kind"].replace("_", " "), place_text(e, self.unit), clock, size, found_by)
+            rows.append("<tr>" + "".join(map(_finding_cell, FINDING_COLUMNS, cells)) + "</tr>")
         told = f"<p class='note'>{_with_code(self.reach_text())}</p>"
         if not rows:
             return f"<p class='muted'>Nothing was found to depart from a smooth pipe.</p>{told}"
-        head = "".join(f"<th scope='col'>{c}</th>" for c in ("what", "chainage", "clock", "size", "found by"))
+        head = "".join(f"<th scope='col'>{c}</th>" for c in FINDING_COLUMNS)
         table = f"<table class='list findings'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
         return f"<div class='wide'>{table}</div>{told}"
 

@@ -143,8 +143,8 @@ class Charts:
             "id": "diameter",
             "title": "Diameter along the pipe",
             "text": "Bands: repeatability. What is wrong with the scale or the camera is not in them: "
-            f"± {' to '.join(ends)} {self.short}. Dotted: nominal. Grey: not measured. Names in the legend switch on "
-            "and off.",
+            f"± {' to '.join(ends)} {self.short}. Dotted: nominal. Grey from bottom to top: not measured. Names in the "
+            "legend switch on and off.",
             "data": data,
             "layout": {
                 "xaxis": self.along(),

@@ -16,7 +16,7 @@ from pipefish.files import rounded
 from pipefish.intervals import Z95
 from pipefish.measured_files import COLOUR_SPAN, RING
 from pipefish.measured_limits import LIMITS, whole_sigma
-from pipefish.measured_texts import column, events_text
+from pipefish.measured_texts import column, event_text
 from pipefish.page import Chart
 from pipefish.report_charts import Charts
 
@@ -217,7 +217,7 @@ class Scene:
             "marker": {"size": 5, "symbol": "diamond", "color": "#b83a63"},
             "text": named(at, [e["kind"] for e in found], NAMED_APART * float(np.ptp(x))),
             "textposition": "top center",
-            "hovertext": [f"{e['kind']} {events_text(e, self.charts.unit)}" for e in found],
+            "hovertext": [f"{e['kind']} {event_text(e, self.charts.unit)}" for e in found],
             "hoverinfo": "text",
         }
         return [mark], place

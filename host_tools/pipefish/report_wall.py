@@ -61,7 +61,8 @@ def wall_picture(
         drawn = unroller.draw(first, min(PART, unroller.columns - first))
         stream = io.BytesIO()
         picture(drawn).convert("RGBA").save(stream, "WEBP", quality=QUALITY, method=4)
-        size = f"width='{drawn.grey.shape[1]}' height='{drawn.grey.shape[0]}'"
+        share = drawn.grey.shape[1] / min(PART, unroller.columns)  # on paper a part that is whole is as wide as that
+        size = f"width='{drawn.grey.shape[1]}' height='{drawn.grey.shape[0]}' style='--share: {share:.4f}'"
         images.append(f"<img src='{data_uri(stream.getvalue(), 'image/webp')}' {size} alt=''>")
         views.append(drawn.view)
     view = np.concatenate(views)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import ArgumentError
+from .intervals import Z95
 
 Floats = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def roc(score: ArrayLike, truth: ArrayLike) -> Roc:
 
 
 def auc_interval(auc: float, positives: int, negatives: int) -> tuple[float, float]:
-    """The areas from which `auc` is 1.96 of their own standard errors away."""
+    """The areas from which `auc` is Z95 of their own standard errors away."""
 
     def deviation(a: float) -> float:
         more = (positives + negatives) / 2 - 1
@@ -78,7 +79,7 @@ def auc_interval(auc: float, positives: int, negatives: int) -> tuple[float, flo
         inside, outside = auc, end
         for _ in range(60):  # halving: beyond the resolution of a double
             middle = (inside + outside) / 2
-            if abs(middle - auc) > 1.959964 * deviation(middle):
+            if abs(middle - auc) > Z95 * deviation(middle):
                 outside = middle
             else:
                 inside = middle

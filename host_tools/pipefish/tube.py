@@ -15,6 +15,7 @@ import numpy as np
 
 from pipefish import _engine, tube_shape
 from pipefish.errors import ArgumentError
+from pipefish.intervals import Z95
 from pipefish.tube_section import calipers, gradients, section_points, size
 from pipefish.tube_shared import Common, Shared
 
@@ -534,8 +535,8 @@ def _stations(
     out["ovality_squared"] = amplitude**2 - 16 * trace / d_mean**2  # the widths differ by 4 |e|
     one = np.maximum(np.hypot(out["ovality_sigma"], out["ovality_systematic"]), 1e-300)
     inside = amplitude / one < seen[-1]
-    out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - 1.96 * one)
-    out["ovality_hi"] = np.where(inside, one * np.interp(amplitude / one, seen, high), amplitude + 1.96 * one)
+    out["ovality_lo"] = np.where(inside, one * np.interp(amplitude / one, seen, low), amplitude - Z95 * one)
+    out["ovality_hi"] = np.where(inside, one * np.interp(amplitude / one, seen, high), amplitude + Z95 * one)
     out["oval"] = e**2 / np.maximum(trace / 2, 1e-300) > 5.99  # chi^2 of two, 95 %
     for name in ("curvature", "curvature_sigma", "gap", "rms", "roughness"):
         out[name] = f[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -10,9 +11,10 @@ import sys
 import pytest
 
 from device import Device
-from pipefish import cli
+from pipefish import cli, progress
 from pipefish.camera import Camera
 from pipefish.survey import Survey
+from pipefish.terminal import printable
 from synthetic import SURVEY, start, survey_objects, write_survey
 
 COMMANDS = [
@@ -190,6 +192,30 @@ def test_help_comes_on_a_terminal_without_the_letters():
 
 def test_a_terminal_without_the_letters_gets_others():
     """It would have got a traceback, after minutes of measuring."""
-    assert cli.printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
-    assert cli.printable("± 1 in \udcff.csv", "utf-8") == "± 1 in \\udcff.csv", "a name that is no text takes no ± away"
-    assert cli.printable("29.9 ± 0.25°", "latin-1") == cli.printable("29.9 ± 0.25°") == "29.9 ± 0.25°"
+    assert printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
+    assert printable("± 1 in \udcff.csv", "utf-8") == "± 1 in \\udcff.csv", "a name that is no text takes no ± away"
+    assert printable("29.9 ± 0.25°", "latin-1") == printable("29.9 ± 0.25°") == "29.9 ± 0.25°"
+
+
+class Terminal(io.StringIO):
+    """That rich takes for one."""
+
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("stream", [io.StringIO, Terminal])
+def test_what_is_told_meanwhile_commands_no_terminal(stream, monkeypatch):
+    """A device's words stand in warnings of the live measurement; they could have cleared the screen, and words in
+    square brackets ended the bar."""
+    monkeypatch.setattr(progress, "SHOW_AFTER_S", -1.0)
+    monkeypatch.setattr(sys, "stderr", stream())
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.Progress("measuring", 2) as bar:
+        bar.update(1, "note \x1b[2J [/b]")
+        bar.say("line \x1b[2J [/b]")
+    told = sys.stderr.getvalue()
+    assert "line \\u001b[2J [/b]" in told and "\x1b[2J" not in told
+    assert ("note \\u001b[2J [/b]" in told) is (stream is Terminal)

@@ -17,11 +17,13 @@ from device import Device
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
 from pipefish.live import Course, Live, progress_text, summary_rows
+from pipefish.measure import measure
+from pipefish.measured_files import summary as summary_of
 from pipefish.receive import Interrupted, receive
 from pipefish.survey import Survey
 from pipefish.surveywrite import OBJECT_KEYFRAME
 from pipefish.transport import open_transport
-from synthetic import SURVEY, Object, as_object
+from synthetic import SURVEY, Object, as_object, write_survey
 from test_reconstruct_cli import objects_of
 from tube_tracks import Drive, tube_drive
 
@@ -66,12 +68,24 @@ def test_the_newest_stretch_is_measured_as_it_arrives(objects, tmp_path):
     assert summary["d_mean"] == pytest.approx(0.3, rel=0.005)
     assert 0.0 < summary["from"] < 0.3 and summary["to"] > 2.3 and summary["stations"] > 25
     assert summary["ovality_most"] == pytest.approx(0.03, abs=0.006)
-    text = progress_text(course.progress())
-    assert text.startswith("2.50 m: diameter ") and "oval " in text
+    text, newest = progress_text(course.progress()), course.progress()["newest"]
+    half = 1960 * np.hypot(newest["d_mean_sigma"], newest["systematic"])
+    assert text.startswith("2.50 m: diameter ") and f" ± {half:.1f} mm at" in text and "oval " in text
     rows = dict(summary_rows(summary))
-    half = 1960 * summary["systematic"]
-    assert rows["warnings"] == "none" and f" ± {half:.1f} mm (scale and camera)" in rows["mean diameter"]
+    own, shared = 1960 * summary["d_mean_sigma_most"], 1960 * summary["systematic"]
+    told = f" ± {own:.1f} (repeatability, at most) ± {shared:.1f} (systematic: scale and camera)"
+    assert rows["warnings"] == "none" and told in rows["mean diameter"] and "along the pipe" in rows
     assert rows["intervals"] == "every ± is a 95 % interval"
+
+
+def test_what_is_said_of_the_mean_holds_for_what_is_measured_of_the_whole(drive, objects, tmp_path):
+    """Other windows and another mean: the bound of its repeatability is one for the whole survey's, too."""
+    course, _ = fed(objects, tmp_path / "a.mcap")
+    write_survey(tmp_path / "a.mcap", objects=objects)
+    live, whole = course.summary(), summary_of(measure(Survey.open(tmp_path / "a.mcap")))
+    assert live["d_mean_sigma_most"] >= whole["d_mean_sigma"]
+    apart = np.hypot(live["d_mean_sigma_most"], whole["d_mean_sigma"])
+    assert abs(live["d_mean"] - whole["d_mean"]) < 2 * apart
 
 
 def test_without_an_encoder_places_are_where_the_pictures_say(drive, tmp_path):

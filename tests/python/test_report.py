@@ -221,7 +221,9 @@ def test_commands_in_texts_are_shown_as_code(measured, tmp_path):
 
 def test_what_the_dense_map_found_is_told_and_shown(page):
     text = page.read_text()
-    cells = re.findall(r"<tr><td>(\w+)</td><td>([\d.]+) m</td><td>(\d+:\d\d)</td><td>([^<]*)</td><td>dense", text)
+    cells = re.findall(
+        r"<tr><td>(\w+)</td><td[^>]*>([\d.]+) m</td><td[^>]*>(\d+:\d\d)</td><td>([^<]*)</td><td[^>]*>dense", text
+    )
     kinds = {kind: (float(at), clock, size) for kind, at, clock, size in cells}
     assert set(kinds) == {"crack", "deposit", "step"}
     assert kinds["deposit"][1] == "5:55" and "height 4.0 ± 1.0 mm" in kinds["deposit"][2]
@@ -241,7 +243,7 @@ def test_a_map_of_another_reconstruction_is_left_out_or_refused(page, tmp_path, 
     (folder / "reconstruction.json").write_text(text)
     out = tmp_path / "r.html"
     assert main(["report", str(folder), "-o", str(out)]) == 0
-    assert "is a map of another reconstruction" in out.read_text() and "<td>dense map" not in out.read_text()
+    assert "is a map of another reconstruction" in out.read_text() and ">dense map</td>" not in out.read_text()
     capsys.readouterr()
     assert main(["report", str(folder), "-o", str(out), "--dense", str(folder / "dense")]) == 1
     assert "another reconstruction" in capsys.readouterr().err
@@ -324,6 +326,46 @@ def test_the_page_draws_itself_in_a_browser(page, tmp_path, width):
         assert at == pytest.approx(wall["start"] + share * wall["columns"] * wall["cell"], abs=0.01)
         assert abs(at - taken) < 0.04
     assert found["view"] > 100, "the picture of the keyframe is there"
+
+
+REDRAWS = """
+  const rest = () => new Promise((done) => setTimeout(done, 1000));
+  const plots = [...document.querySelectorAll(".plot")], main = document.querySelector("main");
+  const own = Plotly.react, out = { all: plots.map((p) => p.id) };
+  let drawn = [];
+  Plotly.react = function (place) { drawn.push(place.id); return own.apply(this, arguments); };
+  const after = async (name, event) => {
+    event();
+    await rest();
+    out[name] = drawn;
+    out[name + "_widths"] = plots.map((p) => [p.clientWidth, p.querySelector(".main-svg").clientWidth]);
+    drawn = [];
+  };
+  const tell = (event) => () => window.dispatchEvent(new Event(event));
+  await after("loaded", () => {});
+  await after("same", tell("resize"));
+  await after("chosen", () => document.querySelector(".choice select").dispatchEvent(new Event("change")));
+  await after("narrow", () => { main.style.maxWidth = "500px"; tell("resize")(); });
+  await after("paper", tell("beforeprint"));
+  const flat = document.querySelector("#plot-tube .on-paper");
+  const seen = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
+  out.inked = seen.filter((v, i) => i % 4 === 3 && v > 0).length / (seen.length / 4);
+  await after("screen", tell("afterprint"));
+  out.left = document.querySelectorAll(".on-paper").length;
+  return out;
+"""
+
+
+def test_only_what_has_another_size_is_drawn_again_and_paper_has_its_own(page, tmp_path):
+    """A phone's bars that come and go change no chart's size; a choice changes one chart; paper is as wide as A4."""
+    found = ask_page(page, REDRAWS, 1280, tmp_path)
+    assert found["same"] == [] and found["chosen"] == ["plot-ovality"]
+    for name in ("narrow", "paper", "screen"):
+        assert sorted(found[name]) == sorted(found["all"]), name
+        assert all(inner == outer for inner, outer in found[name + "_widths"]), name
+    assert {inner for inner, _ in found["paper_widths"]} == {655}
+    assert found["screen_widths"] == found["narrow_widths"] != found["loaded_widths"]
+    assert found["inked"] > 0.05 and found["left"] == 0, "the 3-D scene is on the paper, and only there"
 
 
 def test_without_the_survey_the_page_says_that_the_pictures_are_missing(measured, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from pipe_cloud import Pipe
 from pipefish import cli_tube
 from pipefish.cli import main
 from pipefish.cloudfile import ply_bytes, read_points
+from pipefish.measured_texts import event_text
 from pipefish.tube_section import calipers
 
 
@@ -390,7 +392,27 @@ def test_the_command_writes_profile_events_mesh_and_json(tmp_path: Path, capsys:
     assert len(vertices) > 1000
     assert main(command) == 0
     text = capsys.readouterr().out
-    assert "mean diameter" in text and "bend" in text
+    bend = document["events"][0] | {"chainage": document["events"][0]["s"]}
+    assert "mean diameter" in text and f"bend           {event_text(bend, 'metre')}\n" in text
+    metres = r"[\d.]+ ± [\d.]+ m"
+    assert re.search(rf"^bend +at {metres}, \d+:\d\d o'clock, [\d.]+ ± [\d.]+°, radius {metres}, from ", text, re.M)
+
+
+def test_a_finding_is_told_with_its_intervals() -> None:
+    """As `tube`, `reconstruct` and the report's picture tell it."""
+    joint = {"kind": "joint", "chainage": 1.2345, "s_sigma": 0.004, "clock": 1.5 * math.pi}
+    joint |= {"step": 0.004, "step_sigma": 0.0005, "gap": 0.02, "gap_sigma": 0.001, "angle": 0.02, "angle_sigma": 0.005}
+    told = "at 1.23 ± 0.01 m, 9:00 o'clock, gap 20.0 ± 2.0 mm, step 4.0 ± 1.0 mm, angle 1.15 ± 0.56°"
+    assert event_text(joint, "metre") == told
+    heap = {
+        "kind": "deposit",
+        "chainage": None,
+        "height": 0.01,
+        "height_sigma": 0.001,
+        "length": 0.1,
+        "size_sigma": 0.01,
+    }
+    assert event_text(heap, "metre") == "place unknown, height 10.0 ± 2.0 mm, length 100.0 ± 19.6 mm"
 
 
 def test_the_command_refuses_what_is_no_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

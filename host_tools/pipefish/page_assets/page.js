@@ -60,7 +60,8 @@
     const depths = places.map((p) => dot(p, back));
     return { eye: at(away), center: at((Math.min(...depths) + Math.max(...depths)) / 2) };
   };
-  const draw = () => {
+  for (const chart of page.charts) chart.place = document.getElementById("plot-" + chart.id);
+  const draw = (charts) => {
     const style = getComputedStyle(document.documentElement);
     const colour = (name) => style.getPropertyValue(name).trim();
     const axis = {
@@ -77,7 +78,7 @@
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 12 } },
       hoverlabel: { font: { size: 13 } },
     };
-    for (const chart of page.charts) {
+    for (const chart of charts) {
       const axes = {};
       for (const key of ["xaxis", "yaxis", "yaxis2"]) {
         if (chart.layout[key]) axes[key] = axis;
@@ -92,31 +93,60 @@
         axes.scene = { xaxis: side, yaxis: side, zaxis: side };
       }
       const whole = merge(merge(layout, axes), chart.layout);
-      const place = document.getElementById("plot-" + chart.id);
+      [whole.width, whole.height] = chart.size = [chart.place.clientWidth, chart.place.clientHeight];
       if (chart.along) {
-        const tall = place.clientHeight * (1 - whole.scene.domain.y[0]) - whole.margin.t;
-        whole.scene.camera = seen(chart, whole.scene, place.clientWidth / tall);
+        const tall = whole.height * (1 - whole.scene.domain.y[0]) - whole.margin.t;
+        whole.scene.camera = seen(chart, whole.scene, whole.width / tall);
       }
-      Plotly.react(place, chart.data, whole, { displayModeBar: false, responsive: true });
+      Plotly.react(chart.place, chart.data, whole, { displayModeBar: false });
     }
   };
-  draw();
-  dark.addEventListener("change", draw);
-  let waiting = 0; // a window that changes its shape is drawn for once it rests
-  window.addEventListener("resize", () => {
-    clearTimeout(waiting);
-    waiting = setTimeout(draw, 200);
-  });
-
   for (const chart of page.charts.filter((c) => c.choice)) {
     const select = document.getElementById("choice-" + chart.id);
-    const show = () => {
+    const choose = () => {
       chart.data.forEach((trace, i) => { trace.visible = Math.floor(i / chart.choice.traces) === select.selectedIndex; });
-      draw();
     };
-    select.addEventListener("change", show);
-    show(); // browsers keep a choice when a page is loaded again
+    select.addEventListener("change", () => { choose(); draw([chart]); });
+    choose(); // browsers keep a choice when a page is loaded again
   }
+  draw(page.charts);
+  dark.addEventListener("change", () => draw(page.charts));
+
+  // Only what has got another size, once the window rests: a phone's bars come and go as one scrolls.
+  const fit = () => {
+    draw(page.charts.filter(({ place, size }) => place.clientWidth !== size[0] || place.clientHeight !== size[1]));
+  };
+  let waiting = 0;
+  window.addEventListener("resize", () => {
+    clearTimeout(waiting);
+    waiting = setTimeout(fit, 200);
+  });
+  // No such event comes for paper, and how wide it is nobody tells: A4 with the style's margins holds so much of a card.
+  const shape = (width, height) => {
+    for (const { place } of page.charts) Object.assign(place.style, { width, height: height && height(place) });
+    fit();
+  };
+  window.addEventListener("beforeprint", () => {
+    shape("655px", (place) => place.clientHeight + "px");
+    // Of 3-D paper gets what the screen had last, in its old shape, but of a flat canvas what is on it.
+    for (const { place } of page.charts) {
+      place._fullLayout.scene?._scene?.glplot?.redraw();
+      for (const solid of place.querySelectorAll("canvas")) {
+        const flat = solid.cloneNode();
+        flat.getContext("2d").drawImage(solid, 0, 0);
+        flat.className = "on-paper";
+        solid.after(flat);
+        solid.style.visibility = "hidden";
+      }
+    }
+  });
+  window.addEventListener("afterprint", () => {
+    for (const flat of document.querySelectorAll(".on-paper")) {
+      flat.previousElementSibling.style.visibility = "";
+      flat.remove();
+    }
+    shape("", "");
+  });
 
   // The unrolled wall: the place under the pointer, and the keyframe that shows it.
   const wall = page.wall;
