@@ -36,7 +36,8 @@ pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long number, void *argument, const c
 {
     if (pf_v4l2_ioctl(c, number, argument) == 0)
         return PF_OK;
-    return pf_fail(c->failure, PF_ERR_IO, "%s: %s: %s", c->device, what, strerror(errno));
+    return pf_fail(c->failure, errno == EBUSY ? PF_ERR_AGAIN : PF_ERR_IO, "%s: %s: %s", c->device, what,
+                   strerror(errno));
 }
 
 /* Gives the kernel all buffers that nobody holds; one that is refused is tried again with the next frame. */
@@ -95,9 +96,9 @@ static pf_status map_buffers(pf_v4l2 *c, uint32_t n)
 static pf_status take_buffers(pf_v4l2 *c, uint32_t wish, pf_session_info *info)
 {
     struct v4l2_requestbuffers r = {.count = wish, .type = c->type, .memory = V4L2_MEMORY_MMAP};
-    if (pf_v4l2_ioctl(c, VIDIOC_REQBUFS, &r) != 0)
-        return pf_fail(c->failure, errno == EBUSY ? PF_ERR_AGAIN : PF_ERR_IO, "%s: gives no buffers: %s", c->device,
-                       strerror(errno)); /* busy: another program has it now */
+    pf_status status = pf_v4l2_call(c, VIDIOC_REQBUFS, &r, "gives no buffers");
+    if (status != PF_OK)
+        return status;
     info->buffers = r.count < PF_SESSION_BUFFERS_MAX ? r.count : PF_SESSION_BUFFERS_MAX;
     return map_buffers(c, info->buffers);
 }
@@ -111,8 +112,9 @@ static pf_status v4l2_open(void *self, const pf_session_wish *wish, pf_session_i
     (void)snprintf(info->id, sizeof info->id, "%s", wish->device);
     c->fd = c->io.open(c->io.self, c->device);
     if (c->fd < 0)
-        return pf_fail(failure, errno == ENOENT || errno == ENODEV || errno == ENXIO ? PF_ERR_AGAIN : PF_ERR_IO,
-                       "%s: %s", c->device, strerror(errno));
+        return pf_fail(
+            failure, errno == ENOENT || errno == ENODEV || errno == ENXIO || errno == EBUSY ? PF_ERR_AGAIN : PF_ERR_IO,
+            "%s: %s", c->device, strerror(errno));
     pf_status status = pf_v4l2_negotiate(c, wish, info);
     if (status == PF_OK) {
         c->is_compressed = info->format->layout == PF_LAYOUT_JPEG;

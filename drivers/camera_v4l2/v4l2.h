@@ -56,7 +56,8 @@ typedef struct pf_v4l2 {
 /* All calls of the device go through it. */
 int pf_v4l2_ioctl(pf_v4l2 *c, unsigned long request, void *argument);
 
-/* The same with the device's name in the failure. */
+/* The same with the device's name in the failure. PF_OK; PF_ERR_AGAIN (busy: another program has it now, and drivers
+ * say so to the first call that would change anything); PF_ERR_IO. */
 pf_status pf_v4l2_call(pf_v4l2 *c, unsigned long request, void *argument, const char *what);
 
 /* negotiate.c: format, size and rate of an open device. Fills those of *info, or says why not. PF_ERR_AGAIN: it has no

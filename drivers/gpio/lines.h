@@ -22,7 +22,7 @@ typedef struct pf_line_place {
     bool is_active_low;
 } pf_line_place;
 
-/* PF_OK; PF_ERR_END (no such line); PF_ERR_FORMAT (not a name). */
+/* PF_OK; PF_ERR_END (no such line); PF_ERR_FORMAT (not a name, or that of several lines). */
 pf_status pf_line_find(const char *name, pf_line_place *place, pf_failure *failure);
 
 typedef struct pf_line_output pf_line_output;

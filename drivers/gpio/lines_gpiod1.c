@@ -7,7 +7,6 @@
 #include <fcntl.h>
 #include <gpiod.h>
 #include <linux/gpio.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/ioctl.h>
@@ -25,19 +24,6 @@ struct pf_edges {
     int fd;
     uint32_t n, offset[PF_EDGES_LINES_MAX];
 };
-
-pf_status pf_line_find(const char *name, pf_line_place *place, pf_failure *failure)
-{
-    const char *plain;
-    char chip[64];
-    pf_status status = pf_line_parse(name, place, &plain, failure);
-    if (status != PF_OK || place->chip[0] != '\0')
-        return status;
-    if (gpiod_ctxless_find_line(plain, chip, sizeof chip - 5, &place->offset) != 1)
-        return pf_fail(failure, PF_ERR_END, "gpio: no line is named %s", plain);
-    (void)snprintf(place->chip, sizeof place->chip, "/dev/%.58s", chip);
-    return PF_OK;
-}
 
 pf_status pf_line_output_open(pf_line_output **output, const pf_line_place *place, pf_failure *failure)
 {

@@ -2,11 +2,9 @@
 #include "gpio/lines.h"
 #include "gpio/place.h"
 
-#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <gpiod.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -23,33 +21,6 @@ struct pf_edges {
     struct gpiod_edge_event_buffer *buffer;
     uint32_t n, offset[PF_EDGES_LINES_MAX];
 };
-
-pf_status pf_line_find(const char *name, pf_line_place *place, pf_failure *failure)
-{
-    const char *plain;
-    pf_status status = pf_line_parse(name, place, &plain, failure);
-    if (status != PF_OK || place->chip[0] != '\0')
-        return status;
-    DIR *folder = opendir("/dev");
-    for (const struct dirent *e = folder ? readdir(folder) : NULL; e != NULL && place->chip[0] == '\0';
-         e = readdir(folder)) {
-        char path[64];
-        if (strncmp(e->d_name, "gpiochip", 8) != 0)
-            continue;
-        (void)snprintf(path, sizeof path, "/dev/%.58s", e->d_name);
-        struct gpiod_chip *chip = gpiod_chip_open(path);
-        int offset = chip != NULL ? gpiod_chip_get_line_offset_from_name(chip, plain) : -1;
-        if (offset >= 0) {
-            memcpy(place->chip, path, sizeof place->chip);
-            place->offset = (uint32_t)offset;
-        }
-        if (chip != NULL)
-            gpiod_chip_close(chip);
-    }
-    if (folder != NULL)
-        (void)closedir(folder);
-    return place->chip[0] != '\0' ? PF_OK : pf_fail(failure, PF_ERR_END, "gpio: no line is named %s", plain);
-}
 
 /* Asks for lines of one chip; NULL and errno. */
 static struct gpiod_line_request *request_lines(const pf_line_place *places, uint32_t n, bool is_input, pf_pull pull)

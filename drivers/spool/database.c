@@ -7,7 +7,10 @@
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/statvfs.h>
 #include <unistd.h>
+
+#define ROOM_BYTES UINT64_C(8388608) /* twice what the log has between two checkpoints */
 
 static const char *const sql[SQL_STATEMENTS] = {
     [SQL_BEGIN] = "BEGIN IMMEDIATE",
@@ -26,6 +29,7 @@ static const char *const sql[SQL_STATEMENTS] = {
     [SQL_VICTIMS] = ("SELECT e.row, e.number, length(o.bytes) FROM evictable e JOIN object o ON o.row = e.row "
                      "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3"),
     [SQL_KEEP_ALL] = "DELETE FROM evictable",
+    [SQL_FREE_PAGES] = "PRAGMA freelist_count",
 };
 
 static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
@@ -350,6 +354,29 @@ void pf_spool_leave(pf_spool_database *d)
     if (d->is_damaged)
         (void)pf_spool_heal(d);
     pthread_mutex_unlock(&d->mutex);
+}
+
+/* Removing takes room too: in the log, and, before the log can begin anew, in the file for what the log still has. A
+ * spool that had filled the disk to the last byte could never get rid of anything again, so some is left. What comes
+ * instead of others takes a page more now and then. */
+pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
+{
+    struct statvfs disk;
+    sqlite3_stmt *q = pf_spool_prepare(d, SQL_FREE_PAGES);
+    if (sqlite3_step(q) != SQLITE_ROW) {
+        sqlite3_reset(q);
+        return pf_spool_fail(d, "storing");
+    }
+    const uint64_t pages = n / (PF_SPOOL_PAGE - 4) + 8, unused = (uint64_t)sqlite3_column_int64(q, 0);
+    sqlite3_reset(q);
+    if (pages <= unused || statvfs(d->path, &disk) != 0)
+        return PF_OK;
+    const uint64_t growth = (pages - unused) * PF_SPOOL_PAGE, left = (uint64_t)disk.f_bavail * disk.f_frsize;
+    if (left >= (is_exchange ? ROOM_BYTES / 2 : ROOM_BYTES) + 2 * growth)
+        return PF_OK;
+    d->stats.errors++;
+    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: the disk is full: the last %" PRIu64 " bytes are for removing",
+                   d->path, left);
 }
 
 pf_status pf_spool_fail_read_only(pf_spool_database *d)

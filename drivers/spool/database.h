@@ -25,6 +25,7 @@ typedef enum pf_spool_statement {
     SQL_RANK,
     SQL_VICTIMS,
     SQL_KEEP_ALL,
+    SQL_FREE_PAGES,
     SQL_STATEMENTS,
 } pf_spool_statement;
 
@@ -68,7 +69,11 @@ bool pf_spool_run(pf_spool_database *d, pf_spool_statement which);
 /* The call that failed is counted and told in SQLite's words. PF_ERR_SPACE, else PF_ERR_IO. */
 pf_status pf_spool_fail(pf_spool_database *d, const char *doing);
 
-/* Likewise where the medium is read-only: later it may be written. PF_ERR_SPACE. */
+/* Whether an object of n bytes may make the file larger, if it has to: inside the open transaction, after what has gone
+ * for it (is_exchange). PF_OK; PF_ERR_SPACE, counted and told; PF_ERR_IO. */
+pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange);
+
+/* As pf_spool_fail where the medium is read-only: later it may be written. PF_ERR_SPACE. */
 pf_status pf_spool_fail_read_only(pf_spool_database *d);
 
 #endif

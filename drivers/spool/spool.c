@@ -63,6 +63,9 @@ static pf_status insert(pf_spool_database *d, const object *o, uint64_t freed, b
         return pf_fail(&d->failure, PF_ERR_SPACE, "%s: quota: %" PRIu64 " bytes wait, %zu more are above %" PRIu64,
                        d->path, bytes, o->n, d->quota);
     }
+    pf_status status = pf_spool_check_disk(d, o->n, freed > 0);
+    if (status != PF_OK)
+        return status;
     sqlite3_stmt *put = pf_spool_prepare(d, SQL_PUT);
     (void)sqlite3_bind_int64(put, 1, o->kind);
     (void)sqlite3_bind_blob(put, 2, o->name, 32, SQLITE_STATIC);

@@ -96,6 +96,32 @@ def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path
     assert lost_indices(second) == set(), "a fast replay waits until it can be stored"
 
 
+@pytest.mark.parametrize("speed", ["fast", "recorded"])
+def test_a_spool_that_has_filled_the_disk_makes_room_and_goes_on_once_a_host_comes(
+    tmp_path: Path, crawler: Crawler, speed: str
+):
+    """Removing takes room too, in SQLite's log: without some that is left nothing could be removed for ever after. A
+    camera's keyframes make room for each other; a replay waits."""
+    with mounted(tmp_path / "medium", "size=13m") as medium:
+        arguments = ("--set", f"spool.path={medium}/spool.db", "--set", "camera.loops=0", *EVERY_FRAME)
+        crawler.start("--set", f"camera.speed={speed}", *arguments)
+        wait_for_status(crawler, lambda s: "full" in s["spool_trouble"] or s["spool"]["evicted"] > 10)
+        if speed == "recorded":
+            wait_for_status(crawler, lambda s: s["spool"]["evicted"] > 10)
+        crawler.kill()  # its log stays as it is
+        crawler.start("--set", f"camera.speed={speed}", *arguments)
+        store = Store(crawler.port)
+        with store.client(crawler) as client:
+            serve(crawler, client, lambda: len(store.objects) > 200 and crawler.status()["spool"]["stored"] > 100)
+            crawler.terminate()
+            serve(crawler, client, lambda: False)
+        assert crawler.wait() == 0
+    [end] = store.ends
+    got = {k.index for k in store.keyframes}
+    assert got | lost_indices(end) == set(range(end.keyframes)) and set(store.arrivals.values()) == {1}
+    assert (lost_indices(end) == set()) == (speed == "fast")
+
+
 def test_a_frame_index_on_a_full_medium_ends_with_a_whole_row_and_keeps_no_survey_from_starting(
     tmp_path: Path, crawler: Crawler
 ):

@@ -164,6 +164,9 @@ static int fake_ioctl(void *self, int fd, unsigned long request, void *argument)
     case VIDIOC_ENUM_FRAMEINTERVALS:
         return enumerate(request, argument);
     case VIDIOC_S_FMT:
+        errno = EBUSY; /* as all drivers say as soon as another file has buffers */
+        if (k.is_busy && k.is_busy_early)
+            return -1;
         k.fourcc = ((struct v4l2_format *)argument)->fmt.pix.pixelformat;
         return set_format(argument);
     case VIDIOC_G_FMT:
