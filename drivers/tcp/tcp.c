@@ -13,7 +13,8 @@
 
 /* A page in a browser can have any bytes sent to loopback, behind a request's first line. It must not have the line,
  * nor try session after session until it hits one. */
-#define LINK_BEGINS 0 /* the delimiter in front of the first frame (lib/link/SPEC.md) */
+#define LINK_BEGINS 0                   /* the delimiter in front of the first frame (lib/link/SPEC.md) */
+#define BEGIN_NS    UINT64_C(200000000) /* a connection that says nothing for so long, as browsers hold some ready */
 
 typedef struct tcp {
     pf_lines lines; /* first: what a line belongs to is a tcp */
@@ -34,7 +35,8 @@ static void take(pf_line *l, int fd)
 
 static bool has_host(const tcp *t, uint64_t now)
 {
-    return t->host.fd >= 0 && (t->lines.silence_ns == 0 || now - t->lines.heard_ns < t->lines.silence_ns);
+    const uint64_t most = t->host.has_begun ? t->lines.silence_ns : BEGIN_NS;
+    return t->host.fd >= 0 && (most == 0 || now - t->lines.heard_ns < most);
 }
 
 /* The host has hung up; what it said last is to be read first, and the next one waits for so long. */

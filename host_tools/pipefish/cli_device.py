@@ -61,7 +61,7 @@ def add_receive(commands: Any) -> None:
         "-o", "--output", required=True, metavar="FILE", help="survey file; FILE.partial until it is complete"
     )
     p.add_argument("--live", action="store_true", help="measure the pipe meanwhile: diameter, ovality, warnings")
-    p.add_argument("--overwrite", action="store_true", help="start anew; FILE stays until the new survey is complete")
+    p.add_argument("--overwrite", action="store_true", help="replace FILE, once the new survey is complete")
     p.add_argument(
         "--timeout",
         type=not_negative,

@@ -53,11 +53,15 @@ def parse_key(text: str) -> str:
 
 
 def certificate_key(der: bytes) -> str:
-    """The key that a certificate (DER) carries."""
+    """The key that a certificate (DER) carries. Raises ValueError: none that can be read."""
     from cryptography import x509
+    from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-    public = x509.load_der_x509_certificate(der).public_key()
+    try:
+        public = x509.load_der_x509_certificate(der).public_key()
+    except (x509.InvalidVersion, UnsupportedAlgorithm) as error:
+        raise ValueError(str(error)) from error
     return hashlib.sha256(public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).hexdigest()
 
 

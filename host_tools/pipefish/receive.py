@@ -20,6 +20,7 @@ from pipefish.surveywrite import (
     OBJECT_START,
     BootClock,
     Content,
+    is_of,
     partial_of,
     read_content,
 )
@@ -168,6 +169,14 @@ class Receiver(ObjectHandlers):
         if self.complete:
             self._linger()
 
+    def settle(self) -> None:
+        """Where an interrupted run has stored the survey's last object: tells the device, if it is there, that all is
+        here. Else it would deliver the rest once more, into the next survey's files."""
+        with contextlib.suppress(PipefishError):
+            self.client.open()
+            self.client.run(lambda: self.client.up, LINGER_S)
+            self._linger()
+
     def _check_rest(self) -> None:
         """Raises PipefishError if the device has nothing more to send and yet the survey is not all here.
 
@@ -204,7 +213,7 @@ class Receiver(ObjectHandlers):
         else:
             file, what = writer.partial, ", ".join(missing)
             text = f"the device has nothing more to send, but the survey in {file} is not complete: {what} missing"
-        others = [str(p) for p in sorted(file.parent.glob("*.partial")) if p != file and _is_of(p, primary)]
+        others = [str(p) for p in sorted(file.parent.glob("*.partial")) if p != file and is_of(p, primary)]
         if others:
             text += f"; {' and '.join(others)} of an earlier reception of this survey may hold that"
         return text
@@ -271,13 +280,6 @@ class Receiver(ObjectHandlers):
         }
 
 
-def _is_of(partial: Path, survey_id: bytes) -> bool:
-    try:
-        return read_content(partial).survey_id == survey_id
-    except (OSError, PipefishError):
-        return False
-
-
 def receive(
     transport: Transport,
     path: Path,
@@ -313,7 +315,9 @@ def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], qui
     recovered = store.recovered
     why = "stopped"
     try:
-        if not receiver.complete:
+        if receiver.complete:
+            receiver.settle()
+        else:
             try:
                 receiver.client.open()
             except TransportClosed as error:  # it may be about to start, or about to be plugged in

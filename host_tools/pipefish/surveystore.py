@@ -22,6 +22,7 @@ from pipefish.surveywrite import (
     BootClock,
     BusyError,
     SurveyWriter,
+    is_of,
     locked,
     partial_of,
     read_content,
@@ -49,7 +50,8 @@ class SurveyStore:
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
         """`overwrite`: `path` and its partial file may be replaced; they are not touched before there is something to
-        replace them with.
+        replace them with. A partial file of the survey that the device goes on to deliver is gone on with all the same:
+        what it holds is no longer on the device.
 
         Raises PipefishError if `path` exists already and must not be overwritten, or another process writes it."""
         self.path = path
@@ -129,14 +131,16 @@ class SurveyStore:
         path, is_primary = self.path, survey_id == self.primary
         if not is_primary:
             path = next(p for p in map(self._numbered, count(2)) if p in self._empty or not self._is_taken(p))
+        anew = is_primary and self._old is not None and not is_of(partial_of(path), survey_id)
         if is_primary and self._old is not None:
             self._old.close()
             self._old = None
-        writer = self._empty.pop(path, None) or SurveyWriter(path, self._overwrite and is_primary)
+        writer = self._empty.pop(path, None) or SurveyWriter(path, self._overwrite and is_primary, anew)
         if writer.content.survey_id not in (b"", survey_id):  # it was not there when we started
             writer.close()
             raise BusyError(f"{writer.partial} is of another survey, which another pipefish receive has begun")
         self.writers[survey_id] = writer
+        self._names |= writer.content.names
         return writer
 
     def _is_taken(self, path: Path) -> bool:
@@ -177,6 +181,8 @@ class SurveyStore:
         if message.survey_id not in self.writers and self._in_finished(message.survey_id, name):
             return True
         writer = self.writer(message.survey_id)
+        if name in self._names:
+            return True
         writer.store(name, kind, message, len(data), measured.get(message.time.boot_id), now_unix_ns)
         self._names.add(name)
         return True

@@ -193,8 +193,8 @@ class SurveyWriter:
     The partial file is locked from here to `finish` or `close`: two receptions cannot write one file.
     """
 
-    def __init__(self, path: Path, overwrite: bool = False) -> None:
-        """`overwrite`: begin anew in place of an old partial file, and let `finish` replace an old survey.
+    def __init__(self, path: Path, overwrite: bool = False, anew: bool = False) -> None:
+        """`overwrite`: let `finish` replace an old survey. `anew`: begin anew in place of an old partial file.
 
         Raises PipefishError when another process writes the file, or `path` is a finished survey; OSError."""
         self.path = path
@@ -215,7 +215,7 @@ class SurveyWriter:
             fresh.unlink(missing_ok=True)  # of a recovery that was interrupted; the lock makes it ours
             self._create(fresh)
             try:
-                if overwrite:
+                if anew:
                     self._sync()
                 else:
                     self._recover()
@@ -419,6 +419,14 @@ def profile_json(binary: bytes) -> str | None:
 def partial_of(path: Path) -> Path:
     """The name of a survey file while it is being received."""
     return path.with_name(path.name + ".partial")
+
+
+def is_of(path: Path, survey_id: bytes) -> bool:
+    """Whether a file, finished or partial, is of this survey."""
+    try:
+        return read_content(path).survey_id == survey_id
+    except (OSError, PipefishError):
+        return False
 
 
 def read_content(path: Path) -> Content:

@@ -25,7 +25,7 @@ def statistics(survey: Survey) -> dict[str, np.ndarray]:
     result["quality_median"] = np.where(found, np.array([p.quality_median for p in parts]) / 32768.0, np.nan)
     counted = [frames_in(p) for p in parts]
     for name, _ in STATES:
-        result[name] = np.array([c[name] for c in counted], dtype=int)
+        result[name] = np.array([c[name] for c in counted], dtype=np.uint64)
     return result
 
 

@@ -238,6 +238,13 @@ def test_a_device_that_hangs_up_on_a_handshake_is_told_in_words_of_its_own():
             TlsTransport("127.0.0.1", server.getsockname()[1]).open()
 
 
+def test_a_certificate_of_a_version_that_is_none_carries_no_key(tmp_path: Path):
+    own_certificate(tmp_path / "pem", "2000-01-01", "2100-01-01")
+    der = x509.load_pem_x509_certificate((tmp_path / "pem").read_bytes()).public_bytes(Encoding.DER)
+    with pytest.raises(ValueError, match="5 is not a valid"):
+        keys.certificate_key(der.replace(b"\xa0\x03\x02\x01\x02", b"\xa0\x03\x02\x01\x05", 1))
+
+
 def test_a_stranger_cannot_choose_a_slow_key_exchange(device: Crawler):
     key = let_in(device, "operator")
     assert key

@@ -27,8 +27,9 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
 from pipefish.receive import Interrupted, receive
 from pipefish.survey import Survey
+from pipefish.surveystore import SurveyStore
 from pipefish.transport import SerialTransport, TcpTransport, TransportClosed, open_transport
-from synthetic import BOOT, SURVEY, end, keyframe, name_of, start, survey_objects
+from synthetic import BOOT, SURVEY, end, keyframe, name_of, start, store_all, survey_objects, write_survey
 
 
 def receive_from(device: Device, path: Path, **options):
@@ -131,6 +132,37 @@ def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path):
         receive_from(device, path)
     names = [r.sha256 for r in Survey.open(path).receipts]
     assert sorted(names) == sorted(n for n, _, _ in objects)
+
+
+def store_as_if_killed(path, objects) -> None:
+    """What a run leaves that was killed when it had stored these."""
+    store = SurveyStore(path)
+    store_all(store, objects)
+    store.close()
+
+
+def test_what_a_killed_run_stored_last_is_not_delivered_into_the_next_survey_s_files(tmp_path):
+    """Killed between the last object's storing and the device's hearing of it."""
+    objects = survey_objects(4)
+    store_as_if_killed(tmp_path / "a.mcap", objects)
+    with Device(objects[-3:], SURVEY) as device:
+        assert receive_from(device, tmp_path / "a.mcap")["keyframes"] == 4
+        assert not device.spool
+    store_as_if_killed(tmp_path / "b.mcap", objects)
+    assert receive_from(device, tmp_path / "b.mcap")["keyframes"] == 4, "without the device it is complete all the same"
+
+
+def test_overwrite_said_again_does_not_drop_what_the_device_has_forgotten(tmp_path):
+    """The same command goes on from there: also the one with --overwrite."""
+    path, objects = tmp_path / "a.mcap", survey_objects(8)
+    write_survey(path, objects=survey_objects(2, survey=bytes(15) + b"\x01"))
+    store_as_if_killed(tmp_path / "b.mcap", objects[:6])
+    (tmp_path / "b.mcap.partial").rename(tmp_path / "a.mcap.partial")
+    with Device(objects[4:], SURVEY) as device:  # of two it has not heard that they are stored
+        receive_from(device, path, overwrite=True)
+    survey = Survey.open(path)
+    assert survey.complete and len(survey.receipts) == len(objects) and len(survey.keyframes) == 8
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_ctrl_c_leaves_a_file_to_resume_and_says_so(tmp_path):

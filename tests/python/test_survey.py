@@ -268,12 +268,18 @@ def test_pictures_that_are_made_up_cost_no_memory_and_are_named(tmp_path, size, 
     assert "internal error" not in capsys.readouterr().err
 
 
-def test_numbers_that_are_none_stand_in_json_as_null(tmp_path, capsys):
+def test_numbers_that_are_none_are_shown_and_stand_in_json_as_null(tmp_path, capsys):
     message = pb.SurveyStart.FromString(start()[2])
     message.frame_rate = float("nan")
     message.encoder.metres_per_count = 1e308
-    frames = [keyframe(i) for i in range(8)]
+    frames = [keyframe(i) for i in range(7)]
+    last = pb.Keyframe.FromString(keyframe(7)[2])
+    last.tracking.frames, last.tracking.tracked = 2**64 - 1, 2**64 - 1
+    last.tracking.state_frames.append(2**64 - 1)
+    frames.append(as_object(OBJECT_KEYFRAME, last))
     write_survey(tmp_path / "a.mcap", objects=[as_object(OBJECT_START, message), *frames, end(8)])
+    assert main(["show", str(tmp_path / "a.mcap"), "--stats", "-o", str(tmp_path / "a.html"), "--json"]) == 0
+    capsys.readouterr()
     assert main(["info", str(tmp_path / "a.mcap"), "--json"]) == 0
     info = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert info["frame_rate"] is None and info["keyframes"] == 8

@@ -255,6 +255,22 @@ static void test_a_request_of_a_browser_is_closed(void)
     close(browser);
 }
 
+/* Proves: a connection that a browser holds ready, and that says nothing, gives the line to the next that comes. */
+static void test_a_connection_that_never_began_makes_room(void)
+{
+    bool fresh = false;
+    open_listener("127.0.0.1");
+    int idle = connect_anything();
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    TEST_ASSERT_TRUE(fresh);
+    (void)usleep(300000);
+    int host = connect_client();
+    accept_client();
+    close(host);
+    close(idle);
+}
+
 /* Proves: a client that is silent for too long loses the line to the next. */
 static void test_a_silent_client_makes_room(void)
 {
@@ -367,6 +383,7 @@ int main(void)
     RUN_TEST(test_connect_disconnect_reconnect);
     RUN_TEST(test_others_look_on);
     RUN_TEST(test_a_request_of_a_browser_is_closed);
+    RUN_TEST(test_a_connection_that_never_began_makes_room);
     RUN_TEST(test_a_silent_client_makes_room);
     RUN_TEST(test_room_bounds_the_queue);
     RUN_TEST(test_other_addresses_are_refused);
