@@ -403,7 +403,7 @@ bool pf_config_check(const pf_config *c, const char *file, char *error, size_t n
 {
     const char *why = NULL;
     if (c->camera.driver == PF_CAMERA_REPLAY && c->camera.path[0] == '\0')
-        why = "camera.path: must be set: the recording to play";
+        why = "camera.path: must be set: the recording to play; or camera.driver, for a camera";
     else if ((c->camera.width == 0) != (c->camera.height == 0))
         why = "camera.width and camera.height: both or neither";
     else if (c->camera.profile[0] != '\0' && c->camera.profile_store[0] != '\0')

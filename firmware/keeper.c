@@ -61,6 +61,12 @@ static bool check_bytes(pf_keeper *k, size_t n, const char *what)
     return false;
 }
 
+static void log_profile(const pf_profile *profile, const char *what)
+{
+    const char *serial = profile->serial[0] != '\0' ? ", serial " : "";
+    pf_log(PF_LOG_INFO, "profile %s%s%s%s", profile->name, serial, profile->serial, what);
+}
+
 /* Loads what counts into k->bytes and k->profile, and notes it as the stored one. False: there is none that can be
  * used, *is_trial says whether it was on trial. */
 static bool load(pf_keeper *k, size_t *n, bool *is_trial)
@@ -103,7 +109,7 @@ static void take_into_use(pf_keeper *k)
     d->profile = k->profile;
     memcpy(d->profile_bytes, k->bytes, n);
     memcpy(d->profile_sha256, k->stored.sha256, sizeof d->profile_sha256);
-    pf_log(PF_LOG_INFO, "profile %s, serial %s%s", k->profile.name, k->profile.serial, is_trial ? ", on trial" : "");
+    log_profile(&k->profile, is_trial ? ", on trial" : "");
 }
 
 /* Counts this start. What cannot be written now keeps nobody from surveying with the profile that is confirmed; one on
@@ -251,7 +257,7 @@ static bool store_profile(pf_keeper *k, const pf_keeper_job *job)
         set_problem(k, "the profile reads back otherwise");
         return false;
     }
-    pf_log(PF_LOG_INFO, "profile %s, serial %s: stored, on trial", k->profile.name, k->profile.serial);
+    log_profile(&k->profile, ": stored, on trial");
     return true;
 }
 

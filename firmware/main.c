@@ -159,6 +159,11 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
     d->profile_size = fread(bytes, 1, sizeof bytes, in);
     is_read = ferror(in) == 0;
     (void)fclose(in);
+    if (is_read && d->profile_size > 0 && bytes[0] == '{') {
+        (void)snprintf(error, n, "camera.profile: %s: JSON; `pipefish profile convert` makes a binary profile of it",
+                       path);
+        return false;
+    }
     if (!is_read || d->profile_size > PF_PROFILE_BINARY_MAX) {
         (void)snprintf(error, n, "camera.profile: %s: %s", path,
                        is_read ? "too large: not a binary profile" : "cannot be read");

@@ -165,7 +165,9 @@ static pf_status read_header(pf_y4m *y4m, uint64_t *size, uint64_t *chroma, pf_f
     if (status != PF_OK)
         return status;
     if (length < sizeof magic || memcmp(line, magic, sizeof magic - 1) != 0 || (line[9] != ' ' && line[9] != '\n'))
-        return pf_fail(failure, PF_ERR_FORMAT, "%s: byte 0: not a Y4M file (must begin with %s)", y4m->name, magic);
+        return pf_fail(failure, PF_ERR_FORMAT,
+                       "%s: byte 0: not a Y4M file, which begins with %s (make one with ffmpeg -pix_fmt gray)",
+                       y4m->name, magic);
     status = read_line(y4m, 0, line, &length, failure);
     if (status != PF_OK)
         return status;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
@@ -206,6 +207,8 @@ def message_of(error: BaseException) -> str:
     match error:
         case PipefishError():
             return str(error)
+        case FileNotFoundError() if error.filename and os.path.exists(f"{error.filename}.partial"):
+            return f"{error.filename}: {error.strerror}; {error.filename}.partial is there: not complete yet"
         case OSError():
             return f"{error.filename}: {error.strerror}" if error.filename else str(error)
         case KeyboardInterrupt():

@@ -82,11 +82,10 @@ def hosts_text(status: Any) -> str:
 
 
 def run_status(args: argparse.Namespace) -> Result:
-    from google.protobuf.json_format import MessageToDict
-
     from pipefish import pipefish_pb2 as pb
     from pipefish.cli_flash import stored_text
     from pipefish.client import Client, Handlers
+    from pipefish.plain import plain
     from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
@@ -97,10 +96,7 @@ def run_status(args: argparse.Namespace) -> Result:
         status = client.answer_to(args.timeout, get_status=pb.Nothing()).status
     finally:
         client.close()
-    document = {
-        "info": MessageToDict(info, preserving_proto_field_name=True, always_print_fields_with_no_presence=True),
-        "status": MessageToDict(status, preserving_proto_field_name=True, always_print_fields_with_no_presence=True),
-    }
+    document = {"info": plain(info), "status": plain(status)}
     link, stage = status.link, status.stage
     rows = [
         ("device", info.software),

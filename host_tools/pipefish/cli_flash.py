@@ -12,15 +12,15 @@ from pipefish.errors import PipefishError
 
 def stored_text(profile: Any) -> str:
     """A pb.Profile for people."""
-    trial = f", on trial, {profile.starts_left} more starts" if profile.trial else ""
+    starts = f"{profile.starts_left} more start{'s' if profile.starts_left != 1 else ''}"
+    trial = f", on trial, {starts}" if profile.trial else ""
     serial = f", serial {profile.serial}" if profile.serial else ""
     return f"{profile.name or 'unnamed'}{serial} ({profile.crc32c:08x}){trial}"
 
 
 def run_flash(args: argparse.Namespace) -> Result:
-    from google.protobuf.json_format import MessageToDict
-
     from pipefish.flash import Flasher
+    from pipefish.plain import plain
     from pipefish.transport import open_transport
 
     if sum(map(bool, (args.profile, args.confirm, args.revert))) > 1:
@@ -39,10 +39,7 @@ def run_flash(args: argparse.Namespace) -> Result:
                 raise PipefishError("the device has no profile that could be confirmed")
             state = device.confirm(state.stored.sha256)
     document = {
-        name: MessageToDict(profile, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
-        | {"sha256": profile.sha256.hex(), "crc32c": f"{profile.crc32c:08x}"}
-        if state.HasField(name)
-        else None
+        name: plain(profile) | {"crc32c": f"{profile.crc32c:08x}"} if state.HasField(name) else None
         for name, profile in (("in_use", state.in_use), ("stored", state.stored))
     }
     document["problem"] = state.problem or None

@@ -112,8 +112,8 @@ def add_match(commands: Any) -> None:
         choices=FILTERS,
         help="keep only matches that fit their neighbours and are no small islands (consistent), that the reverse "
         "direction confirms (both-ways), that fit the one plane or rigid motion that most agree with (pinhole "
-        "pictures; rigid: the motion, if 78 % of the picture agree), or that are the only place on their epipolar line "
-        "which looks like it (unique: by --pose, else by the rigid motion that most agree with); may be repeated; "
+        "pictures; rigid: the motion, if 78 %% of the picture agree), or that are the only place on their epipolar "
+        "line which looks like it (unique: by --pose, else by the rigid motion that most agree with); may be repeated; "
         "none: all that grew [consistent and rigid; with a fisheye's --profile consistent]",
     )
     p.add_argument("--threads", type=positive, default=1, metavar="N", help="do not change the result [1]")

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from pipefish.terminal import printable, say
 
 SHOW_AFTER_S = 2.0
+NOTE_WIDTH = 90  # of a line without its bar: figures, and a note of a live measurement
 T = TypeVar("T")
 
 
@@ -59,14 +60,17 @@ class Progress:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as RichProgress
+        from rich.table import Column
 
+        console = Console(stderr=True)
+        # Where a terminal is narrow the bar is short and the note wraps: the figures stay whole.
         self._bar = RichProgress(
             TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
-            console=Console(stderr=True),
+            BarColumn(bar_width=min(40, max(10, console.width - NOTE_WIDTH)), table_column=Column(no_wrap=True)),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            TimeElapsedColumn(table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[note]}", markup=False, table_column=Column()),
+            console=console,
             transient=True,
         )
         self._task = self._bar.add_task(self._what, total=self._total, note="")

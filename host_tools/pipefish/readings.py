@@ -92,7 +92,7 @@ def camera_of(survey: Survey, given: Camera | None) -> Camera:
     camera = given
     if camera is None:
         if survey.start is None or not survey.start.profile:
-            raise PipefishError(f"{survey.path}: holds no camera profile: give one with --profile")
+            raise PipefishError(f"{survey.path}: holds no camera profile: pipefish reconstruct --profile takes one")
         camera = Camera.from_binary(survey.start.profile)
     frame = survey.keyframes[0]
     if (camera.width, camera.height) != (frame.width, frame.height):

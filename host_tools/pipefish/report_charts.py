@@ -126,8 +126,9 @@ class Charts:
         data[-1]["line"]["dash"] = "dash"
         for trace in data[1::2]:
             trace["hovertemplate"] = f"%{{x:.2f}} {self.along_unit}: %{{y:.2f}} {self.short}"
-        shapes = self.shapes()
+        shapes, dotted = self.shapes(), ""
         if self.summary["nominal"] and self.unit == "metre":
+            dotted = " Dotted: nominal."
             line = {
                 "type": "line",
                 "xref": "paper",
@@ -139,11 +140,14 @@ class Charts:
         shared = Z95 * self.factor * column(self.document, "d_mean_systematic")
         digits = 1 if self.unit == "metre" else 4
         ends = dict.fromkeys(f"{value:.{digits}f}" for value in (np.nanmin(shared), np.nanmax(shared)))
+        wrong = f"the scale or the camera is not in them: ± {' to '.join(ends)} {self.short}"
+        if not np.nanmax(shared) > 0:  # no scale, and a profile without covariance
+            wrong = "the camera is not in them, and not known"
         return {
             "id": "diameter",
             "title": "Diameter along the pipe",
-            "text": "Bands: repeatability. What is wrong with the scale or the camera is not in them: "
-            f"± {' to '.join(ends)} {self.short}. Dotted: nominal. Grey from bottom to top: not measured. Names in the "
+            "text": f"Bands: repeatability. What is wrong with {wrong}.{dotted} Grey from bottom to top: not measured. "
+            "Names in the "
             "legend switch on and off.",
             "data": data,
             "layout": {

@@ -36,8 +36,9 @@ def _reason(error: Exception) -> str:
     """The system's text for an error number, without what libraries put around it."""
     if isinstance(error, socket.gaierror):
         return error.strerror
-    if isinstance(error, ssl.SSLEOFError | ssl.SSLZeroReturnError):
-        return "the device closed the connection"
+    if isinstance(error, ssl.SSLError):  # its numbers are OpenSSL's, not the system's
+        ended = isinstance(error, ssl.SSLZeroReturnError | ssl.SSLEOFError)
+        return "the device closed the connection" if ended else error.reason or str(error)
     number = _number(error)
     if number == errno.ENOTTY:
         return "not a serial line"
@@ -88,6 +89,14 @@ class Transport(ABC):
         """Closes the stream; again is harmless."""
 
 
+# What errors of opening a serial line mean.
+SERIAL_REASONS = {
+    errno.EACCES: "Permission denied (is this user in the device's group, dialout?)",
+    errno.EAGAIN: "another program has it open (a pipefish receive?)",
+    errno.EBUSY: "another program has it open (a pipefish receive?)",
+}
+
+
 class SerialTransport(Transport):
     """A serial device, 8N1, with hardware flow control if asked for; locked against other programs."""
 
@@ -108,8 +117,8 @@ class SerialTransport(Transport):
             )
             self._port.reset_input_buffer()
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-            hint = " (is this user in the device's group, dialout?)" if _number(error) == errno.EACCES else ""
-            raise TransportClosed(f"{self.path}: {_reason(error)}{hint}", error) from error
+            reason = SERIAL_REASONS.get(_number(error), _reason(error))
+            raise TransportClosed(f"{self.path}: {reason}", error, reason) from error
 
     def fileno(self) -> int:
         return self._port.fileno() if self._port is not None else -1
@@ -148,6 +157,7 @@ class TcpTransport(Transport):
     _heard = False  # the device has said something since it was opened
 
     scheme = "tcp"
+    at_once = "other hosts are connected to the device, as many as it takes, or it speaks TLS (tls:// instead?)"
 
     def __init__(self, host: str, port: int) -> None:
         self.name = f"{self.scheme}://{f'[{host}]' if ':' in host else host}:{port}"
@@ -174,6 +184,8 @@ class TcpTransport(Transport):
             data = self._socket.recv(65536)
         except (BlockingIOError, InterruptedError):
             return b""
+        except ConnectionResetError as error:
+            raise self._ended() from error
         except OSError as error:
             raise TransportClosed(f"{self.name}: {_reason(error)}") from error
         if not data:
@@ -184,7 +196,7 @@ class TcpTransport(Transport):
     def _ended(self) -> TransportClosed:
         why = "the device closed the connection"
         if not self._heard:
-            why = "other hosts are connected to the device, as many as it takes"
+            why = self.at_once
         return TransportClosed(f"{self.name}: {why}", reason=why)
 
     def write(self, data: bytes) -> int:
@@ -194,6 +206,8 @@ class TcpTransport(Transport):
             return self._socket.send(data)
         except (BlockingIOError, InterruptedError):
             return 0
+        except (ConnectionResetError, BrokenPipeError) as error:
+            raise self._ended() from error
         except OSError as error:
             raise TransportClosed(f"{self.name}: {_reason(error)}") from error
 
@@ -228,6 +242,7 @@ class TlsTransport(TcpTransport):
     device    name of the device at the other end, once opened"""
 
     scheme = "tls"
+    at_once = "other hosts are connected to the device, as many as it takes"
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__(host, port)
@@ -269,6 +284,10 @@ class TlsTransport(TcpTransport):
         except ValueError as error:
             self.close()
             raise TransportClosed(f"{self.name}: the device shows no key") from error
+        except (ssl.SSLZeroReturnError, ssl.SSLEOFError, ConnectionResetError) as error:
+            self.close()
+            why = "the device broke the handshake off: too many at once, or five of this address failed within a minute"
+            raise TransportClosed(f"{self.name}: {why}", reason=why) from error
         except TimeoutError as error:
             self.close()
             raise TransportClosed(f"{self.name}: the device does not answer the handshake", error) from error

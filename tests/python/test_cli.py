@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
@@ -17,18 +18,14 @@ from pipefish.survey import Survey
 from pipefish.terminal import printable
 from synthetic import SURVEY, start, survey_objects, write_survey
 
-COMMANDS = [
-    ["demo"],
-    ["simulate"],
-    ["receive"],
-    ["info"],
-    ["show"],
-    ["status"],
-    ["profile", "show"],
-    ["profile", "check"],
-    ["profile", "convert"],
-    ["undistort"],
-]
+
+def names_of(parser, before=()):
+    """The words of each command below a parser, down to those that have no commands of their own."""
+    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    return [w for a in below for name, p in a.choices.items() for w in names_of(p, (*before, name))] or [list(before)]
+
+
+COMMANDS = names_of(cli.build_parser())
 
 
 @pytest.fixture
@@ -41,7 +38,7 @@ def survey(tmp_path):
 def test_every_command_has_help_with_an_example(command, capsys):
     assert cli.main([*command, "--help"]) == 0
     text = capsys.readouterr().out
-    assert "example:\n  pipefish " + " ".join(command) in text and "--json" in text
+    assert "pipefish " + " ".join(command) in text.partition("\nexample:\n")[2] and "--json" in text
 
 
 @pytest.mark.parametrize(
@@ -88,6 +85,7 @@ def test_show_writes_what_it_says(survey, tmp_path, capsys):
     ("arguments", "words"),
     [
         (["info", "nothing.mcap"], "nothing.mcap: No such file"),
+        (["reconstruct", "c.mcap", "-o", "m"], "c.mcap: No such file or directory; c.mcap.partial is there"),
         (["info", "junk.mcap"], "junk.mcap: offset 0: not an MCAP file"),
         (["show", "a.mcap", "-o", "no/such/folder/o.png"], "pipefish: no/such/folder/o.png: No such file"),
         (["show", "a.mcap", "-o", "a.mcap/o.png"], "pipefish: a.mcap/o.png: Not a directory"),
@@ -108,6 +106,7 @@ def test_show_writes_what_it_says(survey, tmp_path, capsys):
 def test_failure_is_1_with_one_clear_line(survey, tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "junk.mcap").write_bytes(b"junk, and not little of it")
+    (tmp_path / "c.mcap.partial").write_bytes(b"")
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
     assert cli.main(arguments) == 1
     captured = capsys.readouterr()
@@ -148,7 +147,8 @@ def test_receive_and_status_from_the_command_line(tmp_path, capsys):
     with Device(survey_objects(4), SURVEY) as device:
         assert cli.main(["status", device.address, "--timeout", "60", "--json"]) == 0
         status = json.loads(capsys.readouterr().out)
-        assert status["info"]["software"] == "test device" and status["status"]["spool"]["objects"] == "6"
+        assert status["info"]["software"] == "test device" and status["status"]["spool"]["objects"] == 6
+        assert status["info"]["survey_id"] == SURVEY.hex() and len(status["info"]["boot_id"]) == 16
         assert len(device.spool) == 6, "asking takes nothing from the device"
         assert cli.main(["receive", device.address, "-o", str(tmp_path / "r.mcap"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -110,6 +110,13 @@ def test_a_profile_that_is_none_is_refused_before_anything_starts(tmp_path: Path
     assert str(profile) in done.stderr
 
 
+@pytest.mark.parametrize("name", ["camera.json", "long.json"])
+def test_a_profile_in_json_is_refused_with_the_command_that_converts_it(tmp_path: Path, crawler: Crawler, name: str):
+    (tmp_path / name).write_text('{"format": "pipefish-profile"}' + (" " * 100_000 if name == "long.json" else ""))
+    done = run("--config", crawler.config, "--check-config", "--set", f"camera.profile={tmp_path / name}")
+    assert done.returncode == 1 and f"{name}: JSON; `pipefish profile convert`" in done.stderr
+
+
 def test_a_busy_port_a_used_spool_and_a_missing_recording_are_clear_errors(tmp_path: Path, crawler: Crawler):
     with socket.create_server(("127.0.0.1", crawler.port)):
         done = run("--config", crawler.config)

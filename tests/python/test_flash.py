@@ -144,6 +144,15 @@ def test_a_store_that_cannot_be_written_gives_the_profile_that_is_confirmed(tmp_
         crawler.kill()
 
 
+def test_the_log_names_a_profile_with_and_without_a_serial_number(crawler: Crawler):
+    restart(crawler)
+    install(crawler, OLD)
+    with device(crawler) as flasher:
+        flasher.send(camera("nameplate lost", serial="").to_binary())
+    wait_for_log(crawler, "profile nameplate lost: stored, on trial")
+    assert "profile old, serial S1" in crawler.text()
+
+
 def test_a_profile_on_trial_reverts_unless_it_is_confirmed(tmp_path: Path, crawler: Crawler, capsys):
     restart(crawler)
     install(crawler, OLD)

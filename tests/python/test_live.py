@@ -166,6 +166,14 @@ def test_a_survey_that_shows_nothing_says_why(drive, tmp_path):
     assert "nothing" in dict(summary_rows(course.summary()))["measured live"]
 
 
+def test_a_survey_without_a_profile_is_told_which_command_takes_one(objects, tmp_path):
+    """`receive` has no --profile: whoever reads this must not look for it there."""
+    start = pb.SurveyStart.FromString(objects[0][2])
+    start.ClearField("profile")
+    course, _ = fed([as_object(objects[0][1], start), *objects[1:]], tmp_path / "a.mcap")
+    assert "no camera profile: pipefish reconstruct --profile takes one" in progress_text(course.progress())
+
+
 def test_the_file_is_the_one_that_arrives_without(objects, tmp_path, capfd):
     """The same objects, which may overtake each other; plain lines where there is no terminal; a summary."""
     with Device(objects, SURVEY) as device:

@@ -23,9 +23,9 @@ from network_device import let_in, network, open_client, raw_tls
 from pipefish import keys
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
-from pipefish.client import Client, Handlers
+from pipefish.client import Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
-from pipefish.transport import Refused, TlsTransport, TransportClosed
+from pipefish.transport import Refused, TlsTransport, TransportClosed, open_transport
 
 pytestmark = pytest.mark.usefixtures("own_keys")
 HANDSHAKE_S = 5.0  # that the device gives a handshake
@@ -57,6 +57,33 @@ def test_an_unknown_host_is_sent_away_with_the_remedy_and_counted(device: Crawle
         client.run(lambda: client.up, PATIENCE_S)
     client.close()
     assert network(device, refused_unknown=1)["sessions"] == 0
+
+
+def test_a_host_that_speaks_no_tls_to_a_device_that_does_is_told_so(device: Crawler):
+    client = Client(open_transport(f"tcp://127.0.0.1:{device.port}"), Handlers())
+    client.open()
+    with pytest.raises(NoDevice, match="tls:// instead"):
+        client.run(lambda: client.up, 2.0)
+    client.close()
+
+
+@pytest.mark.parametrize("abrupt", [True, False])
+def test_a_handshake_that_the_device_breaks_off_is_told_as_that_and_may_be_tried_again(abrupt: bool):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def hang_up() -> None:
+            s, _ = server.accept()
+            if not abrupt:
+                s.recv(65536)
+                s.sendall(bytes.fromhex("15030300020100"))  # close_notify
+            s.close()
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        with pytest.raises(TransportClosed, match="broke the handshake off") as told:
+            TlsTransport("127.0.0.1", server.getsockname()[1]).open()
+        thread.join()
+    assert not told.value.is_final
 
 
 def test_a_device_with_another_key_gets_not_a_byte(device: Crawler):

@@ -516,6 +516,20 @@ def test_flow_control_of_a_serial_line_is_what_its_address_says(flow):
         os.close(slave)
 
 
+def test_a_serial_line_that_another_program_has_is_told_as_that():
+    master, slave = os.openpty()
+    first, second = (open_transport(f"serial:{os.ttyname(slave)}@115200") for _ in range(2))
+    first.open()
+    try:
+        with pytest.raises(TransportClosed, match="another program has it open") as told:
+            second.open()
+        assert told.value.reason.startswith("another program") and not told.value.is_final
+    finally:
+        first.close()
+        os.close(master)
+        os.close(slave)
+
+
 def test_tcp_addresses():
     assert open_transport("tcp://pi.local").address == ("pi.local", 7447)
     transport = open_transport("tcp://[::1]:99")

@@ -213,6 +213,17 @@ def test_the_page_says_what_is_systematic_at_stations_beside_what_is_in_the_mean
     assert "± 0.78 mm" in text and "± 1.96 mm, up to ± 3.92" in text and "± 1.0 to 3.9 mm. Dotted" in text
 
 
+def test_a_systematic_part_that_nobody_knows_is_not_told_as_zero(measured, tmp_path):
+    """Without a scale, of a profile without covariance: the camera's part is unknown, and there is no nominal line."""
+    folder = shutil.copytree(measured / "out", tmp_path / "out")
+    document = json.loads((folder / "reconstruction.json").read_text())
+    document["stations"]["d_mean_systematic"] = [0.0] * len(document["stations"]["s"])
+    document["summary"]["nominal"] = None
+    (folder / "reconstruction.json").write_text(json.dumps(document))
+    text = Charts(folder).chart_diameter()["text"]
+    assert "What is wrong with the camera is not in them, and not known." in text and "Dotted" not in text
+
+
 def test_commands_in_texts_are_shown_as_code(measured, tmp_path):
     out = tmp_path / "report.html"
     assert main(["report", str(measured / "out"), "-o", str(out)]) == 0

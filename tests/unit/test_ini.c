@@ -183,7 +183,8 @@ static void test_config_override_wins_and_settings_are_checked_together(void)
     char error[512];
     pf_config_defaults(&c);
     TEST_ASSERT_FALSE(pf_config_check(&c, "f", error, sizeof error));
-    TEST_ASSERT_EQUAL_STRING("f: camera.path: must be set: the recording to play", error);
+    TEST_ASSERT_EQUAL_STRING("f: camera.path: must be set: the recording to play; or camera.driver, for a camera",
+                             error);
     TEST_ASSERT_TRUE(pf_config_parse(&c, "[camera]\npath = a = b", 21, "f", error, sizeof error));
     TEST_ASSERT_TRUE(pf_config_override(&c, "camera.path=x.y4m=z", error, sizeof error));
     TEST_ASSERT_EQUAL_STRING("x.y4m=z", c.camera.path);
