@@ -29,7 +29,7 @@ from pipefish.measuretruth import against_truth, bare, true_place
 from pipefish.simcamera import calibrated
 from pipefish.simulate import Scene, simulate
 from pipefish.survey import Survey
-from pipefish.tube_findings import LEAST_HEIGHT
+from pipefish.tube_patches import LEAST_HEIGHT
 from selfcal_drives import drifted
 
 LEFT, UP_RIGHT = -math.pi / 2, 0.6

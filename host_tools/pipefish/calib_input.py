@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import dataclasses
 import functools
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
 
 from .calib_data import CalibrationError, View
 from .errors import FormatError, PipefishError
+from .files import PICTURES, opened_picture
 from .target import Target
 
 Array = npt.NDArray[np.float64]
 
-PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp")
 CORNERS = (".csv", ".vnl", ".orpc")
 SURVEYS = (".mcap", ".partial")
 TELEMETRY = "telemetry.csv"  # of a recording: no corners
@@ -138,7 +136,7 @@ def _refuse_sizes(files: Sequence[Path]) -> None:
     damaged: list[FormatError] = []
     for file in files:
         try:
-            with _reading(file), Image.open(file) as opened:
+            with opened_picture(file) as opened:
                 opened.load()
                 by_size.setdefault(opened.size, []).append(file)
         except FormatError as error:
@@ -199,22 +197,9 @@ def _text(path: Path) -> str:
 
 
 def _open(file: Path) -> npt.NDArray[Any]:
-    with _reading(file), Image.open(file) as opened:
+    with opened_picture(file) as opened:
         plain = opened.mode in ("L", "RGB", "I;16")
         return np.asarray(opened if plain else opened.convert("I;16" if opened.mode == "I" else "RGB"))
-
-
-@contextlib.contextmanager
-def _reading(file: Path) -> Iterator[None]:
-    """Pillow's errors as ours, with the file."""
-    try:
-        yield
-    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
-        raise FormatError(file, None, f"not a picture: {error}") from None
-    except OSError as error:
-        if error.errno is None:  # Pillow's own, for a damaged file
-            raise FormatError(file, None, f"not a whole picture: {error}") from None
-        raise
 
 
 def _keyframes(path: Path, camera: int) -> list[Picture]:

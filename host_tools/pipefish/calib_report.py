@@ -396,16 +396,16 @@ def describe(
     lit: dict[int, ImageEllipse],
 ) -> dict[str, Any]:
     """Everything that a report of the calibration shows, as plain values."""
-    data = fit.data
-    error, theta = fit.errors(), fit.theta()
-    predicted, _ = fit.bundle.predict()
-    residual = data.pixels - predicted
-    gross = np.flatnonzero(~fit.used & ~np.isin(data.view_of, list(fit.view_reason)))
+    data, error, theta = fit.data, fit.errors(), fit.theta()
+    in_views = ~np.isin(data.view_of, list(fit.view_reason))
+    residual = data.pixels - fit.bundle.predict()[0]
     hands = [handedness(data, v) for v in range(len(data.views))]
-    report: dict[str, Any] = {
+    mirrored = "every view shows the board mirrored: seen through a mirror, or its X and Y are not right and down"
+    all_mirrored = hands and all(h <= 0 for h in hands) and any(h < 0 for h in hands)
+    return {
         "model": fit.model.name,
         "rms_px": fit.rms(),
-        "rms_all_px": fit.rms(~np.isin(data.view_of, list(fit.view_reason))),
+        "rms_all_px": fit.rms(in_views),
         "median_px": float(np.median(error[fit.used])),
         "flat_board": {
             "model": flat.model.name,
@@ -417,24 +417,8 @@ def describe(
         "points": len(fit.used),
         "freedom": {"camera": fit.model.freedom[0], "board": fit.model.freedom[1]},
         "models": table,
-        "notes": list(notes),
-        "views": [
-            {
-                "view": v,
-                "name": data.views[v].name,
-                "camera": data.views[v].camera,
-                "board": data.views[v].board,
-                "used": v not in fit.view_reason,
-                "reason": fit.view_reason.get(v, ""),
-                "points": int(fit.used[data.of_view(v)].sum()),
-                "rms_px": float(np.sqrt(np.mean(error[data.of_view(v)][fit.used[data.of_view(v)]] ** 2)))
-                if fit.used[data.of_view(v)].any()
-                else None,
-                "theta_max": float(theta[data.of_view(v)].max()),
-                "mirrored": hands[v] < 0,
-            }
-            for v in range(len(data.views))
-        ],
+        "notes": [*notes, mirrored] if all_mirrored else list(notes),
+        "views": [_view_row(fit, v, error, theta, hands[v]) for v in range(len(data.views))],
         "rejected_views": [
             {"view": v, "name": data.views[v].name, "reason": r} for v, r in sorted(fit.view_reason.items())
         ],
@@ -446,7 +430,7 @@ def describe(
                 "error_px": float(error[i]),
                 "reason": f"{error[i]:.1f} px off where {fit.sigma[i]:.2f} px is the noise",
             }
-            for i in gross
+            for i in np.flatnonzero(~fit.used & in_views)
         ],
         "residuals": {
             "view": data.view_of.tolist(),
@@ -459,16 +443,41 @@ def describe(
             {"board": n, "coefficients": list(fit.bundle.shape(b)), "flat": fit.model.shape == "flat"}
             for b, n in enumerate(data.board_ids)
         ],
-        "cameras": [],
+        "cameras": _camera_rows(fit, cameras, uncertainty, lit, compared=bool(table)),
     }
-    if hands and all(h <= 0 for h in hands) and any(h < 0 for h in hands):
-        report["notes"].append(
-            "every view shows the board mirrored: seen through a mirror, or its X and Y are not right and down"
-        )
-    for c, number in enumerate(data.cameras):
+
+
+def _view_row(fit: Fit, v: int, error: Array, theta: Array, hand: float) -> dict[str, Any]:
+    """One view of the report."""
+    points = fit.data.of_view(v)
+    used = fit.used[points]
+    return {
+        "view": v,
+        "name": fit.data.views[v].name,
+        "camera": fit.data.views[v].camera,
+        "board": fit.data.views[v].board,
+        "used": v not in fit.view_reason,
+        "reason": fit.view_reason.get(v, ""),
+        "points": int(used.sum()),
+        "rms_px": float(np.sqrt(np.mean(error[points][used] ** 2))) if used.any() else None,
+        "theta_max": float(theta[points].max()),
+        "mirrored": hand < 0,
+    }
+
+
+def _camera_rows(
+    fit: Fit,
+    cameras: dict[int, Camera],
+    uncertainty: list[Uncertainty],
+    lit: dict[int, ImageEllipse],
+    compared: bool,
+) -> list[dict[str, Any]]:
+    """The cameras of the report; with what the halves of the views differ by where models were compared."""
+    rows: list[dict[str, Any]] = []
+    for c, number in enumerate(fit.data.cameras):
         camera = cameras[number]
         knots, sigma = fit.noise[c]
-        report["cameras"].append(
+        rows.append(
             {
                 "camera": number,
                 "noise": {"theta": knots.tolist(), "sigma_px": sigma.tolist()},
@@ -479,10 +488,10 @@ def describe(
                 "pipes": [uncertainty[c].diameter(dn) for dn in DN],
             }
         )
-    if table:
-        for entry, halves in zip(report["cameras"], halves_difference(fit), strict=False):
-            entry["halves"] = halves
-        for entry, spread in zip(report["cameras"], diameter_spread(fit, list(cameras.values())), strict=False):
-            for pipe, spread_mm in zip(entry["pipes"], spread, strict=True):
+    if compared:
+        for row, halves in zip(rows, halves_difference(fit), strict=False):
+            row["halves"] = halves
+        for row, spread in zip(rows, diameter_spread(fit, list(cameras.values())), strict=False):
+            for pipe, spread_mm in zip(row["pipes"], spread, strict=True):
                 pipe["spread_mm"] = spread_mm
-    return report
+    return rows

@@ -49,7 +49,8 @@ def _target_and_picture(first: str, second: str) -> tuple[Any, Any] | None:
     """Conics of a target and of a picture of it, each beside its own, where the two files are these."""
     from pathlib import Path
 
-    from pipefish.conics import PICTURES, circles_of, discs_of_target, is_target, load_picture
+    from pipefish.conics import circles_of, discs_of_target, is_target, load_picture
+    from pipefish.files import PICTURES
     from pipefish.target import Target
 
     for target, picture in ((first, second), (second, first)):

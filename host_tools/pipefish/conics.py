@@ -18,13 +18,13 @@ import numpy.typing as npt
 from pipefish import _engine
 from pipefish.detect import Detection, detect_target, grey
 from pipefish.errors import ArgumentError, FormatError
+from pipefish.files import PICTURES, opened_picture
 from pipefish.target import Target
 
 if TYPE_CHECKING:
     from pipefish.camera import Camera
 
 Array = npt.NDArray[np.float64]
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".pgm")
 
 
 def _conics(name: str, given: npt.ArrayLike) -> Array:
@@ -176,13 +176,8 @@ def is_target(path: str | os.PathLike[str]) -> bool:
 
 def load_picture(path: str | os.PathLike[str]) -> npt.NDArray[np.uint8]:
     """A picture (H, W) in grey. Raises FormatError, OSError."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("L"))
-    except UnidentifiedImageError:
-        raise FormatError(path, None, "not a picture") from None
+    with opened_picture(path) as picture:
+        return np.asarray(picture.convert("L"))
 
 
 def load_conics(path: str | os.PathLike[str]) -> tuple[Array, bool]:

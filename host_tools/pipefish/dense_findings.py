@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from pipefish.errors import FormatError, PipefishError
 from pipefish.intervals import Z95
-from pipefish.measured_texts import interval_text, length_text
+from pipefish.measured_texts import interval_text, length_text, read_document
 
 FORMAT, VERSION = "pipefish-dense", 2
 COLUMNS = (
@@ -82,12 +81,7 @@ def read_dense(folder: Path, measured: Path) -> dict[str, Any]:
     """dense.json of a folder, of a map of the reconstruction in the folder `measured`. Raises PipefishError (another
     reconstruction's, another version's), FormatError, OSError."""
     path = folder / "dense.json"
-    try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, UnicodeDecodeError) as error:
-        raise FormatError(path, None, f"not JSON: {error}") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise FormatError(path, "format", f"not '{FORMAT}': is this a folder of `pipefish dense`?")
+    document = read_document(path, FORMAT, "pipefish dense")
     if document.get("version") != VERSION:
         raise PipefishError(f"{path}: version {document.get('version')}, not {VERSION}; run `pipefish dense` again")
     wanted = {"reconstruction", "files", "unit", "cell", "measured", "coverage", "sigma_median", "cracks"}

@@ -1,4 +1,4 @@
-"""Writing files, and what is written as JSON and CSV."""
+"""Opening pictures, writing files, and what is written as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -7,11 +7,33 @@ import csv
 import io
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .errors import file_error
+from .errors import FormatError, file_error
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")  # how their names end
+
+
+@contextlib.contextmanager
+def opened_picture(path: str | os.PathLike[str]) -> Iterator[Image]:
+    """A picture that Pillow has opened; its errors, also those of what is read of it meanwhile, are ours, with the
+    file. Raises FormatError, OSError."""
+    from PIL import Image, UnidentifiedImageError  # takes time, which --help has not
+
+    try:
+        with Image.open(path) as opened:
+            yield opened
+    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
+        raise FormatError(path, None, f"not a picture: {error}") from None
+    except OSError as error:
+        if error.errno is None:  # Pillow's own, for a damaged file
+            raise FormatError(path, None, f"not a whole picture: {error}") from None
+        raise
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FormatError
-from .files import write_atomically
+from .files import opened_picture, write_atomically
 from .matching import Matches, Seeds, grey
 
 COLUMNS = ("x1", "y1", "x2", "y2", "a11", "a12", "a21", "a22", "zncc")
@@ -20,21 +20,12 @@ COLUMNS = ("x1", "y1", "x2", "y2", "a11", "a12", "a21", "a22", "zncc")
 
 def read_pixels(path: str | os.PathLike[str]) -> NDArray[np.generic]:
     """A picture as (H,W,3) uint8; (H,W) uint16 or float32 where it is that. Raises FormatError, OSError."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as opened:
-            if opened.mode.startswith("I;16") or opened.mode == "F":
-                return np.asarray(opened)
-            if opened.mode == "I":  # what some files of 16 bits are read as
-                return _of_16_bits(np.asarray(opened), path)
-            return np.asarray(opened.convert("RGB"))
-    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
-        raise FormatError(path, None, f"not a picture: {error}") from None
-    except OSError as error:
-        if error.errno is None:  # Pillow's own, for a damaged file
-            raise FormatError(path, None, f"not a whole picture: {error}") from None
-        raise
+    with opened_picture(path) as opened:
+        if opened.mode.startswith("I;16") or opened.mode == "F":
+            return np.asarray(opened)
+        if opened.mode == "I":  # what some files of 16 bits are read as
+            return _of_16_bits(np.asarray(opened), path)
+        return np.asarray(opened.convert("RGB"))
 
 
 def _of_16_bits(pixels: NDArray[np.int32], path: str | os.PathLike[str]) -> NDArray[np.uint16]:

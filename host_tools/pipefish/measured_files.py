@@ -24,8 +24,8 @@ from pipefish.measured_texts import FORMAT, VERSION
 from pipefish.measurement import Measurement, Stretch, mean_diameter
 from pipefish.pupil import pupil_is_known
 from pipefish.simulate import quaternion
-from pipefish.tube import rms_ovality
 from pipefish.tube_findings import COLUMNS
+from pipefish.tube_stations import rms_ovality
 
 RING = 72  # vertices of tube.ply around the pipe
 COLMAP_THETA = math.radians(89)  # its functions divide by z

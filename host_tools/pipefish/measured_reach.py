@@ -11,7 +11,7 @@ import numpy as np
 from pipefish.intervals import Z95
 from pipefish.measured_texts import length_text
 from pipefish.measurement import Measurement, mean_diameter
-from pipefish.tube_findings import LEAST_HEIGHT, SURELY, TENTH
+from pipefish.tube_patches import LEAST_HEIGHT, SURELY, TENTH
 
 FEWEST = 9  # points whose median makes a patch, at the least: more than half of them have to stand out
 JOINT_SIGMAS = 4.0  # by which the walls before and after a joint must differ: chi-squared of 16, at the least

@@ -117,15 +117,21 @@ def scale_texts(scale: dict[str, Any]) -> list[str]:
 # ---- reading
 
 
-def read_measured(folder: Path) -> dict[str, Any]:
-    """reconstruction.json of a folder. Raises FormatError, OSError."""
-    path = folder / "reconstruction.json"
+def read_document(path: Path, form: str, command: str) -> dict[str, Any]:
+    """A JSON document of this format, as this command writes it. Raises FormatError, OSError."""
     try:
         document = json.loads(path.read_bytes())
     except (ValueError, UnicodeDecodeError) as error:
         raise FormatError(path, None, f"not JSON: {error}") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise FormatError(path, "format", f"not '{FORMAT}': is this a folder of `pipefish reconstruct`?")
+    if not isinstance(document, dict) or document.get("format") != form:
+        raise FormatError(path, "format", f"not '{form}': is this a folder of `{command}`?")
+    return document
+
+
+def read_measured(folder: Path) -> dict[str, Any]:
+    """reconstruction.json of a folder. Raises FormatError, OSError."""
+    path = folder / "reconstruction.json"
+    document = read_document(path, FORMAT, "pipefish reconstruct")
     if document.get("version") != VERSION:
         raise FormatError(path, "version", f"{document.get('version')}; this program reads {VERSION}")
     return document

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FormatError
-from .files import write_atomically
+from .files import PICTURES, opened_picture, write_atomically
 from .matching import grey
 from .matching_files import png, read_grey, read_pixels
 from .recognition import ObjectModel, Recognition
 from .roc_curve import Roc
 
 MASKS = ("_mask", "_labels")  # what a mask's name ends with; labels are those of simulated objects
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp")
 COLUMNS = (
     "scene",
     "object",
@@ -71,13 +70,11 @@ def _mask_of(picture: Path) -> Path | None:
 
 def _read_view(picture: Path, mask: Path | None) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """A picture and its mask: a file, or else what the picture's own alpha covers."""
-    from PIL import Image
-
     image = read_grey(picture)
     if mask is not None:
         values = read_grey(mask)
         return image, values > 0.5 * values.max()
-    with Image.open(picture) as opened:
+    with opened_picture(picture) as opened:
         if "A" in opened.getbands():
             return image, np.asarray(opened.getchannel("A")) > 127
     return image, None

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipefish import __version__
 from pipefish.errors import ArgumentError, FormatError, PipefishError
+from pipefish.files import opened_picture
 from pipefish.studio_objects import ObjectPicture, simulate_objects
 from pipefish.studio_pairs import simulate_two_views
 from pipefish.studio_targets import simulate_target_views, warp
@@ -86,14 +87,8 @@ def checked(scene: dict[str, Any], path: Path | None) -> dict[str, Any]:
 
 
 def _read_image(path: Path | None, name: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
-    file = (path.parent if path else Path()) / name
-    try:
-        with Image.open(file) as image:
-            return np.asarray(image.convert("L"))
-    except UnidentifiedImageError:
-        raise FormatError(file, None, "not an image that can be read") from None
+    with opened_picture((path.parent if path else Path()) / name) as image:
+        return np.asarray(image.convert("L"))
 
 
 def simulate_studio(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from pipefish.files import rounded
 from pipefish.scene import REASONS, STATES, frames_in
 from pipefish.survey import Survey
+
+Line = Callable[..., dict[str, Any]]  # a name, values and more: a line of a chart
 
 
 def statistics(survey: Survey) -> dict[str, np.ndarray]:
@@ -34,83 +37,94 @@ def charts(survey: Survey, along: np.ndarray, title: str) -> list[dict[str, Any]
     stats = statistics(survey)
     if not np.isfinite(stats["tracked"]).any():
         return []
-    x = rounded(along)
-    xaxis = {"title": {"text": title}}
+    x, xaxis = rounded(along), {"title": {"text": title}}
 
     def line(name: str, y: np.ndarray, **more: Any) -> dict[str, Any]:
         return {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": rounded(y, 3), **more}
 
-    lost = [(name, words) for name, words in REASONS if np.nansum(stats[name]) > 0]
-    result = [
-        {
-            "id": "stats-live",
-            "title": "Tracks held and taken up",
-            "text": "Tracks in each keyframe; found again and newly detected in a camera frame, in the mean since the "
-            "keyframe before.",
-            "data": [
-                line("in the keyframe", stats["live"]),
-                line("found again a frame", stats["tracked"]),
-                line("new a frame", stats["detected"]),
-            ],
-            "layout": {"xaxis": xaxis, "yaxis": {"title": {"text": "tracks"}, "rangemode": "tozero"}},
+    return [_live(stats, line, xaxis), _lost(stats, line, xaxis), _age(stats, line, xaxis), *_states(stats, x, xaxis)]
+
+
+def _live(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "id": "stats-live",
+        "title": "Tracks held and taken up",
+        "text": "Tracks in each keyframe; found again and newly detected in a camera frame, in the mean since the "
+        "keyframe before.",
+        "data": [
+            line("in the keyframe", stats["live"]),
+            line("found again a frame", stats["tracked"]),
+            line("new a frame", stats["detected"]),
+        ],
+        "layout": {"xaxis": xaxis, "yaxis": {"title": {"text": "tracks"}, "rangemode": "tozero"}},
+    }
+
+
+def _lost(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "id": "stats-lost",
+        "title": "Why tracks end",
+        "text": "Tracks lost in a camera frame, by reason, in the mean since the keyframe before.",
+        "data": [
+            line(words, stats[name], stackgroup="lost", hovertemplate="%{y:.2f}", line={"width": 0.5})
+            for name, words in REASONS
+            if np.nansum(stats[name]) > 0
+        ],
+        "layout": {
+            "xaxis": xaxis,
+            "yaxis": {"title": {"text": "lost a frame"}, "rangemode": "tozero"},
+            "hovermode": "x unified",
+            "legend": {"font": {"size": 11}},
         },
-        {
-            "id": "stats-lost",
-            "title": "Why tracks end",
-            "text": "Tracks lost in a camera frame, by reason, in the mean since the keyframe before.",
-            "data": [
-                line(words, stats[name], stackgroup="lost", hovertemplate="%{y:.2f}", line={"width": 0.5})
-                for name, words in lost
-            ],
-            "layout": {
-                "xaxis": xaxis,
-                "yaxis": {"title": {"text": "lost a frame"}, "rangemode": "tozero"},
-                "hovermode": "x unified",
-                "legend": {"font": {"size": 11}},
+    }
+
+
+def _age(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "id": "stats-age",
+        "title": "Age and quality",
+        "text": "Medians over the tracks found again in the keyframe's own frame; quality is the similarity with "
+        "the frame before.",
+        "data": [
+            line("age, camera frames", stats["age_median"]),
+            line("quality", stats["quality_median"], yaxis="y2"),
+        ],
+        "layout": {
+            "xaxis": xaxis,
+            "yaxis": {"title": {"text": "camera frames"}, "rangemode": "tozero"},
+            "yaxis2": {
+                "title": {"text": "quality"},
+                "overlaying": "y",
+                "side": "right",
+                "showgrid": False,
+                "tickformat": ".3f",
             },
         },
-        {
-            "id": "stats-age",
-            "title": "Age and quality",
-            "text": "Medians over the tracks found again in the keyframe's own frame; quality is the similarity with "
-            "the frame before.",
-            "data": [
-                line("age, camera frames", stats["age_median"]),
-                line("quality", stats["quality_median"], yaxis="y2"),
-            ],
-            "layout": {
-                "xaxis": xaxis,
-                "yaxis": {"title": {"text": "camera frames"}, "rangemode": "tozero"},
-                "yaxis2": {
-                    "title": {"text": "quality"},
-                    "overlaying": "y",
-                    "side": "right",
-                    "showgrid": False,
-                    "tickformat": ".3f",
-                },
-            },
-        },
-    ]
+    }
+
+
+def _states(stats: dict[str, np.ndarray], x: list[float | None], xaxis: dict[str, Any]) -> list[dict[str, Any]]:
+    """None where the device reported no state."""
     seen = [(name, words) for name, words in STATES if stats[name].any()]
-    if seen:
-        result.append(
-            {
-                "id": "stats-states",
-                "title": "States of the scene",
-                "text": "States that the device reported since the keyframe before, and in how many frames.",
-                "data": [
-                    {
-                        "type": "scatter",
-                        "mode": "markers",
-                        "name": words,
-                        "x": [v for v, on in zip(x, stats[name], strict=True) if on],
-                        "y": [words] * int((stats[name] > 0).sum()),
-                        "text": [f"{on} frames" for on in stats[name] if on],
-                        "marker": {"symbol": "square", "size": 9},
-                    }
-                    for name, words in seen
-                ],
-                "layout": {"xaxis": xaxis, "yaxis": {"automargin": True}, "showlegend": False},
-            }
-        )
-    return result
+    if not seen:
+        return []
+    marks = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": words,
+            "x": [v for v, on in zip(x, stats[name], strict=True) if on],
+            "y": [words] * int((stats[name] > 0).sum()),
+            "text": [f"{on} frames" for on in stats[name] if on],
+            "marker": {"symbol": "square", "size": 9},
+        }
+        for name, words in seen
+    ]
+    chart = {
+        "id": "stats-states",
+        "title": "States of the scene",
+        "text": "States that the device reported since the keyframe before, and in how many frames.",
+        "data": marks,
+        "layout": {"xaxis": xaxis, "yaxis": {"automargin": True}, "showlegend": False},
+    }
+    return [chart]

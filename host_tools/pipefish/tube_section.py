@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+MEASURED = ("ok", "circle_only")  # statuses of stations that have sizes
+
 
 def section_points(shape: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The curve { M u + g n } of tube/section.hpp: shape (n,k), t (m,) -> (n,m,2)."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipefish.tube_section import AROUND
+from pipefish.tube_section import AROUND, MEASURED
 
 if TYPE_CHECKING:
     from pipefish.tube import Tube
@@ -209,7 +209,6 @@ def bordered(tube: Tube, among: np.ndarray, without: np.ndarray) -> np.ndarray:
 def is_open(tube: Tube) -> np.ndarray:
     """(n,) bool: stations that were measured but for this: the section is no ellipse, and how it goes on where no wall
     is seen is hardly known; half as well is not enough where points beside the gap lie off it."""
-    from pipefish.tube import MEASURED
     from pipefish.tube_water import mirrored
 
     table, d = tube.stations, tube.summary["d_mean"]

@@ -159,3 +159,8 @@ class Common:
         start = np.clip(at - length / 2, low, max(low, high - length))
         inside = on[(s >= start) & (s <= start + length)]
         return inside if len(inside) >= LEAST else on
+
+
+def alike(surface: Any) -> int:
+    """So many neighbouring points of a surface tell the same."""
+    return max(1, round(surface.correlation * surface.thinning))

@@ -12,16 +12,15 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from .camera import Camera
 from .errors import ArgumentError, FormatError, PipefishError, file_error
-from .files import write_atomically
+from .files import PICTURES, opened_picture, write_atomically
 from .progress import Progress, track
 from .views import FAR, Remap, remap, rotation, vertical_fov, view_rays
 
 Picture = npt.NDArray[np.uint8]
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 _PLANES = {"mono": 0, "420": 1, "420jpeg": 1, "420mpeg2": 1, "420paldv": 1}  # and whether colour follows
 
 
@@ -53,8 +52,8 @@ def undistort(
         fov = 90.0 if view in ("perspective", "cube") else 180.0
     one = not source.is_dir() and source.suffix.lower() != ".y4m"
     for path in ([out] if one else []) + ([mask] if mask is not None else []):
-        if path.suffix.lower() not in SUFFIXES:
-            raise ArgumentError(f"{path}: a picture's name ends in {', '.join(SUFFIXES)}")
+        if path.suffix.lower() not in PICTURES:
+            raise ArgumentError(f"{path}: a picture's name ends in {', '.join(PICTURES)}")
     width, height = size or (camera.width, camera.height)
     if view == "cube" and size is None:
         width = height = min(camera.width, camera.height) // 2
@@ -95,15 +94,8 @@ def _encode(picture: Picture, path: Path) -> bytes:
 
 
 def _open(path: Path, camera: Camera) -> Picture:
-    try:
-        with Image.open(path) as opened:
-            picture = np.asarray(opened if opened.mode in ("L", "RGB") else opened.convert("RGB"))
-    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError, EOFError) as error:
-        raise FormatError(path, None, f"not a picture: {error}") from None
-    except OSError as error:
-        if error.errno is None:  # Pillow's own, for a damaged file
-            raise FormatError(path, None, f"not a whole picture: {error}") from None
-        raise
+    with opened_picture(path) as opened:
+        picture = np.asarray(opened if opened.mode in ("L", "RGB") else opened.convert("RGB"))
     _check_size(path, picture.shape[1], picture.shape[0], camera)
     return picture
 
@@ -115,9 +107,9 @@ def _check_size(path: Path, width: int, height: int, camera: Camera) -> None:
 
 
 def _folder(source: Path, out: Path, camera: Camera, table: Remap, quiet: bool) -> int:
-    pictures = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    pictures = sorted(p for p in source.iterdir() if p.suffix.lower() in PICTURES and p.is_file())
     if not pictures:
-        raise FormatError(source, None, f"no pictures ({', '.join(SUFFIXES)})")
+        raise FormatError(source, None, f"no pictures ({', '.join(PICTURES)})")
     if out.exists():
         raise PipefishError(f"{out}: is there already; a folder is not overwritten")
     partial = out.with_name(f".{out.name}.{os.getpid()}")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from crawler import PATIENCE_S, Crawler, wait_for_log, write_recording
+from pipefish.camera import Camera
 from pipefish.cli import main
 from pipefish.simulate import Scene
 from rendered_survey import FRAMES, SCENE, rendered_survey
@@ -75,6 +76,15 @@ def device(tmp_path: Path, own_keys: None, request: pytest.FixtureRequest) -> Cr
     crawler.start()
     wait_for_log(crawler, "127.0.0.1:")
     return crawler
+
+
+@pytest.fixture(scope="session")
+def front() -> Camera:
+    """A camera that many programs' models hold."""
+    return Camera(
+        width=800, height=600, f_u=330.5, f_v=331.25, c_u=402.25, c_v=296.5, theta_max=1.52,
+        k2=-0.013, k3=0.004, k4=-0.002, k5=0.0003, name="front",
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")

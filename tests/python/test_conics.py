@@ -286,6 +286,14 @@ def test_bad_files_are_refused_with_file_and_place(tmp_path, capsys, name, text,
     assert message in error and error.count("\n") == 1
 
 
+def test_a_picture_that_ends_early_is_named(tmp_path, capsys) -> None:
+    """The error said what is wrong, but of no file."""
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8)).save(tmp_path / "x.png")
+    (tmp_path / "x.png").write_bytes((tmp_path / "x.png").read_bytes()[:1000])
+    assert cli.main(["homography", str(tmp_path / "x.png"), str(tmp_path / "x.png")]) == 1
+    assert "x.png: not a whole picture" in capsys.readouterr().err
+
+
 def test_a_target_of_many_discs_and_a_picture_of_it_give_their_homography(tmp_path: Path, capsys) -> None:
     """Matched one by one only the twelve largest would be looked at; the target's own detector orders them all."""
     board = pf.Target("circles", 7, 7, 0.02, radius_m=0.005)

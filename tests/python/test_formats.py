@@ -197,14 +197,6 @@ def test_ros_messages_as_printed_are_read_like_ros_files(tmp_path):
 # ---- writers
 
 
-@pytest.fixture(scope="module")
-def front():
-    return pf.Camera(
-        width=800, height=600, f_u=330.5, f_v=331.25, c_u=402.25, c_v=296.5, theta_max=1.52,
-        k2=-0.013, k3=0.004, k4=-0.002, k5=0.0003, name="front",
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("form", ["opencv-fisheye", "ros", "kalibr", "colmap", "basalt", "orbslam3"])
 def test_a_polynomial_goes_out_and_comes_back_to_the_bit(front, form, tmp_path):
     written = formats.write(front, tmp_path / "out", form)

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipefish as pf
 from pipefish import formats
 
 DATA = Path(__file__).with_name("data") / "formats"
@@ -73,14 +72,6 @@ def rays_of(camera):
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, 23), np.linspace(0, camera.height - 1, 23))
     rays, ok = camera.unproject(np.stack([x, y], axis=-1).reshape(-1, 2))
     return rays[ok & (rays[:, 2] > math.cos(math.radians(89)))]
-
-
-@pytest.fixture(scope="module")
-def front():
-    return pf.Camera(
-        width=800, height=600, f_u=330.5, f_v=331.25, c_u=402.25, c_v=296.5, theta_max=1.52,
-        k2=-0.013, k3=0.004, k4=-0.002, k5=0.0003, name="front",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 import pipefish as pf
 from pipe_cloud import Pipe
-from pipefish import tube_findings
+from pipefish import tube_findings, tube_patches
 from pipefish.tube_shared import Common
 
 
@@ -228,8 +228,8 @@ def test_points_that_are_the_highest_for_their_errors_make_no_height(
         "distance": np.array([2.6, 2.2, 1.7, 1.3, 1.3, 0.9, 0.8]) / 1000,
         "sigma": np.array([sigma_of_the_highest] * 2 + [0.0002] * 5),
     }
-    surely = tube_findings._surely(points, np.arange(7), 0.0024, 0.0002)
-    assert (surely > tube_findings.LEAST_HEIGHT * 0.3) is is_sure
+    surely = tube_patches._surely(points, np.arange(7), 0.0024, 0.0002)
+    assert (surely > tube_patches.LEAST_HEIGHT * 0.3) is is_sure
 
 
 @pytest.mark.parametrize(("clock", "height"), [(3.0, 0.015), (0.05, 0.009), (4.5, -0.012)])
@@ -331,7 +331,7 @@ def test_few_points_tell_where_a_heap_of_any_form_lies_and_how_large_it_is(
     tube = pf.fit_tube(points[~behind | (rng.random(len(s)) < 0.33)], pipe.noise, pipe.cameras(diameter / 8))
     found = of_kind(tube, "deposit")
     x = np.linspace(-1, 1, 2001)
-    high = x[height * form(x[:, None], np.linspace(-1, 1, 101)).max(axis=1) > tube_findings.LEAST_HEIGHT]
+    high = x[height * form(x[:, None], np.linspace(-1, 1, 101)).max(axis=1) > tube_patches.LEAST_HEIGHT]
     middle = pipe.heap[0] + 0.25 * (high[0] + high[-1]) * pipe.heap[2]
     place = float(tube.project(np.array([[0, 0, middle]]))["s"][0])  # the wall begins where its first points lie
     turn = (found["clock"] - clock + math.pi) % (2 * math.pi) - math.pi
@@ -351,4 +351,4 @@ def test_points_beside_a_rim_are_those_of_all_pairs(link: float) -> None:
     reach = np.where(rng.random(len(rows)) < 0.5, 1.5, 1.0) * link
     away = (p["clock"][rows][:, None] - p["clock"][rim] + np.pi) % (2 * np.pi) - np.pi
     near = np.hypot(p["s"][rows][:, None] - p["s"][rim], away * 0.15) < reach[:, None]
-    assert (tube_findings._beside(p, rows, rim, reach, 0.15) == near.any(axis=1)).all()
+    assert (tube_patches._beside(p, rows, rim, reach, 0.15) == near.any(axis=1)).all()

@@ -15,6 +15,7 @@ from pipefish.cli import main
 from pipefish.simulate import Scene
 from pipefish.unroll import Unroller, nice_length
 from rendered_survey import FRAMES, MARKS, SCENE, rendered_survey
+from test_reconstruct_cli import failure
 from true_wall import TrueWall, true_wall
 
 
@@ -180,15 +181,6 @@ def test_a_long_picture_is_written_in_parts(measured, tmp_path, monkeypatch):
         assert after is None or (
             after["first_column"] == p["first_column"] + p["columns"] and after["start"] == p["end"]
         )
-
-
-def failure(capsys, *arguments: object) -> str:
-    """The line of a command that must fail with exit code 1."""
-    capsys.readouterr()
-    assert main([str(a) for a in arguments]) == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_bad_input_is_named(measured, tmp_path, capsys):
