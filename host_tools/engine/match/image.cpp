@@ -28,6 +28,8 @@ constexpr float kPole = -0.26794919243F; // sqrt(3) - 2, of the cubic spline's i
 void filter_rows(Image &image)
 {
     const int w = image.cols, h = image.rows;
+    if (h < 2)
+        return; // a constant
     std::vector<float> start(static_cast<size_t>(w), 0.0F);
     float power = 1;
     for (int y = 0; y < std::min(h, 16); y++, power *= kPole) // 0.268^16 is below a float's last bit
