@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -162,6 +165,7 @@ def sheet(columns: int = 4, nodes: int = 9) -> Any:
         (lambda: expand(width=3), "width"),
         (lambda: _engine.mask_outlines(np.zeros((0, 5), np.uint8)), "mask"),
         (lambda: _engine.silhouette(np.zeros((1, 0, 5), np.float32), *[np.zeros((0, 5), np.uint8)] * 3), "picture"),
+        (lambda: _engine.silhouette(np.zeros((6, 9, 9), np.float32), *[np.zeros((9, 9), np.uint8)] * 3), "picture"),
         (lambda: _engine.Prepared(PICTURE[:0], None, 100_000, 500), "picture"),
         (lambda: _engine.Prepared(PICTURE, None, 0, 500), "max_pixels"),
         (lambda: surface(radii=4), "rho"),
@@ -201,6 +205,23 @@ def test_a_picture_of_one_row_has_no_place_to_sample() -> None:
     """Nor has one of one column: its spline is a constant, and reads nothing beside it."""
     for shape in ((1, 9), (9, 1), (1, 1)):
         assert np.isnan(_engine.sample_image(np.ones(shape, np.float32), np.zeros((3, 2)))).all()
+
+
+def test_where_the_system_gives_no_more_threads_the_work_is_done_by_fewer() -> None:
+    """Nine threads have stacks of 8 MB each; with the memory there is, three begin."""
+    code = """
+import resource, sys
+from pipe_cloud import Pipe
+from pipefish import _engine
+points = Pipe().points(1500)
+alone = _engine.tube_find_cylinder(points, None, 1)
+pages = int(open("/proc/self/statm").read().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (30 << 20),) * 2)
+among = _engine.tube_find_cylinder(points, None, 10)
+assert all(repr(alone[key]) == repr(among[key]) for key in alone)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_tube_has_no_other_pieces_than_its_own() -> None:

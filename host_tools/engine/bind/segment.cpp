@@ -178,7 +178,7 @@ using Marks = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::
 
 Array<uint8_t> silhouette_of(const Planes &planes, const Marks &expected, const Marks &seen, const Marks &others)
 {
-    require(planes.size() > 0, "no picture");
+    require(planes.size() > 0 && (planes.shape(0) == 1 || planes.shape(0) == 3), "no picture");
     const size_t rows = planes.shape(1), columns = planes.shape(2);
     const auto mask = [&](const Marks &given) {
         require(given.shape(0) == rows && given.shape(1) == columns, "a mask is not of the picture's size");
