@@ -207,6 +207,13 @@ def test_a_picture_of_one_row_has_no_place_to_sample() -> None:
         assert np.isnan(_engine.sample_image(np.ones(shape, np.float32), np.zeros((3, 2)))).all()
 
 
+@pytest.mark.parametrize("side", [6, 7, 16])
+def test_a_small_picture_of_one_grey_is_that_grey_between_its_pixels(side: int) -> None:
+    """The spline's first coefficients are sums over 16 samples, mirrored at the other end where there are fewer."""
+    values = _engine.sample_image(np.full((side, side), 0.5, np.float32), np.array([[2.5, 2.5]]))
+    assert np.abs(values - 0.5).max() < 1e-6
+
+
 def test_where_the_system_gives_no_more_threads_the_work_is_done_by_fewer() -> None:
     """Nine threads have stacks of 8 MB each; with the memory there is, three begin."""
     code = """
