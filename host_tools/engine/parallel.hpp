@@ -5,13 +5,15 @@
 #include <atomic>
 #include <exception>
 #include <mutex>
+#include <system_error>
 #include <thread>
 #include <vector>
 
 namespace pipefish
 {
 
-// Calls body(i) for 0 <= i < items, on the calling thread and threads - 1 others. The first exception is passed on.
+// Calls body(i) for 0 <= i < items, on the calling thread and threads - 1 others, or as many as the system gives. The
+// first exception is passed on.
 template <typename Body> void parallel_for(int items, int threads, const Body &body)
 {
     std::atomic<int> next{0};
@@ -29,8 +31,11 @@ template <typename Body> void parallel_for(int items, int threads, const Body &b
     };
     {
         std::vector<std::jthread> team;
-        for (int k = 1; k < threads && k < items; k++) {
-            team.emplace_back(work);
+        try {
+            for (int k = 1; k < threads && k < items; k++) {
+                team.emplace_back(work);
+            }
+        } catch (const std::system_error &) { // no more threads: those that are there do it all
         }
         work();
     }

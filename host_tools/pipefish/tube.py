@@ -84,10 +84,14 @@ class Tube:
 
     def frames(self, s: Any, piece: Any = None) -> dict[str, np.ndarray]:
         """Of each chainage: centre, tangent, up (twelve o'clock), right (three o'clock), all (n,3); shape (n,k);
-        `zero`, the section's own angle at twelve o'clock."""
+        `zero`, the section's own angle at twelve o'clock. piece (n,): on which piece's axis, where two meet; -1, or
+        None: on the one that holds the chainage."""
         self._need()
         s = np.atleast_1d(np.asarray(s, float))
-        found = self.surface.stations(s.tolist(), [-1] * len(s) if piece is None else list(piece))
+        on = np.full(s.shape, -1) if piece is None else np.asarray(piece, int)
+        if s.ndim != 1 or on.shape != s.shape or not ((on >= -1) & (on < len(self.surface.pieces))).all():
+            raise ArgumentError(f"piece: not one of the tube's {len(self.surface.pieces)} for each of s {s.shape}")
+        found = self.surface.stations(s.tolist(), on.tolist())
         zero = _zero_angle(found, self._up, self.surface)
         c, n = np.cos(zero)[:, None], np.sin(zero)[:, None]
         found["up"] = c * found["first"] + n * found["second"]
@@ -304,17 +308,17 @@ def _of_another_shape(fit: _Fit, points: np.ndarray, tube: Tube, count: int) -> 
 def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any, Any, np.ndarray]:
     """Arrays as the engine wants them, without points that are not finite; `used`: which points are."""
     cloud = _array(points, "points", (None, 3))
-    used = np.isfinite(cloud).all(1)
+    used = _bounded(cloud).all(1)
     noise = None
     if sigma is not None:
         noise = np.asarray(sigma, float)
         if noise.ndim == 0:
-            if not np.isfinite(noise):
+            if not _bounded(noise):
                 raise ArgumentError(f"sigma: {noise} is not a standard deviation")
             noise = np.full(len(cloud), float(noise))
         if noise.shape not in ((len(cloud),), (len(cloud), 3, 3)):
             raise ArgumentError(f"sigma: shape {noise.shape} is neither ({len(cloud)},) nor ({len(cloud)}, 3, 3)")
-        sound = np.isfinite(noise) if noise.ndim == 1 else np.isfinite(noise).all((1, 2))
+        sound = _bounded(noise) if noise.ndim == 1 else _bounded(noise).all((1, 2))
         if noise.ndim == 1 and (noise[sound] < 0).any():
             raise ArgumentError("sigma: negative standard deviations")
         if noise.ndim == 3 and not _are_covariances(noise[sound]):
@@ -324,9 +328,9 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
     centres = None
     if path is not None:
         centres = _array(path, "path", (None, 3))
-        if not np.isfinite(centres).all():
+        if not _bounded(centres).all():
             raise ArgumentError("path: not finite")
-        centres = _forward(centres)
+        centres = _forward(centres) if len(centres) else centres
         if len(centres) < 2:
             raise ArgumentError("path: the camera stands still; leave it out")
     vector = None
@@ -336,6 +340,11 @@ def _checked(points: Any, sigma: Any, path: Any, up: Any) -> tuple[Any, Any, Any
             raise ArgumentError("up: not a direction")
         vector = vector / np.linalg.norm(vector)
     return np.ascontiguousarray(cloud[used]), noise, centres, vector, used
+
+
+def _bounded(values: np.ndarray) -> np.ndarray:
+    """Finite, and so are products of a few of them."""
+    return np.abs(values) <= 1e50
 
 
 def _are_covariances(noise: np.ndarray) -> bool:

@@ -220,11 +220,12 @@ def test_what_half_a_pipe_hides_is_in_its_interval() -> None:
     [
         (np.zeros((0, 3)), "too_few_points"),
         (np.full((500, 3), np.nan), "too_few_points"),
+        (Pipe().points(500) * 1e300, "too_few_points"),
         (np.zeros((500, 3)), "no_cylinder"),
         (np.random.default_rng(0).normal(size=(1500, 3)), "no_cylinder"),
         (Pipe(cover=1.9).points(1200), "one_sided"),
     ],
-    ids=["none", "not finite", "one place", "a cloud", "a strip"],
+    ids=["none", "not finite", "beyond all bounds", "one place", "a cloud", "a strip"],
 )
 def test_what_is_no_pipe_is_an_answer(points: np.ndarray, status: str) -> None:
     tube = pf.fit_tube(points)
@@ -270,6 +271,8 @@ def test_wrong_arguments_are_named() -> None:
         (dict(points=points, sigma=np.ones(3)), "sigma"),
         (dict(points=points, sigma=-1.0), "sigma"),
         (dict(points=points, path=np.zeros((5, 3))), "path"),
+        (dict(points=points, path=np.zeros((0, 3))), "path"),
+        (dict(points=points, path=np.full((5, 3), 1e300)), "path"),
         (dict(points=points, nominal=-1.0), "nominal"),
         (dict(points=points, order=5), "order"),
         (dict(points=points, up=(0, 0, 0)), "up"),

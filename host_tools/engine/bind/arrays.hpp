@@ -1,4 +1,5 @@
-// Arrays for Python: made here, owned by NumPy, row-major.
+// Arrays for Python: made here, owned by NumPy, row-major. And what keeps those that come from there within bounds:
+// pipefish's Python checks its arguments and names them; nothing that gets past it may reach the engine's memory.
 #pragma once
 
 #include <Eigen/Core>
@@ -9,10 +10,26 @@
 #include <algorithm>
 #include <initializer_list>
 #include <memory>
+#include <stdexcept>
 #include <utility>
 #include <vector>
 
 template <typename T> using Array = nanobind::ndarray<nanobind::numpy, T>;
+
+// A ValueError with this text unless it holds.
+inline void require(bool holds, const char *otherwise)
+{
+    if (!holds)
+        throw std::invalid_argument(otherwise);
+}
+
+// Whether all values lie within `low` and `high`; NaN does not.
+template <typename Given> bool all_within(const Given &given, double low, double high)
+{
+    return std::all_of(given.data(), given.data() + given.size(), [&](auto value) {
+        return static_cast<double>(value) >= low && static_cast<double>(value) <= high;
+    });
+}
 
 // Takes over what `data` holds.
 template <typename T> Array<T> to_numpy(std::unique_ptr<T[]> data, std::initializer_list<size_t> shape)

@@ -50,9 +50,11 @@ std::unique_ptr<Bundle> make(const std::vector<int> &camera, const std::vector<i
                              const Rows<2> &pixels, double circle_radius)
 {
     const size_t count = camera.size();
-    if (board.size() != count || frame.size() != count || first.size() != count + 1 || count == 0 ||
-        first.back() != drawn.shape(0) || drawn.shape(0) != pixels.shape(0))
-        throw nb::value_error("bundle: views and points do not go together");
+    const auto numbers = [](const std::vector<int> &of) { return *std::min_element(of.begin(), of.end()) >= 0; };
+    require(count > 0 && board.size() == count && frame.size() == count && first.size() == count + 1 &&
+                std::is_sorted(first.begin(), first.end()) && first.back() == drawn.shape(0) &&
+                drawn.shape(0) == pixels.shape(0) && numbers(camera) && numbers(board) && numbers(frame),
+            "bundle: views and points do not go together");
     auto bundle = std::make_unique<Bundle>();
     bundle->circle_radius = circle_radius;
     bundle->cameras.resize(static_cast<size_t>(*std::max_element(camera.begin(), camera.end())) + 1);
@@ -76,8 +78,7 @@ template <class Each> void each_point(Bundle &bundle, size_t given, const Each &
     size_t i = 0;
     for (View &view : bundle.views)
         i += view.points.size();
-    if (i != given)
-        throw nb::value_error("bundle: not one value a point");
+    require(i == given, "bundle: not one value a point");
     i = 0;
     for (View &view : bundle.views)
         for (Observation &point : view.points)
@@ -86,6 +87,7 @@ template <class Each> void each_point(Bundle &bundle, size_t given, const Each &
 
 void set_sheets(Bundle &bundle, const Rows<3> &across, const Rows<3> &down, const Rows<3> &bend)
 {
+    require(down.shape(0) == across.shape(0) && bend.shape(0) == across.shape(0), "bundle: not one value a point");
     each_point(bundle, across.shape(0), [&](Observation &point, size_t i) {
         point.across = Eigen::Map<const Eigen::Vector3d>(across.data() + 3 * i);
         point.down = Eigen::Map<const Eigen::Vector3d>(down.data() + 3 * i);
@@ -269,9 +271,10 @@ void bind_calib(nb::module_ &m)
                  return nb::make_tuple(l.camera, l.camera_pose, l.corner, l.shape, l.board_pose, l.size);
              })
         .def("parameter_slope",
-             [](Bundle &b, int i) {
+             [](Bundle &b, size_t i) {
+                 require(i < b.cameras.size(), "no such camera");
                  b.arrange();
-                 return matrix_to_numpy(b.parameter_slope(i));
+                 return matrix_to_numpy(b.parameter_slope(static_cast<int>(i)));
              })
         .def("view_pose", &view_pose_of, nb::arg("view"), "Board to camera (3, 4) by rays alone, or None.")
         .def("sweep", &sweep_of, nb::arg("camera"), nb::arg("width"), nb::arg("height"), nb::arg("c_u"), nb::arg("c_v"),

@@ -82,6 +82,14 @@ void make_board(Board *self, const std::string &kind, const Rows2 &flat, const S
                 int marker_bits, int marker_errors, double marker_side, const Rows2 &marker_middles,
                 const Bytes &marker_codes)
 {
+    const bool coded = kind == "sleeve" || kind == "checkerboard" || kind == "charuco";
+    require(flat.shape(0) >= 1 && sites.shape(0) == flat.shape(0), "sites: not one for each point");
+    require(code.size() == (coded ? flat.shape(0) : 0), "code: not one for each point");
+    require(std::min(size[0], size[1]) >= 1 && std::max(size[0], size[1]) <= 10000, "size: out of range");
+    require(all_within(sites, -100000, 100000), "sites: out of range");
+    require(marker_bits >= 0 && marker_bits <= 64 &&
+                marker_codes.size() == marker_middles.shape(0) * static_cast<size_t>(marker_bits * marker_bits),
+            "marker_codes: not of as many markers and bits");
     Board b;
     b.kind = kind_of(kind);
     for (size_t k = 0; k < flat.shape(0); k++) {
@@ -108,6 +116,7 @@ void make_board(Board *self, const std::string &kind, const Rows2 &flat, const S
 
 cv::Mat view(const Picture &image)
 {
+    require(image.size() > 0 && std::max(image.shape(0), image.shape(1)) <= 32767, "not a picture");
     return cv::Mat(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)), CV_8U,
                    const_cast<uint8_t *>(image.data()));
 }

@@ -79,12 +79,14 @@ nb::dict to_python(const Recognition &r)
 
 void prepare_at(Prepared *at, const Picture &image, const std::optional<Marked> &mask, int max_pixels, int regions)
 {
+    require(image.size() > 0 && std::max(image.shape(0), image.shape(1)) <= 32767, "not a picture");
+    require(max_pixels >= 1024 && regions >= 1, "max_pixels or regions: out of range");
     const int rows = static_cast<int>(image.shape(0)), columns = static_cast<int>(image.shape(1));
     const match::Image picture(rows, columns, const_cast<float *>(image.data())); // not written to
     Mask marked;
     if (mask) {
-        if (mask->shape(0) != image.shape(0) || mask->shape(1) != image.shape(1))
-            throw std::invalid_argument("the mask is not of the picture's size");
+        require(mask->shape(0) == image.shape(0) && mask->shape(1) == image.shape(1),
+                "the mask is not of the picture's size");
         marked = Mask(rows, columns, const_cast<uint8_t *>(mask->data()));
     }
     const nb::gil_scoped_release release;
@@ -104,6 +106,7 @@ void bind_group(nb::module_ &m)
     m.def(
         "group_matches",
         [](const Rows2 &xy1, const Rows2 &xy2, const Maps &affine, const Values &zncc, const Options &options) {
+            require(options.cell >= 1, "cell: not at least 1");
             const std::vector<match::Match> matches = matches_of(xy1, xy2, affine, zncc);
             Groups found;
             {
@@ -117,6 +120,11 @@ void bind_group(nb::module_ &m)
         "group_support",
         [](const Rows2 &xy, const Triples &triangles, const Labels &group, int wanted, int height, int width,
            double reach) {
+            require(group.shape(0) == triangles.shape(0), "group: not one for each triangle");
+            require(all_within(triangles, 0, static_cast<double>(xy.shape(0)) - 1), "triangles: no such position");
+            require(all_within(xy, -kPixelMost, kPixelMost), "xy: not pixels");
+            require(std::min(height, width) >= 1 && std::max(height, width) <= 32767,
+                    "height and width: not a picture's");
             std::vector<match::Match> corners(xy.shape(0));
             for (size_t k = 0; k < corners.size(); k++)
                 corners[k].centre = {static_cast<float>(xy(k, 0)), static_cast<float>(xy(k, 1))};
@@ -137,6 +145,7 @@ void bind_group(nb::module_ &m)
     m.def(
         "mask_outlines",
         [](const Marked &mask) {
+            require(mask.size() > 0, "an empty mask");
             return to_python(outlines(Mask(static_cast<int>(mask.shape(0)), static_cast<int>(mask.shape(1)),
                                            const_cast<uint8_t *>(mask.data()))));
         },
@@ -159,6 +168,7 @@ void bind_group(nb::module_ &m)
     m.def(
         "recognise",
         [](const Prepared &model, const Prepared &scene, const RecogniseOptions &options) {
+            require(options.seeds >= 1 && options.grouping.cell >= 1, "seeds or cell: not at least 1");
             Recognition found;
             {
                 const nb::gil_scoped_release release;

@@ -1,7 +1,9 @@
 // Quasi-dense matching for Python: _engine.find_seeds, _engine.grow_matches. pipefish/matching.py is what people use.
 #include "bind/arrays.hpp"
 #include "bind/matches.hpp"
+#include "match/patch.hpp"
 #include "match/rivals.hpp"
+#include "match/search.hpp"
 #include "match/seeds.hpp"
 #include "pipefish/profile.h"
 
@@ -25,9 +27,12 @@ using Picture = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::
 using Pose = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Square = nb::ndarray<const double, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 
+constexpr int kSideMost = 32767; // pixels
+
 // Borrows the array: cv::Mat is not const-correct, ScaleStack does not write level 0.
 Image view(const Picture &image)
 {
+    require(image.size() > 0 && image.shape(0) <= kSideMost && image.shape(1) <= kSideMost, "not a picture");
     return Image(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)), const_cast<float *>(image.data()));
 }
 
@@ -91,6 +96,7 @@ Array<double> match_rivals(const Picture &first, const Picture &second, const st
                            const Reach &reach, const std::optional<Epipolar> &epipolar,
                            const std::optional<Square> &fundamental)
 {
+    require(reach.radius >= 1 && reach.radius <= kPatchMost, "radius: out of range");
     LineAt line_at;
     if (epipolar) {
         line_at = [&](const Eigen::Vector2d &x, const Eigen::Vector2d &x_2) { return epipolar->at(x, x_2); };
@@ -113,6 +119,10 @@ Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at
                     const Options &options, const pf_profile *camera_1, const pf_profile *camera_2,
                     const std::optional<Pose> &pose)
 {
+    require(centre.shape(0) == at.shape(0) && maps.shape(0) == at.shape(0),
+            "xy1, xy2 and affine: must be as long as each other");
+    require(options.radius >= 2 && options.radius <= kRadiusMost, "radius: out of range");
+    require(options.classes >= 1 && options.classes <= 1 << 20, "classes: out of range");
     std::vector<Seed> seeds(at.shape(0));
     for (size_t k = 0; k < seeds.size(); k++) {
         seeds[k] = {{at(k, 0), at(k, 1)}, {centre(k, 0), centre(k, 1)}, {}};
@@ -177,6 +187,7 @@ void bind_match(nb::module_ &m)
         "find_seeds",
         [](const Picture &first, const Picture &second, int most, bool adapt, bool hessian, bool extremal,
            int threads) {
+            require(most >= 1, "most: not at least 1");
             std::vector<Seed> seeds;
             {
                 const nb::gil_scoped_release release;

@@ -34,6 +34,16 @@ std::vector<std::vector<int32_t>> rows_of(const Table &table)
 nb::tuple expand_one(const Table &cost, int width, const Weights &weight, const Table &partner, int lonely, int alpha,
                      const Bytes &start)
 {
+    const size_t pixels = cost.shape(1);
+    require(partner.shape(0) == cost.shape(0) && partner.shape(1) == pixels && start.shape(0) == pixels,
+            "cost, partner and labels: not of as many labels and pixels");
+    require(weight.shape(0) * weight.shape(1) == pixels && width >= 1 &&
+                weight.shape(1) % static_cast<size_t>(width) == 0,
+            "weight: not of pictures of that width");
+    require(cost.shape(0) <= 256 && alpha < static_cast<int>(cost.shape(0)) &&
+                all_within(start, 0, static_cast<double>(cost.shape(0)) - 1),
+            "alpha or labels: no such label");
+    require(all_within(partner, -1, static_cast<double>(pixels) - 1), "partner: no such pixel");
     std::vector<Grid> grids(weight.shape(0), {width, {}});
     Problem problem{{}, rows_of(cost), rows_of(partner), lonely};
     for (size_t k = 0; k < grids.size(); k++) {
@@ -53,6 +63,9 @@ nb::tuple expand_one(const Table &cost, int width, const Weights &weight, const 
 
 Array<double> halved(const std::array<int, 4> &box, double spacing, const Rows2 &d, const Rows2 &at)
 {
+    require(std::min(box[2], box[3]) >= 1 && std::max(box[2], box[3]) <= 32767 && spacing >= 0.5 && spacing <= 32767,
+            "box or spacing: out of range");
+    require(all_within(at, -1e6, 1e6), "at: not places");
     Warp warp{Lattice({box[0], box[1], box[2], box[3]}, spacing), {}};
     const size_t points = warp.lattice.points();
     if (d.shape(0) < points)
@@ -81,8 +94,13 @@ std::vector<Image> planes_of(const Planes &planes)
     return out;
 }
 
-pipefish::group::Groups groups_of(const Indices &label, const Triples &triangles, const Indices &of)
+pipefish::group::Groups groups_of(const Indices &label, const Triples &triangles, const Indices &of, size_t matches)
 {
+    const double last = static_cast<double>(matches) - 1;
+    require(label.shape(0) == matches && of.shape(0) == triangles.shape(0),
+            "label or triangle_group: not one for each");
+    require(all_within(triangles, 0, last), "triangles: no such match");
+    require(all_within(label, -1, last) && all_within(of, 0, last), "label or triangle_group: no such group");
     pipefish::group::Groups out;
     out.label.assign(label.data(), label.data() + label.shape(0));
     for (size_t t = 0; t < triangles.shape(0); t++) {
@@ -132,7 +150,7 @@ nb::dict segment_pictures(const Planes &one, const Planes &two, const Rows2 &xy1
                           const Options &options, const nb::callable &progress)
 {
     const std::vector<pipefish::match::Match> matches = matches_of(xy1, xy2, affine, zncc);
-    const pipefish::group::Groups groups = groups_of(label, triangles, of);
+    const pipefish::group::Groups groups = groups_of(label, triangles, of, matches.size());
     Result found;
     {
         const nb::gil_scoped_release release;
@@ -160,10 +178,10 @@ using Marks = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::
 
 Array<uint8_t> silhouette_of(const Planes &planes, const Marks &expected, const Marks &seen, const Marks &others)
 {
+    require(planes.size() > 0 && (planes.shape(0) == 1 || planes.shape(0) == 3), "no picture");
     const size_t rows = planes.shape(1), columns = planes.shape(2);
     const auto mask = [&](const Marks &given) {
-        if (given.shape(0) != rows || given.shape(1) != columns)
-            throw std::invalid_argument("a mask is not of the picture's size");
+        require(given.shape(0) == rows && given.shape(1) == columns, "a mask is not of the picture's size");
         return pipefish::group::Mask(static_cast<int>(rows), static_cast<int>(columns),
                                      const_cast<uint8_t *>(given.data())); // not written to
     };

@@ -86,10 +86,9 @@ nb::tuple selfcal_errors(const Numbers &lens, double theta_end, uint32_t width, 
                          const Pixels &first, const Pixels &second, const Numbers &step)
 {
     using Unknowns = Eigen::Matrix<double, selfcal::kLens + selfcal::Adjustment::kPose, 1>;
-    if (lens.shape(0) != selfcal::kLens || pose.shape(0) != 12 || step.shape(0) != Unknowns::RowsAtCompileTime ||
-        first.shape(0) != second.shape(0)) {
-        throw std::invalid_argument("selfcal_errors: sizes");
-    }
+    require(lens.shape(0) == selfcal::kLens && pose.shape(0) == 12 && step.shape(0) == Unknowns::RowsAtCompileTime &&
+                first.shape(0) == second.shape(0),
+            "selfcal_errors: sizes");
     std::vector<selfcal::Pair> pairs(1);
     pairs[0].uv1.assign(first.data(), first.data() + first.size());
     pairs[0].uv2.assign(second.data(), second.data() + second.size());
@@ -123,9 +122,11 @@ nb::dict self_calibrate(const std::vector<Pixels> &first, const std::vector<Pixe
                         uint32_t height, double c_u, double c_v, double centre_sigma, double bend, double alpha_limit,
                         double alone_limit, double sigma_least, uint64_t seed, int threads)
 {
-    std::vector<selfcal::Pair> pairs(std::min(first.size(), second.size()));
+    require(first.size() == second.size(), "first and second: not as many pictures");
+    std::vector<selfcal::Pair> pairs(first.size());
     for (size_t p = 0; p < pairs.size(); p++) {
-        const size_t n = std::min(first[p].shape(0), second[p].shape(0));
+        const size_t n = first[p].shape(0);
+        require(second[p].shape(0) == n, "first and second: not as many matches");
         pairs[p].uv1.assign(first[p].data(), first[p].data() + 2 * n);
         pairs[p].uv2.assign(second[p].data(), second[p].data() + 2 * n);
     }

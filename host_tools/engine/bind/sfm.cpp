@@ -54,10 +54,31 @@ const char *status_name(geometry::TwoViewStatus status)
     }
 }
 
+// As many rows as `count`, where they are given.
+template <typename Rows> void require_rows(const std::optional<Rows> &rows, size_t count, const char *otherwise)
+{
+    require(!rows || rows->shape(0) == count, otherwise);
+}
+
+// Observations that a TrackTable can hold.
+void check_tracks(int frames, int tracks, const Indices &frame, const Indices &track, const Pixels &uv,
+                  const std::optional<Covariances> &covariance)
+{
+    const size_t n = frame.shape(0);
+    require(frames >= 0 && tracks >= 0, "frames and tracks: below 0");
+    require(track.shape(0) == n && uv.shape(0) == n, "frame, track and uv: must be as long as each other");
+    require_rows(covariance, n, "covariance: not one for each observation");
+    require(all_within(frame, 0, frames - 1.0), "frame: no such frame");
+    require(all_within(track, 0, tracks - 1.0), "track: no such track");
+}
+
 nb::dict two_view(const pf_profile &first, const pf_profile &second, const Pixels &uv1, const Pixels &uv2,
                   const std::optional<Covariances> &covariance1, const std::optional<Covariances> &covariance2,
                   double sigma, uint64_t seed)
 {
+    require(uv2.shape(0) == uv1.shape(0), "uv1 and uv2: must be as long as each other");
+    require_rows(covariance1, uv1.shape(0), "covariance1: not one for each pixel");
+    require_rows(covariance2, uv2.shape(0), "covariance2: not one for each pixel");
     geometry::TwoView found;
     {
         const nb::gil_scoped_release release;
@@ -91,9 +112,7 @@ geometry::Pose pose_at(const Poses &poses, size_t i)
 
 template <size_t N> std::array<geometry::Vector3d, N> vectors(const Triples &rows)
 {
-    if (rows.shape(0) != N) {
-        throw nb::value_error("wrong number of vectors");
-    }
+    require(rows.shape(0) == N, "wrong number of vectors");
     std::array<geometry::Vector3d, N> out;
     for (size_t i = 0; i < N; i++) {
         out[i] = {rows.data()[3 * i], rows.data()[3 * i + 1], rows.data()[3 * i + 2]};
@@ -106,7 +125,8 @@ Array<double> sampson_squared(const pf_profile &profile, const Matrix34 &pose, c
 {
     const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(pose.data());
     const geometry::Pose relative{m.leftCols<3>(), m.col(3)};
-    const size_t n = std::min(uv1.shape(0), uv2.shape(0));
+    const size_t n = uv1.shape(0);
+    require(uv2.shape(0) == n, "uv1 and uv2: must be as long as each other");
     const auto a = geometry::make_sights(profile.camera, n, uv1.data(), nullptr, sigma);
     const auto b = geometry::make_sights(profile.camera, n, uv2.data(), nullptr, sigma);
     std::vector<double> out(n);
@@ -121,15 +141,13 @@ Array<double> row_poses(const Poses &poses, const Indices &segment, const Values
 {
     const int frames = static_cast<int>(poses.shape(0));
     const size_t n = place.shape(0);
-    if (segment.shape(0) != poses.shape(0) || time.shape(0) != poses.shape(0) || late.shape(0) != n) {
-        throw nb::value_error("not one segment and time a pose, or not one time a place");
-    }
+    require(segment.shape(0) == poses.shape(0) && time.shape(0) == poses.shape(0) && late.shape(0) == n,
+            "not one segment and time a pose, or not one time a place");
+    require(std::is_sorted(segment.data(), segment.data() + frames), "segment: not in order");
+    require(all_within(place, 0, frames - 1.0), "place: no such frame");
     std::vector<double> out(12 * n);
     for (size_t i = 0; i < n; i++) {
         const int frame = place.data()[i];
-        if (frame < 0 || frame >= frames) {
-            throw nb::value_error("place: no such frame");
-        }
         const auto range = std::equal_range(segment.data(), segment.data() + frames, segment.data()[frame]);
         const int first = static_cast<int>(range.first - segment.data());
         const int end = static_cast<int>(range.second - segment.data());
@@ -148,14 +166,10 @@ Array<double> row_poses(const Poses &poses, const Indices &segment, const Values
 Array<double> functions(const sfm::BundleCovariance &covariance, const Indices &points, const Jacobians &jacobian)
 {
     const size_t m = jacobian.shape(0), n = points.shape(0);
-    if (jacobian.shape(1) != n) {
-        throw nb::value_error("jacobian: not one column for each point");
-    }
+    require(jacobian.shape(1) == n, "jacobian: not one column for each point");
+    require(all_within(points, 0, static_cast<double>(covariance.points().size()) - 1), "points: no such point");
     std::vector<sfm::BundleCovariance::Solver::MatrixEG> a(n);
     for (size_t k = 0; k < n; k++) {
-        if (points.data()[k] < 0 || static_cast<size_t>(points.data()[k]) >= covariance.points().size()) {
-            throw nb::value_error("points: no such point");
-        }
         a[k].resize(3, static_cast<Eigen::Index>(m));
         for (size_t row = 0; row < m; row++) {
             const double *from = jacobian.data() + 3 * (row * n + k);
@@ -240,6 +254,8 @@ nb::dict adjust(const pf_profile &profile, const Poses &poses, const Triples &po
                 const Indices &track, const Pixels &uv, double sigma, int max_iterations)
 {
     const int frames = static_cast<int>(poses.shape(0)), tracks = static_cast<int>(points.shape(0));
+    require(frames >= 2, "poses: fewer than two");
+    check_tracks(frames, tracks, frame, track, uv, std::nullopt);
     const sfm::TrackTable table(profile.camera, frames, tracks, {frame.data(), frame.shape(0)},
                                 {track.data(), track.shape(0)}, uv.data(), nullptr, sigma);
     sfm::Submap map;
@@ -274,6 +290,10 @@ const sfm::CameraPrior *prior_of(const std::vector<uint32_t> &parameters, const 
         return nullptr;
     }
     const Eigen::Index n = static_cast<Eigen::Index>(parameters.size());
+    require(covariance->shape(0) == parameters.size() && covariance->shape(1) == parameters.size(),
+            "not a row and a column of covariance for each parameter");
+    require(std::all_of(parameters.begin(), parameters.end(), [](uint32_t p) { return p < PF_CAMERA_PARAMS; }),
+            "no such parameter of a camera");
     room = sfm::CameraPrior(parameters, Eigen::Map<const Eigen::MatrixXd>(covariance->data(), n, n));
     return &room;
 }
@@ -287,6 +307,12 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::optional<Square> &drift, double drift_noise, bool common_errors, double sag_sigma,
                      const std::optional<Values> &frame_time, double line_time, double middle_row)
 {
+    check_tracks(frames, tracks, frame, track, uv, covariance);
+    const size_t count = static_cast<size_t>(frames);
+    require_rows(step, count, "step: not one for each frame");
+    require_rows(step_sigma, count, "step_sigma: not one for each frame");
+    require_rows(down, count, "down: not one for each frame");
+    require_rows(frame_time, count, "frame_time: not one for each frame");
     Extras extras;
     sfm::ReconstructOptions options;
     options.method = method == "incremental" ? sfm::Method::incremental : sfm::Method::hierarchical;
@@ -375,6 +401,7 @@ void bind_sfm(nb::module_ &m)
     m.def(
         "sag",
         [](const Values &first, const Values &now, double f) {
+            require(first.shape(0) == now.shape(0), "first and now: must be as long as each other");
             std::vector<double> out;
             for (size_t i = 0; i < now.shape(0); i++) {
                 out.push_back(sfm::sag_of(first.data()[i], now.data()[i], f));
@@ -390,6 +417,7 @@ void bind_sfm(nb::module_ &m)
     m.def(
         "turn_between",
         [](const Poses &first, const Poses &second, double share) {
+            require(first.shape(0) > 0 && second.shape(0) > 0, "no pose");
             const geometry::Matrix3d r1 = pose_at(first, 0).r, r2 = pose_at(second, 0).r;
             const geometry::TurnBetween out =
                 geometry::turn_between(r1, geometry::rotation_log(r2 * r1.transpose()), share);

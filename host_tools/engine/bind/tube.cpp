@@ -1,4 +1,5 @@
 // The tube for Python: arrays in, arrays and dictionaries out. pipefish/tube.py is what people use.
+#include "bind/arrays.hpp"
 #include "tube/cylinder.hpp"
 #include "tube/scan.hpp"
 #include "tube/section.hpp"
@@ -12,6 +13,7 @@
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <memory>
 #include <numeric>
 
@@ -27,16 +29,20 @@ using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::dev
 using Numbers = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Indices = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
+constexpr double FARTHEST = 1e60; // metres: fourth powers stay finite, and so does every distance
+
 // noise: None, (N,) standard deviations or (N,3,3) covariances.
 Cloud cloud_of(const Points &points, const nb::object &noise)
 {
     const size_t n = points.shape(0);
+    require(all_within(points, -FARTHEST, FARTHEST), "points: not finite, or beyond all bounds");
     Cloud cloud;
     cloud.points = Eigen::Map<const Eigen::Matrix3Xd>(points.data(), 3, static_cast<Eigen::Index>(n));
     if (noise.is_none()) {
         return cloud;
     }
     const Numbers values = nb::cast<Numbers>(noise);
+    require(all_within(values, -FARTHEST, FARTHEST), "noise: not finite, or beyond all bounds");
     if (values.ndim() == 1 && values.shape(0) == n) {
         cloud.sigma.assign(values.data(), values.data() + n);
     } else if (values.ndim() == 3 && values.shape(0) == n && values.shape(1) == 3 && values.shape(2) == 3) {
@@ -106,6 +112,7 @@ nb::dict fit_one(const Points &points, const nb::object &noise, const Eigen::Vec
 nb::dict find_one(const Points &points, const nb::object &noise, int threads)
 {
     const Cloud cloud = cloud_of(points, noise);
+    require(cloud.size() > 0, "no points");
     const nb::gil_scoped_release release;
     const Cylinder found = find_cylinder(cloud, threads);
     const nb::gil_scoped_acquire acquire;
@@ -116,6 +123,7 @@ nb::dict find_one(const Points &points, const nb::object &noise, int threads)
 nb::list trace_all(const Points &points, const nb::object &noise, const Points &path, int threads)
 {
     const Cloud cloud = cloud_of(points, noise);
+    require(cloud.size() > 0 && all_within(path, -FARTHEST, FARTHEST), "no points, or a path beyond all bounds");
     std::vector<Cylinder> found;
     {
         const nb::gil_scoped_release release;
@@ -149,6 +157,13 @@ std::unique_ptr<Fitted> fit_surface(const Points &points, const nb::object &nois
 {
     auto out = std::make_unique<Fitted>();
     out->cloud = cloud_of(points, noise);
+    require(all_within(centres, -FARTHEST, FARTHEST), "centres: not finite, or beyond all bounds");
+    require(rho.size() == centres.shape(0) && std::all_of(rho.begin(), rho.end(), [](double r) { return r > 0.0; }),
+            "rho: not a radius for each centre");
+    require(std::is_sorted(breaks.begin(), breaks.end()) && (breaks.empty() || breaks.front() > 0.0),
+            "breaks: not ascending from above 0");
+    require(knot > 1e-3 && (order == 0 || (order >= 2 && order <= MAX_ORDER)) && rounds >= 1,
+            "knot, order or rounds: out of range");
     const Reference reference{
         Eigen::Map<const Eigen::Matrix3Xd>(centres.data(), 3, static_cast<Eigen::Index>(centres.shape(0))), rho,
         breaks};
@@ -194,6 +209,8 @@ std::vector<OnSurface> all_placed(const Fitted &fitted)
 // Rows: s, chi2, the 7 differences, their 7 standard deviations.
 Rows steps(const Fitted &fitted, double window, double every, double radius)
 {
+    require(window > 0.0 && every > 1e-9 * fitted.surface->length() && radius > 0.0,
+            "window, every or radius: not above 0");
     const std::vector<Step> found = scan_steps(all_placed(fitted), fitted.surface->length(), window, every, radius);
     Rows out(static_cast<Eigen::Index>(found.size()), 16);
     for (size_t i = 0; i < found.size(); i++) {
@@ -205,13 +222,25 @@ Rows steps(const Fitted &fitted, double window, double every, double radius)
 
 Eigen::VectorXd medians(const Fitted &fitted, double radius, int k, int every, double reach, double most)
 {
+    require(radius > 0.0 && radius <= FARTHEST && k >= 1 && every >= 1 && reach > 0.0,
+            "radius, k, every or reach: out of range");
     const std::vector<double> found = local_medians(all_placed(fitted), radius, k, every, reach, most);
     return Eigen::Map<const Eigen::VectorXd>(found.data(), static_cast<Eigen::Index>(found.size()));
+}
+
+// Of stations: chainages and pieces, -1 where the chainage tells it.
+void check_places(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece)
+{
+    const int pieces = static_cast<int>(fitted.surface->pieces().size());
+    require(piece.size() == s.size(), "piece: not one for each chainage");
+    require(std::all_of(piece.begin(), piece.end(), [&](int p) { return p >= -1 && p < pieces; }),
+            "piece: the tube has no such piece");
 }
 
 // Each key an array with one row a station.
 nb::dict stations(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece)
 {
+    check_places(fitted, s, piece);
     const Eigen::Index n = static_cast<Eigen::Index>(s.size()), shape = shape_parameters(fitted.surface->order());
     Rows centre(n, 3), tangent(n, 3), first(n, 3), second(n, 3), sections(n, shape),
         covariance(n, (shape + 2) * (shape + 2));
@@ -245,10 +274,11 @@ nb::dict stations(const Fitted &fitted, const std::vector<double> &s, const std:
 // Of the sum over stations of weight . shape.
 double variance(const Fitted &fitted, const std::vector<double> &s, const std::vector<int> &piece, const Rows &weight)
 {
-    if (piece.size() != s.size() || weight.rows() != static_cast<Eigen::Index>(s.size()) ||
-        weight.cols() != shape_parameters(fitted.surface->order())) {
-        throw nb::value_error("variance: a piece and a row of weights for each station");
-    }
+    check_places(fitted, s, piece);
+    require(std::all_of(piece.begin(), piece.end(), [](int p) { return p >= 0; }), "piece: not told");
+    require(weight.rows() == static_cast<Eigen::Index>(s.size()) &&
+                weight.cols() == shape_parameters(fitted.surface->order()),
+            "weight: not a row for each station");
     return fitted.surface->variance(s, piece, weight);
 }
 

@@ -38,14 +38,12 @@ std::vector<Spot> spots_of(const Spots &rows)
 std::vector<Picture> pictures_of(const pf_camera &camera, const std::vector<Grey> &images, const Poses &poses,
                                  const std::vector<int> &views)
 {
-    if (images.size() != poses.shape(0) || images.size() != views.size()) {
-        throw nb::value_error("images, poses and views: not as many of each");
-    }
+    require(images.size() == poses.shape(0) && images.size() == views.size(),
+            "images, poses and views: not as many of each");
     std::vector<Picture> out(images.size());
     for (size_t i = 0; i < images.size(); i++) {
-        if (images[i].shape(0) != camera.height || images[i].shape(1) != camera.width) {
-            throw nb::value_error("images: not of the camera's size");
-        }
+        require(images[i].shape(0) == camera.height && images[i].shape(1) == camera.width,
+                "images: not of the camera's size");
         const Eigen::Map<const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> m(poses.data() + 12 * i);
         out[i] = {images[i].data(), {m.leftCols<3>(), m.col(3)}, views[i]};
     }
@@ -76,9 +74,7 @@ struct Balance {
     Light solve(const pf_profile &profile, const Eigen::VectorXd &along) const
     {
         for (const Glance &g : seen) {
-            if (g.view < 0 || g.view >= along.size()) {
-                throw nb::value_error("views: out of range");
-            }
+            require(g.view >= 0 && g.view < along.size(), "views: out of range");
         }
         const nb::gil_scoped_release release;
         return balance(seen, along, profile.camera.theta_max);
@@ -92,16 +88,14 @@ nb::tuple draw_sheet(const pf_profile &profile, const std::vector<Grey> &images,
                      double cell, const Light &light, double finest, double radius, double reach, double seam,
                      int threads)
 {
-    Sheet sheet{columns, row_count, step, cell, spots_of(rows)};
-    if (step < 1 || columns % step || row_count % step ||
-        sheet.nodes.size() != static_cast<size_t>(sheet.node_rows()) * static_cast<size_t>(sheet.node_columns())) {
-        throw nb::value_error("spots: not the nodes of such a sheet");
-    }
+    const Sheet sheet{columns, row_count, step, cell, spots_of(rows)};
+    require(step >= 1 && columns >= 1 && row_count >= 1 && columns % step == 0 && row_count % step == 0 &&
+                sheet.nodes.size() ==
+                    static_cast<size_t>(sheet.node_rows()) * static_cast<size_t>(sheet.node_columns()),
+            "spots: not the nodes of such a sheet");
     const std::vector<Picture> pictures = pictures_of(profile.camera, images, poses, views);
     for (const Picture &p : pictures) {
-        if (p.view < 0 || p.view >= light.gain.size()) {
-            throw nb::value_error("views: the light does not know them");
-        }
+        require(p.view >= 0 && p.view < light.gain.size(), "views: the light does not know them");
     }
     Drawing out;
     {

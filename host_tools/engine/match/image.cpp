@@ -28,11 +28,15 @@ constexpr float kPole = -0.26794919243F; // sqrt(3) - 2, of the cubic spline's i
 void filter_rows(Image &image)
 {
     const int w = image.cols, h = image.rows;
+    if (h < 2)
+        return; // a constant
     std::vector<float> start(static_cast<size_t>(w), 0.0F);
     float power = 1;
-    for (int y = 0; y < std::min(h, 16); y++, power *= kPole) // 0.268^16 is below a float's last bit
+    for (int k = 0; k < 16; k++, power *= kPole) { // 0.268^16 is below a float's last bit
+        const int turn = k % (2 * h - 2), y = std::min(turn, 2 * h - 2 - turn);
         for (int x = 0; x < w; x++)
             start[static_cast<size_t>(x)] += power * image(y, x);
+    }
     for (int x = 0; x < w; x++)
         image(0, x) = start[static_cast<size_t>(x)];
     for (int y = 1; y < h; y++)

@@ -8,14 +8,16 @@
  *
  * Worst errors, against the model in long double (tests/unit/test_camera_fixed.c asserts them for all radial functions
  * to 110 degrees and beyond, narrow lenses, strong asymmetry, tilt and pupil shift, and for random cameras from all
- * over the legal ranges; docs/camera.md has figures): projection       2.2e-5 px + 1e-9 of the way from the principal
- * point + 3.5e-10 rad of the local magnification in pixels per radian, and with asymmetric terms or tilt 3e-9 / d of
- * the farthest projection's way, d the tilt's least denominator: 2.3e-5 px for a symmetric fisheye of f = 300, 1e-4 px
- * at most back-projection  2e-9 rad + (1e-8 + 2.5e-9 r_max) / r', r_max the farthest point of the plane (with
- * asymmetric terms, tilt or skew 5e-9 (1 + |skew| / f_u) r_max), r' the least magnification of theta on the plane,
- * before the tilt or behind it: 2e-7 rad where r' >= 0.18 and r_max <= 5 without skew. For the pixel as it stands: that
- * it was rounded to Q16.16 moves its ray by 1.1e-5 px / (f r') besides table of rays    1e-5 rad, wherever the camera
- * is defined
+ * over the legal ranges; docs/camera.md has figures):
+ *
+ * - projection: 2.2e-5 px + 1e-9 of the way from the principal point + 3.5e-10 rad of the local magnification in pixels
+ *   per radian, and with asymmetric terms or tilt 3e-9 / d of the farthest projection's way, d the tilt's least
+ *   denominator: 2.3e-5 px for a symmetric fisheye of f = 300, 1e-4 px at most
+ * - back-projection: 2e-9 rad + (1e-8 + 2.5e-9 r_max) / r', r_max the farthest point of the plane (with asymmetric
+ *   terms, tilt or skew 5e-9 (1 + |skew| / f_u) r_max), r' the least magnification of theta on the plane, before the
+ *   tilt or behind it: 2e-7 rad where r' >= 0.18 and r_max <= 5 without skew. For the pixel as it stands: that it was
+ *   rounded to Q16.16 moves its ray by 1.1e-5 px / (f r') besides
+ * - table of rays: 1e-5 rad, wherever the camera is defined
  *
  * What cannot keep them is refused when the camera is built, never computed wrongly.
  */
