@@ -118,18 +118,19 @@ def test_without_an_encoder_stations_hold_the_truth_whatever_the_profile_says_of
 
 
 def test_a_profile_without_covariance_tapers_within_its_interval_too(tmp_path) -> None:
-    """Its radius is 0.15 px off in the middle of the field, smoothly, as a fit of another model leaves it: held, all of
-    that is in the taper, and nothing of it in the interval."""
-    z = []
+    """Its radius is 0.15 px off in the middle of the field, smoothly, as a fit of another model leaves it. Free within
+    that residual it tapers three drives by 1.1 % (rms of the stations) where the profile, held, tapers them by 2.0 %;
+    what is left is in the intervals."""
+    scatter = []
     for seed in (61, 62, 63):
         drive = driven(seed)
         profile = dataclasses.replace(drive.camera, k2=drive.camera.k2 + 1e-3, k3=drive.camera.k3 - 4e-4, rms_px=0.15)
         m = measured(tmp_path, drive, profile, diameter=SIZE)
         error, sigma = held(m)
-        z.append(np.sqrt(np.mean((error / sigma) ** 2)))
+        scatter.append(error.std())
         assert (np.abs(error) < 1.96 * sigma).mean() >= 0.9 and m.measured[0].camera[0] > 0.003
         assert any("radial function as off by 0.15 px" in remark for remark in m.remarks)
-    assert np.mean(z) < 1.3
+    assert np.mean(scatter) < 0.016
 
 
 def test_without_any_length_the_taper_is_within_its_interval_too(tmp_path) -> None:
