@@ -7,6 +7,7 @@ again only if the scene or what the simulator draws has changed: first and last 
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import math
@@ -198,6 +199,35 @@ def by_diameter(name: str, survey: Path, camera: Camera) -> list[Limits]:
     return rows
 
 
+def without_pupil(camera: Camera) -> Camera:
+    """The profile as a calibration without near views leaves it."""
+    assert camera.covariance is not None
+    kept = [i for i, parameter in enumerate(camera.covariance_parameters) if parameter != "pupil_e1"]
+    names = tuple(camera.covariance_parameters[i] for i in kept)
+    own = camera.covariance[np.ix_(kept, kept)]
+    return dataclasses.replace(camera, pupil_e1=0.0, covariance=own, covariance_parameters=names)
+
+
+def without_encoder(path: Path, scene: Scene, camera: Camera) -> list[Limits]:
+    """The same survey with its encoder not read, the mean diameter given: by the profile, and by one that says nothing
+    of its pupil."""
+    rows: list[Limits] = []
+    for word, profile in (("free", camera), ("free_pupil_unknown", without_pupil(camera))):
+        survey = Survey.open(path)
+        unread = np.full(len(survey.keyframes), np.nan)
+        survey.chainage = lambda unread=unread: unread  # type: ignore[method-assign]
+        measured = measure(survey, profile, diameter=scene.spec["diameter"], pictures=False, threads=2)
+        truth = against_truth(measured, scene)
+        assert truth is not None and measured.scale.diameter_from_prior
+        share = truth["stations_measured"] / truth["stations"]
+        rows += [
+            (f"{word}_diameter_scatter_pct", truth["diameter_scatter_pct"], -math.inf, math.inf),
+            (f"{word}_diameter_held", truth["diameter_covered"], 0.9, math.inf),
+            (f"{word}_share_measured", share, 0.9, math.inf),
+        ]
+    return rows
+
+
 def video_figures(name: str) -> list[Limits]:
     """Name, value and limits of what came out of one scene."""
     recording = recorded(name, SCENES[name])
@@ -219,6 +249,7 @@ def video_figures(name: str) -> list[Limits]:
     accused = [
         ("profile_called_drifted", float(measured.health.verdict.startswith("drifted")), -math.inf, 0),
         *by_diameter(name, Path(survey["file"]), Camera.load(profile)),
+        *without_encoder(Path(survey["file"]), scene, Camera.load(profile)),
     ]
     if name == "tube":
         after = ("seconds_after_rendering", seconds, -math.inf, 180)

@@ -224,11 +224,13 @@ def check_profile(
     shutter: RollingShutter | None = None,
     sag_sigma: float = 0.0,
     common_errors: bool = False,
+    pupil_sigma: float = 0.0,
+    about: float | None = None,
     common_scale: float = 0.0,
 ) -> ProfileCheck:
     """Tests a survey against its profile.
 
-    tracks .. sigma, shutter .. common_errors  as of reconstruct()
+    tracks .. sigma, shutter .. pupil_sigma  as of reconstruct(), about as its diameter
     structure        reconstruct() of the same with drift=drift_prior(tracks, camera, noise); None: it is made here
     diameter         known true inner diameter, metres, with diameter_sigma (relative): beside an encoder it shows what
                      a straight drive cannot
@@ -248,6 +250,7 @@ def check_profile(
     prior = _prior(camera, end)
     known = {"encoder": encoder, "attitude": attitude, "attitude_sigma": attitude_sigma, "sigma": sigma}
     known |= {"threads": threads, "shutter": shutter, "sag_sigma": sag_sigma, "common_errors": common_errors}
+    known |= {"pupil_sigma": pupil_sigma, "diameter": about}
 
     def adjusted(about: Floats, spread: Floats) -> Reconstruction:
         """With the profile free to drift about a change, by this covariance."""

@@ -40,9 +40,12 @@ def into_radial(camera: Camera) -> Floats:
     return out
 
 
-def ripple_covariance(camera: Camera, theta_end: float) -> Floats:
-    """(6,6) of RADIAL: the ripples up to an angle from the axis, as far as the polynomial follows them."""
+def ripple_covariance(camera: Camera, theta_end: float, least_px: float = 0.0) -> Floats:
+    """(6,6) of RADIAL: the ripples up to an angle from the axis, as far as the polynomial follows them; of `least_px`
+    where those are less."""
     theta = np.linspace(0.2, 1.0, 60) * theta_end
-    ripple = (LENS_RADIAL_PX / camera.f_u) ** 2 * np.exp(-0.5 * ((theta[:, None] - theta) / LENS_LENGTH) ** 2)
+    ripple = (max(LENS_RADIAL_PX, least_px) / camera.f_u) ** 2 * np.exp(
+        -0.5 * ((theta[:, None] - theta) / LENS_LENGTH) ** 2
+    )
     fit = into_radial(camera) @ radial_fit(camera, theta)
     return fit @ ripple @ fit.T

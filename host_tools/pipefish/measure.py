@@ -18,7 +18,7 @@ from pipefish.health import ProfileCheck, check_profile, doubted, drift_prior
 from pipefish.intervals import Z95
 from pipefish.jitter import smoothed
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
-from pipefish.pupil import pupil_sigma
+from pipefish.pupil import pupil_sigma, shift_sigma
 from pipefish.readings import TRACK_FLOOR_PX, Readings, angles, readings_of
 from pipefish.repeated import jumps, renamed, repetition
 from pipefish.scale import Known, Scale, with_diameter
@@ -106,7 +106,7 @@ def measure(
         raise ArgumentError(f"nominal: {nominal} is not a positive length")
     if len(survey.keyframes) < 3:
         raise PipefishError(f"{survey.path}: {_too_short(survey)}; three are the least that can be measured")
-    readings = readings_of(survey, camera, line_time)
+    readings = readings_of(survey, camera, line_time, known.diameter.value if known.diameter else nominal)
 
     def fitted(given: Readings, cuts: list[int]) -> tuple[Measurement, Readings, Reconstruction]:
         """Poses and points, scale, tubes; what was adjusted, and the structure in the adjustment's unit."""
@@ -116,7 +116,7 @@ def measure(
         m.nominal = nominal or m.nominal
         find_scale(m, known, threads, tell)
         _fit_stretches(m, threads, tell)
-        _check_measured(m)
+        _check_measured(m, given.diameter)
         return m, used, structure
 
     m, used, structure = fitted(readings, [])
@@ -168,10 +168,13 @@ def _adjusted_once(readings: Readings, method: str, threads: int | None, tell: C
             method=method,
             threads=threads,
             sag_sigma=TRACK_SAG_PX2,
-            hold_camera=readings.camera.covariance is None,  # tracks are no better than what is assumed
+            # Beside an encoder tracks are no better than what is assumed; without one nothing else holds the scale.
+            hold_camera=readings.camera.covariance is None and readings.chainage is not None,
             drift=drift_prior(readings.weighed, readings.camera, TRACK_SHARPER),
             common_errors=True,  # the floor
             shutter=readings.shutter,
+            pupil_sigma=shift_sigma(readings.camera),
+            diameter=readings.diameter,
         ),
         tell,
     )
@@ -181,9 +184,7 @@ def _measurement(survey: Survey, readings: Readings, structure: Reconstruction) 
     """Of a structure whose scale is not looked for yet. Raises PipefishError where there is none."""
     camera, chainage = readings.camera, readings.chainage
     if structure.status == "failed":
-        raise PipefishError(
-            f"{survey.path}: nothing could be measured: {_why(survey, structure)}{_pupil_doubt(camera, chainage)}"
-        )
+        raise PipefishError(f"{survey.path}: nothing could be measured: {_why(survey, structure)}")
     ahead = np.einsum("ni,ni->n", np.diff(structure.centres, axis=0), structure.poses[:-1, 2, :3])
     return Measurement(
         survey=survey,
@@ -201,13 +202,13 @@ def _measurement(survey: Survey, readings: Readings, structure: Reconstruction) 
     )
 
 
-def _check_measured(m: Measurement) -> None:
+def _check_measured(m: Measurement, given: float | None) -> None:
     """Raises PipefishError where no stretch has a tube."""
     if m.measured:
         return
     reasons = sorted({s.tube.reason for s in m.stretches})
     shaped = any(s.tube.status == "open" for s in m.stretches)
-    doubt = "" if shaped else _pupil_doubt(m.camera, m.encoder) or " (a wrong camera profile?)"
+    doubt = "" if shaped else _doubt(m, given)
     raise PipefishError(
         f"{m.survey.path}: poses of {len(m.structure.frames)} keyframes and {len(m.structure.points)} points were "
         f"found, but no pipe {'of any size' if shaped else 'around them'}: {'; '.join(reasons)}{doubt}"
@@ -233,6 +234,8 @@ def _health(
             shutter=readings.shutter,
             sag_sigma=TRACK_SAG_PX2,
             common_errors=True,
+            pupil_sigma=shift_sigma(readings.camera),
+            about=readings.diameter,
             common_scale=TRACK_COMMON_SCALE,
         ),
         lambda: tell(0.9, "profile"),
@@ -266,13 +269,14 @@ def _why(survey: Survey, structure: Reconstruction) -> str:
     return structure.reason + seen
 
 
-def _pupil_doubt(camera: Camera, chainage: np.ndarray | None) -> str:
-    """What may be in the way without an encoder: to a structure that has no unit lenses are central."""
-    if not camera.pupil_e1 or chainage is not None:
-        return ""
+def _doubt(m: Measurement, given: float | None) -> str:
+    """What to look at where there are points and no pipe; given: what the pipe's diameter was said to be."""
+    if m.encoder is not None:
+        return " (a wrong camera profile?)"
+    size = "" if given else ", say what the pipe's nominal diameter is (--nominal)"
     return (
-        f" (the profile's pupil shifts by {1000 * camera.pupil_e1:.2g} mm a squared radian, which is left out where "
-        "no encoder tells lengths: close to a narrow pipe's wall that alone may be too much)"
+        " (a wrong camera profile? No encoder tells how far the camera went, and pictures alone lose a pipe's size on "
+        f"the way where they show little of its wall: connect an encoder, light the wall better{size})"
     )
 
 
@@ -396,7 +400,8 @@ def _sigmas(m: Measurement) -> None:
         d = stations["d_mean"]
         # Where the mean diameter is the scale, a station's is known as far as the structure's own scale holds along it.
         by_prior, mean = m.scale.diameter_from_prior, stretch.tube.summary["d_mean"]
-        if exact.mean_camera is not None and m.camera.covariance is not None:  # of others no radial part is assumed
+        # Of other profiles a radial part is assumed only where no encoder holds the scale.
+        if exact.mean_camera is not None and (m.camera.covariance is not None or m.structure.unit != "metre"):
             camera = exact.wander_camera if by_prior else exact.camera
             stretch.camera = factor * np.interp(stations["s"], exact.s, camera) / d
             stretch.mean_camera = 0.0 if by_prior else factor * exact.mean_camera / mean
@@ -415,7 +420,8 @@ def _sigmas(m: Measurement) -> None:
             continue
         rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
-    if m.scale.unit == "metre" and not m.scale.diameter_from_prior:  # else it is in what the diameter was set to
+    # Else it is in what the diameter was set to, or was estimated.
+    if m.scale.unit == "metre" and not m.scale.diameter_from_prior and not m.structure.pupil:
         seen = m.residuals.inlier
         m.pupil_sigma = pupil_sigma(
             m.camera, m.residuals.theta[seen], m.residuals.point[seen], 0.5 * mean_diameter(m)[0]

@@ -191,7 +191,12 @@ def _structure_part(m: Measurement) -> dict[str, Any]:
         for g in m.structure.gaps
     ]
     part = {name: getattr(m.structure, name) for name in names}
-    return part | {"standing": m.index[m.structure.standing], "gaps": gaps, "backwards": m.backwards}
+    return part | {
+        "standing": m.index[m.structure.standing],
+        "gaps": gaps,
+        "backwards": m.backwards,
+        "pupil_e1": m.structure.pupil,
+    }
 
 
 def _poses_part(m: Measurement) -> dict[str, Any]:

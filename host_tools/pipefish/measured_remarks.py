@@ -12,6 +12,7 @@ from pipefish.assumed import assumed_px
 from pipefish.camera import Camera
 from pipefish.health import VERDICTS
 from pipefish.intervals import Z95
+from pipefish.lens_ripple import LENS_RADIAL_PX
 from pipefish.measured_texts import clock_text, length_text
 from pipefish.measurement import Measurement, Residuals, Stretch, mean_diameter
 from pipefish.repeated import against_encoder
@@ -106,13 +107,7 @@ def remark(m: Measurement) -> None:
         remarks.append(m.health.text)
     remarks += _repeated_remark(m)
     remarks += _shape_remark(m) + _water_remark(m) + _invert_remark(m)
-    if m.camera.covariance is None:
-        whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
-        remarks.append(
-            "The camera profile has no covariance: what its radial function is off is not in the intervals of "
-            f"diameters. Ovality counts it as asymmetric by {assumed_px(m.camera):.2g} px all over the "
-            f"picture ({whence})."
-        )
+    remarks += _uncovered_remark(m)
     if m.structure.down is None:
         remarks.append("No inclinometer: the clock is relative to the first keyframe.")
     remarks += _shutter_remark(m)
@@ -128,6 +123,21 @@ def remark(m: Measurement) -> None:
     if m.structure.repeated:
         remarks.append(f"{m.structure.repeated} observations were of one track twice in a frame and were left out.")
     m.remarks = remarks + m.remarks
+
+
+def _uncovered_remark(m: Measurement) -> list[str]:
+    """Of a profile that does not say how well it is known."""
+    if m.camera.covariance is not None:
+        return []
+    px = assumed_px(m.camera)
+    whence = "it does not say what its calibration left" if m.camera.rms_px is None else "as its calibration left"
+    radial = "what its radial function is off is not in the intervals of diameters"
+    if m.structure.unit != "metre" and m.camera.radial == "generic":
+        radial = f"diameters count its radial function as off by {max(px, LENS_RADIAL_PX):.2g} px"
+    return [
+        f"The camera profile has no covariance: {radial}. Ovality counts it as asymmetric by {px:.2g} px all over the "
+        f"picture ({whence})."
+    ]
 
 
 def unseen_sector(m: Measurement, stretch: Stretch, low: float, high: float) -> tuple[str, float]:

@@ -7,9 +7,11 @@ R (cot theta_1 - cot theta_2) = way - e1 (theta_1^2 - theta_2^2), so R is off by
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from .assumed import PUPIL_MOST
+from .assumed import PUPIL_MOST, PUPIL_REST
 from .camera import Camera
 from .intervals import Z95
 
@@ -17,6 +19,15 @@ from .intervals import Z95
 def pupil_is_known(camera: Camera) -> bool:
     """Whether the profile says how well it knows its pupil's shift: then that is in the camera's covariance."""
     return camera.covariance is not None and "pupil_e1" in camera.covariance_parameters
+
+
+def shift_sigma(camera: Camera) -> float:
+    """Metres of e1 that the profile leaves open."""
+    if not pupil_is_known(camera):
+        return PUPIL_MOST / Z95
+    assert camera.covariance is not None
+    place = camera.covariance_parameters.index("pupil_e1")
+    return math.hypot(PUPIL_REST, math.sqrt(max(0.0, float(camera.covariance[place, place]))))
 
 
 def diameter_slope(theta: np.ndarray, point: np.ndarray, radius: float) -> float:

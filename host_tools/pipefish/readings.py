@@ -39,6 +39,7 @@ class Readings:
     encoder   how good it is
     attitude  (K,2) roll and pitch, radians, NaN where unknown; None without an inclinometer
     shutter   None for one that exposes all rows at once
+    diameter  metres, what the pipe is said to be; None: nothing is said
     remarks   what one should know of them, in words
     """
 
@@ -51,6 +52,7 @@ class Readings:
     attitude: np.ndarray | None
     attitude_sigma: float
     shutter: RollingShutter | None
+    diameter: float | None
     remarks: list[str]
 
     def cut_at(self, frames: list[int]) -> Readings:
@@ -59,11 +61,14 @@ class Readings:
         return dataclasses.replace(self, tracks=tracks, weighed=_weighed(tracks, self.camera))
 
 
-def readings_of(survey: Survey, camera: Camera | None, line_time: float | None = None) -> Readings:
+def readings_of(
+    survey: Survey, camera: Camera | None, line_time: float | None = None, diameter: float | None = None
+) -> Readings:
     """Reads a survey that has keyframes.
 
     camera     None: the survey's profile
     line_time  as of `shutter_of`
+    diameter   of the pipe, about, metres [the survey's nominal one]
 
     Raises PipefishError for a profile that is missing or does not fit, FormatError for a setting that is no number."""
     camera = camera_of(survey, camera)
@@ -83,6 +88,7 @@ def readings_of(survey: Survey, camera: Camera | None, line_time: float | None =
         attitude=attitude,
         attitude_sigma=attitude_sigma,
         shutter=shutter_of(survey, line_time),
+        diameter=diameter or (survey.start.nominal_diameter_m if survey.start else 0.0) or None,
         remarks=remarks,
     )
 

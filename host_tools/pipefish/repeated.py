@@ -103,7 +103,7 @@ def _pair(m: Measurement, stretch: Stretch, first: int, second: int, s: float) -
         if grey.shape != (m.camera.height, m.camera.width):
             return []
         pose = m.structure.poses[frame]
-        uv, ok = m.camera.project(points @ pose[:, :3].T + pose[:, 3])
+        uv, ok = m.structure.in_its_unit(m.camera, stretch.segment).project(points @ pose[:, :3].T + pose[:, 3])
         strips.append(_sampled(grey, uv, ok).reshape(len(along), PATCHES, PATCH))
     out, reach = [], round(REACH / CELL)
     for row in range(reach, len(along) - reach - PATCH, 2 * PATCH):

@@ -331,4 +331,5 @@ def rescaled(structure: Reconstruction, factors: Sequence[float]) -> Reconstruct
         pose_covariance=pose_covariance,
         systematic=systematic,
         pose_systematic=pose_systematic,
+        pupil=[shift * factor for shift, factor in zip(structure.pupil, factors, strict=False)],
     )

@@ -5,7 +5,6 @@ was (seven parameters) is fitted to all of them at once."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -92,11 +91,10 @@ def fit_target(
     seen: list[Seen], structure: Reconstruction, camera: Camera, points: np.ndarray
 ) -> tuple[float, float, float] | str:
     """Metres a unit of the structure (logarithm), its sigma by the pictures' noise with the poses held, and the fit's
-    rms in px; or why not. points (N,3) of the target, metres."""
-    if structure.unit != "metre":
-        camera = dataclasses.replace(camera, pupil_e1=0.0)  # a length, and lengths are not known
+    rms in px; or why not. seen: from one segment; points (N,3) of the target, metres."""
     if not seen:
         return "it was found in no keyframe"
+    camera = structure.in_its_unit(camera, int(structure.segment[seen[0].frame]))
     centres = structure.centres[[s.frame for s in seen]]
     place = _start(seen, structure, camera, points)
     if place is None:

@@ -141,6 +141,8 @@ class Reconstruction:
     camera_change    (segments, n) change of the camera's parameters as estimated with their prior, names in
                      camera_parameters; None where the profile has no covariance. See camera_of()
     cost             sum of half the squared residuals
+    pupil            of each segment, the shift of the camera's pupil as estimated, in its unit; empty where a wheel's
+                     metres tell that
     joined           (n,2) int64 tracks that are another's continuation under a name of their own, and that one
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
                      covariance (m,m); poses, points and tracks as they are then; noise, the factor
@@ -176,6 +178,7 @@ class Reconstruction:
     camera_parameters: tuple[str, ...]
     cost: float
     sag: list[Floats] = field(default_factory=list)
+    pupil: list[float] = field(default_factory=list)
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
     joined: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64), repr=False)
@@ -240,8 +243,14 @@ class Reconstruction:
             return found + (total.functions(inside, rows) - found) / self.camera_share
         return found
 
+    def in_its_unit(self, camera: Camera, segment: int) -> Camera:
+        """The camera with its pupil's shift in the segment's unit, where no encoder's metres are that."""
+        return dataclasses.replace(camera, pupil_e1=self.pupil[segment]) if self.pupil else camera
+
     def camera_of(self, camera: Camera, segment: int) -> Camera:
-        """The camera with which a segment's poses and points agree: as estimated with its prior."""
+        """The camera with which a segment's poses and points agree: as estimated with its prior, its pupil's shift in
+        their unit."""
+        camera = self.in_its_unit(camera, segment)
         if self.camera_change is None:
             return camera
         return changed_camera(camera, self.camera_parameters, self.camera_change[segment])
@@ -334,6 +343,8 @@ class _Asked:
     common_errors: bool
     sag_sigma: float
     shutter: RollingShutter | None
+    pupil_sigma: float
+    diameter: float | None
 
     def run(self, numbers: npt.NDArray[Any], end: int) -> dict[str, Any]:
         """What the engine finds of the frames before one, with these numbers of the observations' tracks."""
@@ -367,6 +378,8 @@ class _Asked:
             None if shutter is None else np.asarray(shutter.time)[:end],
             0.0 if shutter is None else shutter.line_time,
             0.0 if shutter is None else shutter.middle_row,
+            self.pupil_sigma,
+            0.5 * (self.diameter or 0.0),
         )
 
     def typical_noise(self) -> float:
@@ -413,6 +426,8 @@ def reconstruct(
     drift: tuple[Sequence[str], Floats, float] | None = None,
     common_errors: bool = False,
     shutter: RollingShutter | None = None,
+    pupil_sigma: float = 0.0,
+    diameter: float | None = None,
 ) -> Reconstruction:
     """Poses of the frames and points of the tracks.
 
@@ -434,6 +449,9 @@ def reconstruct(
     common_errors   the stated noise holds errors that tracks have in common, too, which leave no residual: it counts
                as stated even where residuals are smaller, against the encoder and in the covariances
     shutter    of a camera whose rows are exposed one after the other; None: all at once
+    pupil_sigma   metres, above 0: where no chainage tells lengths the pupil's shift is estimated in the structure's
+               unit, about the camera's, which is known to this sigma. 0: there lenses count as central
+    diameter   of the pipe, metres, to a few per cent: what that unit is, for the pupil's shift alone; None: not known
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
     that are wrong in themselves.
@@ -474,6 +492,8 @@ def reconstruct(
         common_errors=common_errors,
         sag_sigma=float(sag_sigma),
         shutter=shutter,
+        pupil_sigma=float(pupil_sigma),
+        diameter=diameter,
     )
     noise = asked.typical_noise()
     found, end = asked.run(numbers, frames), frames
@@ -506,8 +526,6 @@ def _own_covariance(rec: Reconstruction, tracks: Tracks, camera: Camera, sigma: 
     """(N,3,3) of the points with the poses held. Observations beyond 3.5 sigma do not count."""
     if not len(rec.points):
         return np.zeros((0, 3, 3))
-    if rec.unit != "metre":
-        camera = dataclasses.replace(camera, pupil_e1=0.0)  # a length, and lengths are not known
     cameras = [rec.camera_of(camera, segment) for segment in range(len(rec.sigma))]
     place = np.minimum(np.searchsorted(rec.frames, tracks.frame), len(rec.frames) - 1)
     here = rec.frames[place] == tracks.frame
@@ -643,6 +661,7 @@ def _result(
         camera_share=share,
         cost=sum(s["cost"] for s in segments),
         sag=[s["sag"] for s in segments],
+        pupil=[] if metric else [s["pupil"] for s in segments],
         iterations=[s["iterations"] for s in segments],
         drift=[s["drift"] | {"tracks": names[s["drift"]["tracks"]]} for s in segments if s["drift"]],
         parts=[(s["random"], s["total"]) for s in segments],

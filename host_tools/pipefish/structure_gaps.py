@@ -4,6 +4,7 @@ Both are told from the points before the gap and the first frame behind it, whos
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,11 @@ END, END_SIGMAS = 3, 2.5  # of the last frames before a gap
 CHUNK, LEAD = 200, 30  # frames that are looked at together, and before them for their tracks' earlier views
 RUN, RUN_LEAST, RUN_SIGMAS = 5, 0.01, 6.0  # of the mean of so many
 TRIES = 24  # whole reconstructions that doubts may cost: stretches that break off everywhere have other reasons
+
+
+def in_unit_of(camera: Camera, segment: dict[str, Any]) -> Camera:
+    """The camera with its pupil's shift in the unit of one of the engine's stretches."""
+    return camera if segment["metric"] else dataclasses.replace(camera, pupil_e1=segment["pupil"])
 
 
 @dataclass
@@ -106,6 +112,7 @@ def zoom_between(
     nobody knows.
 
     place: the picture's number among the frames used; track (n,), pixels (n,2): what it shows; sigma: of pixels."""
+    camera = in_unit_of(camera, segment)
     _, here, there = np.intersect1d(track, segment["tracks"], return_indices=True)  # a track may be there twice
     if len(here) < LEAST:
         return None
@@ -130,7 +137,7 @@ def frame_zooms(
     that is known; of each frame: pose and zoom that fit those best, to first order.
 
     place (n,) of each observation's frame in the stretch, track (n,), pixels (n,2), sorted by track and frame."""
-    count = len(segment["poses"])
+    camera, count = in_unit_of(camera, segment), len(segment["poses"])
     rows = np.minimum(np.searchsorted(segment["tracks"], track), len(segment["tracks"]) - 1)
     on = np.flatnonzero((segment["tracks"][rows] == track) & (place >= 0) & (place < count))
     place, track, pixels, points = place[on], track[on], pixels[on], segment["points"][rows[on]]
@@ -151,7 +158,8 @@ def _zooms(
         return np.zeros(count), np.full(count, np.inf)
     rays, ok = camera.unproject(pixels)
     turn = poses[place, :, :3]
-    centre = -np.einsum("nji,nj->ni", turn, poses[place, :, 3])
+    start = np.where(ok[:, None], camera.origins(pixels), 0.0)
+    centre = np.einsum("nji,nj->ni", turn, start - poses[place, :, 3])
     ray = np.einsum("nji,nj->ni", turn, rays)
     depth = np.maximum(np.linalg.norm(points - centre, axis=1), 1e-9)
     across = (np.eye(3) - ray[:, :, None] * ray[:, None]) * (camera.f_u / (sigma * depth))[:, None, None] ** 2

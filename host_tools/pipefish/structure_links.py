@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .camera import Camera
-from .structure_gaps import ahead_of, fit_frame
+from .structure_gaps import ahead_of, fit_frame, in_unit_of
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -124,7 +124,8 @@ def linked(
             driven, before = step[used[last] : used[first]].sum(), step[used[last - 1] : used[last]].sum()
             steps = float(driven / before) if np.isfinite(driven) and abs(before) > 1e-6 else steps
         near = np.flatnonzero(np.isin(a["tracks"], track[(frame >= used[max(last - 4, 0)]) & (frame <= used[last])]))
-        again = found_again(camera, a["points"][near], pixels[at_first], ahead_of(a, steps), gate)
+        lens = in_unit_of(camera, a)
+        again = found_again(lens, a["points"][near], pixels[at_first], ahead_of(a, steps), gate)
         if again is None:
             continue
         old, new = near[again[0]], track[at_first[again[1]]]
@@ -133,7 +134,7 @@ def linked(
         young = at_last[~np.isin(track[at_last], a["tracks"][old])]
         first_seen = np.flatnonzero(np.isin(b["tracks"], track[at_first]))
         ratio = _depth(a, -1, near) / _depth(b, 0, first_seen) if len(first_seen) else 1.0
-        ours, theirs = seen_before(camera, a, b, first_seen, again[2], pixels[young], gate, ratio)
+        ours, theirs = seen_before(lens, a, b, first_seen, again[2], pixels[young], gate, ratio)
         for k, item in zip(ours, young[theirs], strict=True):
             if b["tracks"][k] not in new:
                 join(int(track[item]), int(b["tracks"][k]))

@@ -37,7 +37,7 @@ REASONS = {
     "no_cylinder": "no stretch of the cloud looks like the wall of a pipe",
     "one_sided": "points on one side only: neither centre nor diameter is determined",
     "open": "the section is no ellipse (an egg?), and too little of it is seen to tell what it is",
-    "not_determined": "the points are too uncertain for a tube",
+    "not_determined": "the points are too uncertain for a tube: their errors leave no diameter determined",
     "too_short": "the wall is shorter than half a radius",
 }
 
@@ -233,8 +233,8 @@ def fit_tube(
     fit = _Fit(cloud, noise, used, up_vector, nominal, order, spacing, scale_sigma, shared)
     try:
         tube, common = fit.on(nodes, rho)
-    except ValueError as error:  # the normal matrix is singular
-        return _none("not_determined", str(error), nominal)
+    except ValueError:  # the normal matrix is singular
+        return _none("not_determined", "", nominal)
     if tube_shape.much_off(tube):
         tell(0.7, "trying another shape")
         tube, common = _of_another_shape(fit, np.asarray(points, float), tube, len(nodes)) or (tube, common)

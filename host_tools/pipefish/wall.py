@@ -3,6 +3,7 @@ keyframes that see it."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -65,7 +66,7 @@ class Wall:
     """A measured pipe with its keyframes.
 
     pieces     by chainage
-    camera, survey   of the measurement
+    camera, survey   of the measurement, the camera's pupil shift as estimated where no encoder tells lengths
     poses      (K,3,4) cam_from_world, keyframe (K,) index of each in the survey, stretch (K,)
     chainage   (K,) of the place of the axis beside each camera
     diameter   mean, metres (or 1: `unit` "diameter"); length of the wall's unit
@@ -182,10 +183,15 @@ def wall_of(document: dict[str, Any], pieces: list[Piece], survey: Survey) -> Wa
         here, of = stretch == number, [p for p in pieces if p.stretch == number]
         if of:
             along[here] = _beside(of, centres[here])
+    camera = Camera.from_document(document["camera"]["profile"], "reconstruction.json")
+    told = document["structure"].get("pupil_e1", [])
+    pupil = [told[k] for k in sorted({p.stretch for p in pieces}) if k < len(told)]
+    if pupil:  # as the structure has it, in its unit
+        camera = dataclasses.replace(camera, pupil_e1=float(np.median(pupil)))
     return Wall(
         document=document,
         pieces=pieces,
-        camera=Camera.from_document(document["camera"]["profile"], "reconstruction.json"),
+        camera=camera,
         survey=survey,
         poses=np.concatenate([turn, shift[:, :, None]], axis=2),
         keyframe=np.array(poses["keyframe"], int),

@@ -127,6 +127,7 @@ def test_a_track_that_is_twice_in_a_frame_tells_the_same_zoom() -> None:
     t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
     known, on = np.unique(t.track[t.frame < frame]), t.frame == frame
     stretch = {"tracks": known, "points": drive.points[known], "first": 0, "poses": drive.poses[:frame]}
+    stretch["metric"] = True
     track, pixels = t.track[on], middle + by * (t.pixels[on] - middle)
     once = zoom_between(drive.camera, stretch, frame, track, pixels, 0.3)
     twice = zoom_between(drive.camera, stretch, frame, np.repeat(track, 2), np.repeat(pixels, 2, axis=0), 0.3)
@@ -193,8 +194,9 @@ def test_pictures_that_cannot_be_are_a_status_without_a_wrong_number(kind: str) 
 
 @pytest.mark.parametrize(("shift", "seed"), [(0.001, 3), (0.001, 4), (0.002, 4), (0.004, 3)])
 def test_a_pupil_that_no_encoder_scales_ends_in_a_status(shift: float, seed: int) -> None:
-    """Without an encoder lenses count as central: of a pupil that moves by millimetres beside a wall 60 mm away hardly
-    an observation is left, and what is left determines nothing or little. That is a gap, and no internal error."""
+    """Without an encoder lenses count as central, unless it is said how well the shift is known: of a pupil that moves
+    by millimetres beside a wall 60 mm away hardly an observation is left, and what is left determines nothing or
+    little. That is a gap, and no internal error."""
     camera = dataclasses.replace(fisheye(95), pupil_e1=shift)
     drive = tube_drive(seed, 1.0, step=0.02, diameter=0.12, camera=camera)
     rec = pf.reconstruct(drive.tracks, camera, None)

@@ -242,6 +242,7 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["converged"] = segment.report.summary.status == pipefish::optim::Status::converged;
     out["wheel"] = segment.report.wheel;
     out["sag"] = to_numpy<double>(segment.report.sag.data(), {3});
+    out["pupil"] = segment.report.pupil;
     out["late"] = segment.late;
     out["late_sigma"] = segment.late_sigma;
     out["down"] = to_numpy<double>(segment.report.down.data(), {3});
@@ -305,7 +306,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
                      const std::optional<Triples> &down, double down_sigma, const std::vector<uint32_t> &uncertain,
                      const std::optional<Square> &uncertainty, const std::vector<uint32_t> &drifting,
                      const std::optional<Square> &drift, double drift_noise, bool common_errors, double sag_sigma,
-                     const std::optional<Values> &frame_time, double line_time, double middle_row)
+                     const std::optional<Values> &frame_time, double line_time, double middle_row, double pupil_sigma,
+                     double radius)
 {
     check_tracks(frames, tracks, frame, track, uv, covariance);
     const size_t count = static_cast<size_t>(frames);
@@ -320,6 +322,8 @@ nb::dict reconstruct(const pf_profile &profile, int frames, int tracks, const In
     options.threads = threads;
     options.still = still;
     options.sag_sigma = sag_sigma;
+    options.pupil_sigma = pupil_sigma;
+    options.radius = radius;
     if (step && step_sigma) {
         extras.odometry.step.assign(step->data(), step->data() + step->shape(0));
         extras.odometry.sigma.assign(step_sigma->data(), step_sigma->data() + step_sigma->shape(0));
@@ -393,8 +397,8 @@ void bind_sfm(nb::module_ &m)
           nb::arg("step_sigma").noconvert().none(), nb::arg("scale_sigma"), nb::arg("down").noconvert().none(),
           nb::arg("down_sigma"), nb::arg("uncertain"), nb::arg("uncertainty").noconvert().none(), nb::arg("drifting"),
           nb::arg("drift").noconvert().none(), nb::arg("drift_noise"), nb::arg("common_errors"), nb::arg("sag_sigma"),
-          nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"),
-          "Poses and points from tracks; see pipefish.structure.");
+          nb::arg("frame_time").noconvert().none(), nb::arg("line_time"), nb::arg("middle_row"), nb::arg("pupil_sigma"),
+          nb::arg("radius"), "Poses and points from tracks; see pipefish.structure.");
     m.def("adjust", &adjust, nb::arg("camera"), nb::arg("poses").noconvert(), nb::arg("points").noconvert(),
           nb::arg("frame").noconvert(), nb::arg("track").noconvert(), nb::arg("uv").noconvert(), nb::arg("sigma"),
           nb::arg("max_iterations"), "Least squares from a start, as a segment of reconstruct().");

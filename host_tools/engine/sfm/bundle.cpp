@@ -27,6 +27,7 @@ public:
         : table_(table), original_(camera), camera_(camera), options_(options), first_(map.first),
           state_(start_of(map)), priors_(options, map.first, table.rolls(), state_)
     {
+        state_.pupil = camera.pupil_e1;
         gather(map);
         project_all();
         select();
@@ -55,14 +56,15 @@ public:
         const size_t point = static_cast<size_t>(e);
         RowsX j_border = RowsX::Zero(2, priors_.layout.border);
         const bool shared = priors_.layout.camera_columns > 0 || priors_.layout.sag_at >= 0 ||
-                            priors_.layout.late_at >= 0 || measures_pupil();
+                            priors_.layout.late_at >= 0 || priors_.layout.pupil_at >= 0 || measures_pupil();
+        const bool frees_camera = priors_.layout.camera_columns > 0 || priors_.layout.pupil_at >= 0;
         for (size_t k = offset_[point]; k < offset_[point + 1]; k++) {
             const Eigen::Map<const Vector3d> x(in_camera_.data() + 3 * k);
             Vector2d uv;
             Rows<2, 3> slope;
             Rows<2, PF_CAMERA_PARAMS> by_camera;
             if (pf_camera_project(&camera_, x.data(), uv.data(), slope.data(),
-                                  priors_.layout.camera_columns ? by_camera.data() : nullptr) != PF_OK) {
+                                  frees_camera ? by_camera.data() : nullptr) != PF_OK) {
                 continue;
             }
             const Eigen::Matrix2d &whiten = measured_[k].whiten;
@@ -88,6 +90,9 @@ public:
                 j_border.col(priors_.layout.late_at) =
                     moment_[k].share *
                     (j_turn * turn_towards(f, frames[1]) - j_point * (state_.centre[other] - state_.centre[f]));
+            }
+            if (priors_.layout.pupil_at >= 0) {
+                j_border.col(priors_.layout.pupil_at) = whiten * by_camera.col(PF_PARAM_PUPIL_E1);
             }
             if (priors_.layout.camera_columns > 0) {
                 const CameraPrior &prior = *options_.camera_prior;
@@ -146,6 +151,10 @@ public:
             state_.camera = saved_.camera + step.g.tail(priors_.layout.camera_columns);
             camera_ = changed_camera(original_, *options_.camera_prior, camera_change());
         }
+        if (priors_.layout.pupil_at >= 0) {
+            state_.pupil = saved_.pupil + step.g[priors_.layout.pupil_at];
+            camera_.pupil_e1 = state_.pupil + pupil_change();
+        }
         project_all();
     }
 
@@ -172,6 +181,20 @@ public:
     Eigen::VectorXd camera_change() const
     {
         return options_.camera_prior ? Eigen::VectorXd(options_.camera_prior->root * state_.camera) : Eigen::VectorXd();
+    }
+
+    // Of the pupil's shift, by the camera's prior.
+    double pupil_change() const
+    {
+        double sum = 0.0;
+        if (options_.camera_prior) {
+            const std::vector<uint32_t> &names = options_.camera_prior->parameter;
+            const Eigen::VectorXd change = camera_change();
+            for (size_t i = 0; i < names.size(); i++) {
+                sum += names[i] == PF_PARAM_PUPIL_E1 ? change[static_cast<Eigen::Index>(i)] : 0.0;
+            }
+        }
+        return sum;
     }
 
     // Of the pixels alone: what shares the border with them (wheel, gravity, priors) tells that border, and the scale.
@@ -500,6 +523,7 @@ BundleReport adjust(Submap &map, const TrackTable &table, const pf_camera &camer
     report.sag = problem.state().sag;
     report.late = problem.state().late;
     report.late_at = problem.late_at();
+    report.pupil = problem.state().pupil;
     report.camera = problem.camera_change();
     report.used = problem.used();
     if (covariance) {

@@ -68,6 +68,8 @@ struct BundleOptions {
     double sag_sigma = 0.0;  // px^2, of the tracks' common sag all around alike (tracks.hpp), about 0, and half of
                              // it of its other parts; 0: there is none
     double late_sigma = 0.0; // of the line time as a share of the stated one, about 1; 0: it is as stated
+    // Where no odometry tells lengths: the pupil's shift e1 in the map's unit, as known beforehand; 0: as the camera's.
+    double pupil = 0.0, pupil_sigma = 0.0;
     const std::vector<int> *only =
         nullptr; // places of the observations to use, as BundleReport::used; null: by the gate
 };
@@ -83,6 +85,7 @@ struct BundleReport {
     Vector3d sag = Vector3d::Zero(); // px^2, as sag_columns() takes it
     double late = 1.0;               // line time over the stated one
     int late_at = -1;                // its place in the border; -1: it was not estimated
+    double pupil = 0.0;              // shift e1 of the camera's pupil, without what the camera's change adds
     Eigen::VectorXd camera;          // changes of the camera's parameters
     std::vector<int> used;           // places in the table of the observations, by point
 };
@@ -107,7 +110,7 @@ public:
     const Eigen::MatrixXd &border() const
     {
         return known_.g;
-    } // wheel, gravity (2), sag (3), late, camera (in units of its prior's root): those of the options
+    } // wheel, gravity (2), sag (3), late, pupil, camera (in units of its prior's root): those of the options
 
     // Of linear functions of points, with all correlation through the poses: a[k] (3 x m) times point `points[k]`.
     Eigen::MatrixXd functions(std::span<const int> points, std::span<const Solver::MatrixEG> a) const

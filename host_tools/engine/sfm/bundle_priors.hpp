@@ -19,7 +19,8 @@ struct BundleState {
     std::vector<Vector3d> centre, point;
     double wheel = 0.0;
     Vector3d down = Vector3d::UnitY();
-    double late = 1.0; // of the stated line time
+    double late = 1.0;  // of the stated line time
+    double pupil = 0.0; // its shift e1
     Vector3d sag = Vector3d::Zero();
     Eigen::VectorXd camera; // in units of the prior's root, whose covariance is the unit matrix
 };
@@ -31,7 +32,7 @@ constexpr double SCALE_SIGMA = 1e-7;
 // Places in the normal matrix: of frames in its chain, of what all share in its border. -1: is not estimated.
 struct BundleLayout {
     int frames = 0, held_front = 0, held_back = 0;
-    int border = 0, down_at = -1, sag_at = -1, late_at = -1, camera_columns = 0;
+    int border = 0, down_at = -1, sag_at = -1, late_at = -1, pupil_at = -1, camera_columns = 0;
 
     // Blocks run from the last frame to the first, which is held: the covariance then grows along the recursion that
     // makes it, block by block. The other way round it would be what is left of differences, of the far end's.
@@ -65,6 +66,9 @@ public:
         }
         if (options.late_sigma > 0.0 && rolls) {
             layout.late_at = layout.border++;
+        }
+        if (options.pupil_sigma > 0.0) {
+            layout.pupil_at = layout.border++;
         }
         if (options.camera_prior) {
             layout.camera_columns = static_cast<int>(options.camera_prior->root.cols());
@@ -102,6 +106,9 @@ public:
         }
         if (layout.late_at >= 0) {
             sum += std::pow((state.late - 1.0) / options_.late_sigma, 2);
+        }
+        if (layout.pupil_at >= 0) {
+            sum += std::pow((state.pupil - options_.pupil) / options_.pupil_sigma, 2);
         }
         if (layout.camera_columns > 0) {
             sum += state.camera.squaredNorm();
@@ -143,10 +150,10 @@ public:
             sink.add(3, r.data(), plain, nullptr, {}, {}, j.data());
         }
         if (layout.late_at >= 0) {
-            RowsX j = RowsX::Zero(1, layout.border);
-            j(0, layout.late_at) = 1.0 / options_.late_sigma;
-            const double r = (state.late - 1.0) / options_.late_sigma;
-            sink.add(1, &r, plain, nullptr, {}, {}, j.data());
+            linearize_one(layout.late_at, state.late - 1.0, options_.late_sigma, sink);
+        }
+        if (layout.pupil_at >= 0) {
+            linearize_one(layout.pupil_at, state.pupil - options_.pupil, options_.pupil_sigma, sink);
         }
         if (layout.camera_columns > 0) {
             RowsX j = RowsX::Zero(layout.camera_columns, layout.border);
@@ -156,6 +163,15 @@ public:
     }
 
 private:
+    // Of one parameter that is `off` by so much from what is known of it to a sigma.
+    template <class Sink> void linearize_one(int at, double off, double sigma, Sink &sink) const
+    {
+        RowsX j = RowsX::Zero(1, layout.border);
+        j(0, at) = 1.0 / sigma;
+        const double r = off / sigma;
+        sink.add(1, &r, optim::RobustLoss{}, nullptr, {}, {}, j.data());
+    }
+
     // One over the sigmas of the sag's parts.
     Vector3d sag_root() const { return Vector3d(1.0, 2.0, 2.0) / options_.sag_sigma; }
 

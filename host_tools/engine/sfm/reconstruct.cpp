@@ -2,6 +2,7 @@
 
 #include "geometry/triangulate.hpp"
 #include "median.hpp"
+#include "sfm/pupil.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -338,9 +339,9 @@ void normalise(Submap &map)
     transform(map, s);
 }
 
-// Robust adjustment and selection in turn, until hardly a point comes or goes; how many observations there were.
-int select(Segment &segment, const TrackTable &table, const pf_camera &camera, BundleOptions settings,
-           const Limits &limits)
+// Robust adjustment and selection in turn, until hardly a point comes or goes; how many observations there were. The
+// camera gets the pupil's shift, where that is estimated.
+int select(Segment &segment, TrackTable &table, pf_camera &camera, BundleOptions settings, const Limits &limits)
 {
     Submap &map = segment.map;
     int observations = 0;
@@ -351,6 +352,10 @@ int select(Segment &segment, const TrackTable &table, const pf_camera &camera, B
         settings.gate = cycle == 0 ? 50.0 : 15.0;
         const BundleReport report = adjust(map, table, camera, settings);
         observations = report.observations;
+        if (settings.pupil_sigma > 0.0) {
+            camera.pupil_e1 = report.pupil;
+            table.shift_pupil(report.pupil);
+        }
         // Residuals are smaller than errors: poses and points were fitted to them.
         segment.sigma = robust_sigma(map, table, camera) *
                         std::sqrt(2.0 * report.observations / static_cast<double>(report.redundancy));
@@ -419,10 +424,12 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     Submap &map = segment.map;
     anchor(segment, options);
     pf_camera central = camera;
-    if (!segment.metric) {
-        central.pupil_e1 = 0.0; // a length, and lengths are not known
-    }
     BundleOptions settings;
+    if (!segment.metric) { // a length, and lengths are not known
+        guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
+        central.pupil_e1 = settings.pupil;
+    }
+    table.shift_pupil(central.pupil_e1);
     settings.threads = options.threads;
     settings.odometry = segment.metric ? options.odometry : nullptr;
     settings.gravity = options.gravity;
@@ -441,9 +448,18 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     }
     if (part.poses.size() < map.poses.size()) {
         map = std::move(part);
+        const bool was_metric = segment.metric;
+        const double length = (map.poses.back().centre() - map.poses.front().centre()).norm();
         anchor(segment, options);
-        central.pupil_e1 = segment.metric ? camera.pupil_e1 : 0.0;
         settings.odometry = segment.metric ? options.odometry : nullptr;
+        if (was_metric && !segment.metric) {
+            guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
+            central.pupil_e1 = settings.pupil;
+        } else if (!segment.metric) {
+            for (double *shift : {&central.pupil_e1, &settings.pupil, &settings.pupil_sigma}) {
+                *shift /= length;
+            }
+        }
     }
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
@@ -584,6 +600,9 @@ Reconstruction reconstruct(TrackTable table, const pf_camera &camera, const Reco
     }
     pf_camera central = camera;
     central.pupil_e1 = 0.0;
+    if (!options.odometry) {
+        table.shift_pupil(0.0);
+    }
     Building building = options.method == Method::hierarchical ? Tree(table, central, inner).build()
                                                                : Chain(table, central, inner).build();
     trim(building.maps, table);

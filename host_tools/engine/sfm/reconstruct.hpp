@@ -20,7 +20,11 @@ struct ReconstructOptions {
     double drift_noise = 1.0;                 // factor on the observations' noise in that adjustment
     bool common_errors = false;               // noise that no residual shows is in what is stated: it is the least
     double sag_sigma = 0.0;                   // as in BundleOptions
-    const Shutter *shutter = nullptr;         // that rolls; times by frame of the table
+    // Metres of the pupil's shift e1 that the camera leaves open; 0: where no odometry tells lengths lenses are
+    // central.
+    double pupil_sigma = 0.0;
+    double radius = 0.0;              // metres, of the pipe, about; 0: unknown
+    const Shutter *shutter = nullptr; // that rolls; times by frame of the table
 };
 
 // A stretch that could not be measured, between two frames.

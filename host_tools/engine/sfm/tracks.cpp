@@ -19,6 +19,7 @@ double sag_of(double first, double now, double f)
 
 TrackTable::TrackTable(const pf_camera &camera, int frames, int tracks, std::span<const int> frame,
                        std::span<const int> track, const double *uv, const double *covariance, double sigma)
+    : pupil_(camera.pupil_e1)
 {
     all_.reserve(frame.size());
     for (size_t i = 0; i < frame.size(); i++) {
@@ -58,6 +59,7 @@ TrackTable TrackTable::only(std::span<const int> kept) const
         }
     }
     out.index(static_cast<int>(kept.size()), tracks());
+    out.pupil_ = pupil_;
     out.outside_ = outside_;
     out.repeated_ = repeated_;
     return out;
@@ -83,6 +85,18 @@ void TrackTable::roll(const Shutter &shutter)
     time_ = shutter.time;
     for (Observation &o : all_) {
         o.late = shutter.line_time * (o.sight.uv.y() - shutter.middle_row);
+    }
+}
+
+void TrackTable::shift_pupil(double e1)
+{
+    if (e1 == pupil_) {
+        return;
+    }
+    pupil_ = e1;
+    for (Observation &o : all_) {
+        const double theta = polar_angle(o.sight.ray);
+        o.sight.origin = {0.0, 0.0, e1 * theta * theta};
     }
 }
 

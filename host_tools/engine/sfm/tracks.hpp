@@ -96,6 +96,8 @@ public:
 
     // From here on rows count. `shutter`: by frame of this table.
     void roll(const Shutter &shutter);
+    // From here on rays start where a pupil that shifts by e1 lets them; in the unit of what they are to meet.
+    void shift_pupil(double e1);
     bool rolls() const { return !time_.empty(); }
     Moment moment(const Observation &o, int first, int end) const
     {
@@ -124,6 +126,7 @@ private:
     std::vector<size_t> begin_; // of each track
     std::vector<std::vector<int>> by_frame_;
     std::vector<double> time_; // of each frame, where rows count
+    double pupil_ = 0.0;       // e1 by which the rays start
     int outside_ = 0, repeated_ = 0;
 };
 
