@@ -112,6 +112,8 @@ def scale_texts(scale: dict[str, Any]) -> list[str]:
 def read_measured(folder: Path) -> dict[str, Any]:
     """reconstruction.json of a folder. Raises FormatError, OSError."""
     path = folder / "reconstruction.json"
+    if folder.is_file():
+        raise FormatError(folder, None, "a file; `pipefish reconstruct SURVEY -o DIR` makes the folder that is wanted")
     try:
         document = json.loads(path.read_bytes())
     except (ValueError, UnicodeDecodeError) as error:
