@@ -131,6 +131,8 @@ def read_document(path: Path, form: str, command: str) -> dict[str, Any]:
 def read_measured(folder: Path) -> dict[str, Any]:
     """reconstruction.json of a folder. Raises FormatError, OSError."""
     path = folder / "reconstruction.json"
+    if folder.is_file():
+        raise FormatError(folder, None, "a file; `pipefish reconstruct SURVEY -o DIR` makes the folder that is wanted")
     document = read_document(path, FORMAT, "pipefish reconstruct")
     if document.get("version") != VERSION:
         raise FormatError(path, "version", f"{document.get('version')}; this program reads {VERSION}")

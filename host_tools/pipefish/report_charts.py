@@ -88,8 +88,10 @@ class Charts:
         self.stretch = column(self.document, "stretch")
 
     def along(self, **more: Any) -> dict[str, Any]:
-        """The axis along the pipe, the same range in all charts."""
-        low, high = float(np.nanmin(self.x)), float(np.nanmax(self.x))
+        """The axis along the pipe, the same range in all charts: what was not measured is on it too."""
+        gaps = [at for gap in self.document["not_measured"] for at in (gap["start"], gap["end"]) if at is not None]
+        reach = np.append(self.x, gaps)
+        low, high = float(np.nanmin(reach)), float(np.nanmax(reach))
         margin = 0.02 * max(high - low, 1e-3)
         return _axis(f"chainage, {self.along_unit}", range=[round(low - margin, 3), round(high + margin, 3)], **more)
 

@@ -213,6 +213,24 @@ def test_the_page_says_what_is_systematic_at_stations_beside_what_is_in_the_mean
     assert "± 0.78 mm" in text and "± 1.96 mm, up to ± 3.92" in text and "± 1.0 to 3.9 mm. Dotted" in text
 
 
+def test_what_was_not_measured_at_the_ends_is_on_the_charts(measured, tmp_path):
+    folder = shutil.copytree(measured / "out", tmp_path / "out")
+    document = json.loads((folder / "reconstruction.json").read_text())
+    gap = {"start": -7.0, "end": -2.0, "keyframes": [0, 9], "reason": "tracks", "detail": ""}
+    document["not_measured"].append(gap)
+    (folder / "reconstruction.json").write_text(json.dumps(document))
+    for chart in (Charts(folder).chart_diameter(), Charts(folder).chart_ovality()):
+        low, high = chart["layout"]["xaxis"]["range"]
+        assert low < -7.0 and high > max(document["stations"]["chainage"])
+        assert any((s.get("x0"), s.get("x1")) == (-7.0, -2.0) for s in chart["layout"]["shapes"])
+
+
+def test_a_survey_in_place_of_a_measured_folder_is_told_what_to_do_first(tmp_path, capsys):
+    (tmp_path / "a.mcap").write_bytes(b"")
+    assert main(["report", str(tmp_path / "a.mcap"), "-o", str(tmp_path / "r.html")]) == 1
+    assert "a.mcap: a file; `pipefish reconstruct SURVEY -o DIR`" in capsys.readouterr().err
+
+
 def test_a_systematic_part_that_nobody_knows_is_not_told_as_zero(measured, tmp_path):
     """Without a scale, of a profile without covariance: the camera's part is unknown, and there is no nominal line."""
     folder = shutil.copytree(measured / "out", tmp_path / "out")
