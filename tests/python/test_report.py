@@ -368,13 +368,16 @@ REDRAWS = """
     await rest();
     out[name] = drawn;
     out[name + "_widths"] = plots.map((p) => [p.clientWidth, p.querySelector(".main-svg").clientWidth]);
+    const flat = plots.filter((p) => p.querySelector(".legend") && p.querySelector(".nsewdrag"));
+    const box = (p, part) => p.querySelector(part).getBoundingClientRect();
+    out[name + "_over"] = flat.map((p) => box(p, ".legend").bottom - box(p, ".nsewdrag").top);
     drawn = [];
   };
   const tell = (event) => () => window.dispatchEvent(new Event(event));
   await after("loaded", () => {});
   await after("same", tell("resize"));
   await after("chosen", () => document.querySelector(".choice select").dispatchEvent(new Event("change")));
-  await after("narrow", () => { main.style.maxWidth = "500px"; tell("resize")(); });
+  await after("narrow", () => { main.style.maxWidth = "420px"; tell("resize")(); });
   await after("paper", tell("beforeprint"));
   const flat = document.querySelector("#plot-tube .on-paper");
   const seen = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
@@ -392,6 +395,7 @@ def test_only_what_has_another_size_is_drawn_again_and_paper_has_its_own(page, t
     for name in ("narrow", "paper", "screen"):
         assert sorted(found[name]) == sorted(found["all"]), name
         assert all(inner == outer for inner, outer in found[name + "_widths"]), name
+        assert found[name + "_over"] and max(found[name + "_over"]) < 3, "a legend lies on no curve"
     assert {inner for inner, _ in found["paper_widths"]} == {655}
     assert found["screen_widths"] == found["narrow_widths"] != found["loaded_widths"]
     assert found["inked"] > 0.05 and found["left"] == 0, "the 3-D scene is on the paper, and only there"

@@ -99,6 +99,7 @@
         whole.scene.camera = seen(chart, whole.scene, whole.width / tall);
       }
       Plotly.react(chart.place, chart.data, whole, { displayModeBar: false });
+      if (!chart.along) Plotly.redraw(chart.place); // else a legend that has got more lines lies on the curves
     }
   };
   for (const chart of page.charts.filter((c) => c.choice)) {
