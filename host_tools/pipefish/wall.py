@@ -184,7 +184,7 @@ def wall_of(document: dict[str, Any], pieces: list[Piece], survey: Survey) -> Wa
         if of:
             along[here] = _beside(of, centres[here])
     camera = Camera.from_document(document["camera"]["profile"], "reconstruction.json")
-    told = document["structure"].get("pupil_e1", [])
+    told = document.get("structure", {}).get("pupil_e1", [])  # older ones do not say
     pupil = [told[k] for k in sorted({p.stretch for p in pieces}) if k < len(told)]
     if pupil:  # as the structure has it, in its unit
         camera = dataclasses.replace(camera, pupil_e1=float(np.median(pupil)))
