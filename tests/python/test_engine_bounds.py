@@ -33,6 +33,7 @@ def reconstruct(frames: int = 3, tracks: int = 4, **changed: Any) -> Any:
         sigma=0.3, method="hierarchical", seed=0, threads=1, still=0.5, step=None, step_sigma=None, scale_sigma=0.003,
         down=None, down_sigma=0.01, uncertain=[], uncertainty=None, drifting=[], drift=None, drift_noise=1.0,
         common_errors=False, sag_sigma=0.0, frame_time=None, line_time=0.0, middle_row=0.0,
+        pupil_sigma=0.0, radius=0.0,
     )  # fmt: skip
     return _engine.reconstruct(**(arguments | changed))
 

@@ -261,7 +261,7 @@ def test_a_device_that_hangs_up_on_a_handshake_is_told_in_words_of_its_own():
                 line.recv(65536)
 
         threading.Thread(target=hang_up, daemon=True).start()
-        with pytest.raises(TransportClosed, match="the device closed the connection"):
+        with pytest.raises(TransportClosed, match="the device broke the handshake off"):
             TlsTransport("127.0.0.1", server.getsockname()[1]).open()
 
 

@@ -608,7 +608,7 @@ def test_pairs_and_objects_become_folders(tmp_path: Path) -> None:
         ('kind = "target"\ntarget = { kind = "circles", rows = 3 }', "s.toml: target.cols: missing"),
         ('kind = "objects"\nscale = [2, 1]', "s.toml: per_scene, scale: must be"),
         ('kind = "objects"\nkinds = ["ball"]', "s.toml: kinds: must be of"),
-        ('kind = "objects"\ntextures = ["s.toml"]', "s.toml: not an image"),
+        ('kind = "objects"\ntextures = ["s.toml"]', "s.toml: not a picture"),
     ],
 )
 def test_a_wrong_scene_file_is_refused_by_file_and_key(tmp_path: Path, text: str, message: str) -> None:

@@ -122,7 +122,7 @@ Growth grow_matches(const Picture &first, const Picture &second, const Rows2 &at
     require(centre.shape(0) == at.shape(0) && maps.shape(0) == at.shape(0),
             "xy1, xy2 and affine: must be as long as each other");
     require(options.radius >= 2 && options.radius <= kRadiusMost, "radius: out of range");
-    require(options.classes >= 1 && options.classes <= 1 << 20, "classes: out of range");
+    require(options.classes >= 1 && options.classes <= 1 << 24, "classes: out of range");
     std::vector<Seed> seeds(at.shape(0));
     for (size_t k = 0; k < seeds.size(); k++) {
         seeds[k] = {{at(k, 0), at(k, 1)}, {centre(k, 0), centre(k, 1)}, {}};
