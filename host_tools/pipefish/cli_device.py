@@ -85,7 +85,7 @@ def run_status(args: argparse.Namespace) -> Result:
     from pipefish import pipefish_pb2 as pb
     from pipefish.cli_flash import stored_text
     from pipefish.client import Client, Handlers
-    from pipefish.plain import plain
+    from pipefish.message_documents import document_of
     from pipefish.scene import losses_of, states_of
     from pipefish.transport import open_transport
 
@@ -96,7 +96,7 @@ def run_status(args: argparse.Namespace) -> Result:
         status = client.answer_to(args.timeout, get_status=pb.Nothing()).status
     finally:
         client.close()
-    document = {"info": plain(info), "status": plain(status)}
+    document = {"info": document_of(info), "status": document_of(status)}
     link, stage = status.link, status.stage
     rows = [
         ("device", info.software),

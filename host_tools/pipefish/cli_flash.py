@@ -20,7 +20,7 @@ def stored_text(profile: Any) -> str:
 
 def run_flash(args: argparse.Namespace) -> Result:
     from pipefish.flash import Flasher
-    from pipefish.plain import plain
+    from pipefish.message_documents import document_of
     from pipefish.transport import open_transport
 
     if sum(map(bool, (args.profile, args.confirm, args.revert))) > 1:
@@ -39,7 +39,7 @@ def run_flash(args: argparse.Namespace) -> Result:
                 raise PipefishError("the device has no profile that could be confirmed")
             state = device.confirm(state.stored.sha256)
     document = {
-        name: plain(profile) | {"crc32c": f"{profile.crc32c:08x}"} if state.HasField(name) else None
+        name: document_of(profile) | {"crc32c": f"{profile.crc32c:08x}"} if state.HasField(name) else None
         for name, profile in (("in_use", state.in_use), ("stored", state.stored))
     }
     document["problem"] = state.problem or None

@@ -7,7 +7,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 
-def plain(message: Message) -> dict[str, Any]:
+def document_of(message: Message) -> dict[str, Any]:
     """All fields that the message has, by name; numbers as numbers, bytes and boot ids in hexadecimal digits as
     everywhere else (Protocol Buffers' own JSON has 64-bit numbers as texts and bytes in base64)."""
     out: dict[str, Any] = {}
@@ -22,7 +22,7 @@ def plain(message: Message) -> dict[str, Any]:
 
 def _value(name: str, value: Any) -> Any:
     if isinstance(value, Message):
-        return plain(value)
+        return document_of(value)
     if isinstance(value, bytes):
         return value.hex()
     return f"{value:016x}" if name == "boot_id" else value
