@@ -6,11 +6,12 @@
  * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
  * capturing side's differ). FORMAT: GREY, YUYV, NV12, Y10 or Y12. COUNTS.txt has the encoder's count at each frame, one
  * a line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
- * Frame i is shown when the encoder has reached its count. --overrun makes a 16550 hear itself for 64 kB: beside what
- * the other end sends at that time that is more than its 16 bytes hold.
+ * Frame i is shown when the encoder has reached its count. --overrun makes a 16550 hear itself until the kernel has
+ * counted an overrun: beside what the other end must send all that time it is more than its 16 bytes hold.
  */
 #include <errno.h>
 #include <fcntl.h>
+#include <linux/serial.h>
 #include <linux/uinput.h>
 #include <linux/videodev2.h>
 #include <stdbool.h>
@@ -23,8 +24,9 @@
 #include <time.h>
 #include <unistd.h>
 
-#define BUFFERS     4u
-#define LEAST_GAP_S 0.004 /* between two edges: gpio-sim merges what comes faster than its threads */
+#define BUFFERS           4u
+#define LEAST_GAP_S       0.004 /* between two edges: gpio-sim merges what comes faster than its threads */
+#define LONGEST_OVERRUN_S 60
 
 typedef struct world {
     FILE *y4m;
@@ -236,20 +238,31 @@ static void drive(world *w, uint32_t i, double begin, double seconds)
     }
 }
 
+static int count_overruns(int fd)
+{
+    struct serial_icounter_struct c;
+    if (ioctl(fd, TIOCGICOUNT, &c) != 0)
+        fail("TIOCGICOUNT");
+    return c.overrun;
+}
+
 /* Its loopback bit: what it sends comes in again, whether there is room or not. */
 static int overrun(const char *tty)
 {
     const int loop = 0x8000; /* TIOCM_LOOP: the kernel's header that has it and glibc's exclude each other */
     static const uint8_t bytes[4096];
+    const double begin = now();
     int fd = open(tty, O_RDWR | O_NOCTTY);
     if (fd < 0 || ioctl(fd, TIOCMBIS, &loop) != 0)
         fail(tty);
-    for (int i = 0; i < 16; i++)
-        if (write(fd, bytes, sizeof bytes) < 0)
+    const int before = count_overruns(fd);
+    while (count_overruns(fd) == before && now() - begin < LONGEST_OVERRUN_S)
+        if (write(fd, bytes, sizeof bytes) < 0 || ioctl(fd, TCSBRK, 1) != 0) /* TCSBRK 1: wait until it is sent */
             fail("write");
-    if (ioctl(fd, TCSBRK, 1) != 0 || ioctl(fd, TIOCMBIC, &loop) != 0) /* TCSBRK 1: wait until it is sent */
+    if (ioctl(fd, TIOCMBIC, &loop) != 0)
         fail(tty);
-    return 0;
+    (void)printf("%d overruns in %.2f s\n", count_overruns(fd) - before, now() - begin);
+    return count_overruns(fd) == before;
 }
 
 int main(int argc, char **argv)
