@@ -93,7 +93,7 @@ cross: unit fuzz-build
 size: cross
 	@tools/size-table $(filter cortex-%,$(CROSS))
 
-pytest: build
+pytest: build packages-test
 	@$(PY) -m pytest -q -n 2 --dist loadfile
 
 # Needs 400 MB of Debian packages once, kept in build/board. Without a network, or on a system that is not Debian 12, the
