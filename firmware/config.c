@@ -118,8 +118,8 @@ static const setting settings[] = {
     {"keyframe", "min_interval", INTEGER, AT(keyframe.min_interval), "frames", "2", 1, 1000, NULL,
      "at least so many frames between keyframes"},
     {"keyframe", "jpeg_quality", INTEGER, AT(keyframe.jpeg_quality), "", "90", 1, 100, NULL, "of keyframe images"},
-    {"keyframe", "queue", INTEGER, AT(keyframe.queue), "", "4", 2, 64, NULL,
-     "keyframes that may wait for the disk in memory"},
+    {"keyframe", "queue", INTEGER, AT(keyframe.queue), "", "32", 2, 64, NULL,
+     "keyframes that may wait in memory for a disk that pauses, as cards do for a second or two"},
 
     {"encoder", "metres_per_count", NUMBER, AT(encoder.metres_per_count), "m", "0", -1, 1, NULL,
      "of the wheel encoder; 0 = no encoder"},

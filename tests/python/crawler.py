@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
@@ -237,6 +238,35 @@ def wait_until(crawler: Crawler, look: Callable[[], T]) -> T:
         assert not has_ended, f"the daemon has ended with {crawler.process.returncode}:\n{crawler.text()}"
         assert time.monotonic() < end, f"{crawler.status()}\n{crawler.text()}"
         time.sleep(0.01)
+
+
+def task_of(crawler: Crawler, thread: str) -> Path:
+    """The folder in /proc of the daemon's thread of that name, once it has come to run and named itself."""
+
+    def look() -> Path | None:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
+            for task in Path(f"/proc/{crawler.process.pid}/task").iterdir():
+                if (task / "comm").read_text() == f"{thread}\n":
+                    return task
+        return None
+
+    return wait_until(crawler, look)
+
+
+@contextlib.contextmanager
+def stopped(crawler: Crawler, thread: str) -> Iterator[None]:
+    """That thread stands still, the others go on; skips the test where nothing may be traced."""
+    task = int(task_of(crawler, thread).name)
+    libc = ctypes.CDLL(None, use_errno=True)
+    seize, interrupt, detach, any_thread = 0x4206, 0x4207, 17, 0x40000000
+    if libc.ptrace(seize, task, None, None) != 0:
+        pytest.skip(f"a stopped thread is NOT tested: no ptrace here: {os.strerror(ctypes.get_errno())}")
+    assert libc.ptrace(interrupt, task, None, None) == 0
+    os.waitpid(task, any_thread)
+    try:
+        yield
+    finally:
+        libc.ptrace(detach, task, None, None)
 
 
 def wait_for_log(crawler: Crawler, text: str, times: int = 1) -> None:

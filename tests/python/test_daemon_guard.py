@@ -1,7 +1,6 @@
 """Watchdogs that must bark, and settings that come back after a crash loop."""
 
 import contextlib
-import ctypes
 import os
 import signal
 import socket
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from crawler import PATIENCE_S, WIDTH, Crawler, texture, wait_until, write_recording
+from crawler import PATIENCE_S, WIDTH, Crawler, stopped, task_of, texture, wait_until, write_recording
 from pipefish import keys
 
 PERIOD_S = 0.3  # of the feeding: a third of WATCHDOG_USEC
@@ -76,19 +75,6 @@ def slow_folder(path: Path, frames: int) -> None:
     path.mkdir()
     for i in range(frames):
         Image.fromarray(np.roll(texture(1), -2 * i, axis=1)[:, :WIDTH]).save(path / f"{i:03d}.png")
-
-
-def task_of(crawler: Crawler, thread: str) -> Path:
-    """The folder in /proc of the daemon's thread of that name, once it has come to run and named itself."""
-
-    def look() -> Path | None:
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that ends
-            for task in Path(f"/proc/{crawler.process.pid}/task").iterdir():
-                if (task / "comm").read_text() == f"{thread}\n":
-                    return task
-        return None
-
-    return wait_until(crawler, look)
 
 
 def rounds(crawler: Crawler) -> int:
@@ -206,17 +192,8 @@ def test_a_thread_that_is_stopped_starves_the_watchdog(tmp_path: Path, manager: 
     )
     crawler.start()
     manager.wait_for(crawler, "WATCHDOG=1")
-    task = int(task_of(crawler, thread).name)
-    libc = ctypes.CDLL(None, use_errno=True)
-    seize, interrupt, detach, any_thread = 0x4206, 0x4207, 17, 0x40000000
-    if libc.ptrace(seize, task, None, None) != 0:
-        pytest.skip(f"a stopped thread is NOT tested: no ptrace here: {os.strerror(ctypes.get_errno())}")
-    assert libc.ptrace(interrupt, task, None, None) == 0
-    os.waitpid(task, any_thread)
-    try:
+    with stopped(crawler, thread):
         manager.wait_for_hang(crawler, thread)
-    finally:
-        libc.ptrace(detach, task, None, None)
     manager.wait_for(crawler, "WATCHDOG=1")
     crawler.kill()
 

@@ -22,6 +22,7 @@ from crawler import (
     run,
     serve,
     spooled,
+    stopped,
     wait_for_log,
     wait_for_status,
     write_recording,
@@ -203,6 +204,18 @@ def test_a_full_spool_makes_a_live_survey_give_up_the_least_important_and_name_t
     # What is left is spread over the survey: the even ones are kept longest, and the first one always.
     assert 0 in got and max(got) - min(got) > len(got) * 2
     assert len([i for i in lost if i % 2]) + status["keyframes_dropped"] > len(lost) / 2  # those by a slow disk, any
+
+
+def test_a_disk_that_pauses_costs_no_keyframe(tmp_path: Path, crawler: Crawler):
+    """As memory cards do while they tidy up: 25 keyframes are two seconds of what a drive gives at the most."""
+    write_recording(tmp_path / "survey.y4m", 25, rate=25)
+    store = Store(crawler.port)
+    crawler.start("--set", "camera.speed=recorded", *EVERY_FRAME)
+    with stopped(crawler, "store"):
+        wait_for_status(crawler, lambda status: status.get("frames", 0) == 25)
+    assert receive_all(crawler, store) == 0
+    [end_message] = store.ends
+    assert [k.index for k in store.keyframes] == list(range(end_message.keyframes)) and end_message.keyframes == 25
 
 
 # ---- kill -9
