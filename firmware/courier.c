@@ -448,10 +448,11 @@ static void *run(void *argument)
             c->status_due = now;
             pf_log(PF_LOG_DEBUG, "the link closes");
         }
-        service(c, now);
-        take_visitors(c, now);
+        /* Who has spoken is heard before another gets the line: this machine may have stood still meanwhile. */
         if (!pf_session_read(&c->host, take_event, c, now))
             lose_stream(c, now);
+        service(c, now);
+        take_visitors(c, now);
         hear_visitors(c, now);
         serve_keeper(c);
         if (is_watched(c)) {
@@ -474,6 +475,8 @@ static void *run(void *argument)
         if (!c->host.has_stream) /* the link has its hello ready all the time */
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
         latest = quit_at < visitors_due ? quit_at : visitors_due;
+        if (c->daemon->transport.ops->visitor != NULL && now + PF_TRANSPORT_RETRY_MS * MS < latest)
+            latest = now + PF_TRANSPORT_RETRY_MS * MS; /* handshakes that take too long, keys that were revoked */
         if (is_watched(c) && c->status_due < latest)
             latest = c->status_due;
         pf_pulse_rest();

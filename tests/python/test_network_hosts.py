@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from crawler import PATIENCE_S, Crawler, Store, wait_for_log, wait_for_status
+from crawler import PATIENCE_S, Crawler, Store, wait_for_log, wait_for_status, write_recording
 from network_device import (
     IMPATIENT,
     Watcher,
@@ -28,7 +29,7 @@ from pipefish.cli import main
 from pipefish.client import BUSY, VIEWER, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
-from pipefish.transport import TlsTransport, TransportClosed
+from pipefish.transport import TcpTransport, TlsTransport, TransportClosed
 
 pytestmark = pytest.mark.usefixtures("own_keys")
 
@@ -270,6 +271,31 @@ def test_a_host_that_falls_silent_makes_room_for_another(device: Crawler, tmp_pa
     with taker.client(device) as client:
         client.run(lambda: taker.objects, PATIENCE_S)
     silent.close()
+
+
+def test_a_device_that_stood_still_hears_its_host_before_another_gets_the_line(tmp_path: Path):
+    """Suspended, or on a machine that is too busy: what a host has said meanwhile waits to be read."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    keepalive_ms = 500
+    crawler = Crawler(tmp_path, link__keepalive_ms=keepalive_ms, daemon__exit_when_done="false", daemon__drain_s=0)
+    crawler.start()
+    store = Store(crawler.port)
+    with store.client(crawler) as host:
+        host.run(lambda: len(store.statuses) > 1, PATIENCE_S)
+        os.kill(crawler.process.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, crawler.process.pid, os.WSTOPPED | os.WNOWAIT)
+        other = Client(TcpTransport("127.0.0.1", crawler.port), Handlers())
+        other.open()
+        end = time.monotonic() + 5 * keepalive_ms / 1000
+        host.run(lambda: time.monotonic() > end, PATIENCE_S)
+        assert host.up, "its own patience is longer: this test proves something"
+        host.ask(get_status=pb.Nothing())
+        host.step(0)
+        os.kill(crawler.process.pid, signal.SIGCONT)
+        with serving(host):
+            assert other.answer_to(PATIENCE_S, get_status=pb.Nothing()).status.looking_on == BUSY
+        assert host.up and host.reconnections == 0
+        other.close()
 
 
 def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawler):
