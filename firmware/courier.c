@@ -229,12 +229,14 @@ static void take_event(void *context, pf_session *s, const pf_link_event *e, uin
 static void take_visitor_event(void *context, pf_session *s, const pf_link_event *e, uint64_t now)
 {
     pf_courier *c = context;
-    if (e->type == PF_LINK_UP)
+    if (e->type == PF_LINK_UP) {
+        tell_host(s, "a host looks on");
         c->status_due = now;
-    else if (e->type == PF_LINK_DOWN)
+    } else if (e->type == PF_LINK_DOWN) {
         s->has_stream = false;
-    else if (e->type == PF_LINK_CONTROL)
+    } else if (e->type == PF_LINK_CONTROL) {
         take_event(c, s, e, now);
+    }
 }
 
 /* ---- bytes */
@@ -314,7 +316,6 @@ static void take_visitors(pf_courier *c, uint64_t now)
         pf_session_begin(&v->session, take_visitor_event, c, now);
         v->session.has_stream = true;
         v->since_ns = now;
-        tell_host(&v->session, "a host looks on");
     }
 }
 

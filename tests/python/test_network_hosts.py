@@ -298,6 +298,28 @@ def test_a_device_that_stood_still_hears_its_host_before_another_gets_the_line(t
         other.close()
 
 
+def test_what_is_no_host_is_not_told_as_one_that_looks_on(tmp_path: Path):
+    """A page in a browser tries as often as it likes; the log has a line for each host."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0)
+    crawler.start()
+    store = Store(crawler.port)
+    with store.client(crawler) as host:
+        host.run(lambda: store.statuses, PATIENCE_S)
+        with serving(host):
+            for _ in range(10):
+                page = socket.create_connection(("127.0.0.1", crawler.port), PATIENCE_S)
+                with page, contextlib.suppress(ConnectionError):
+                    page.sendall(b"POST / HTTP/1.1\r\n\r\n")
+                    while page.recv(4096):
+                        pass
+            other = Client(TcpTransport("127.0.0.1", crawler.port), Handlers())
+            other.open()
+            assert other.answer_to(PATIENCE_S, get_status=pb.Nothing()).status.looking_on == BUSY
+        other.close()
+    assert crawler.text().count("a host looks on") == 1
+
+
 def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawler):
     let_in(device, "operator")
     with raw_tls(device.port, keys.host_key_file()) as s:
