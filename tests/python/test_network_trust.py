@@ -87,6 +87,21 @@ def test_a_handshake_that_the_device_breaks_off_is_told_as_that_and_may_be_tried
     assert not told.value.is_final
 
 
+def test_an_alert_of_the_device_s_own_trouble_is_waited_out():
+    """OpenSSL's number of it is that of "not permitted" in the system."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def complain() -> None:
+            with server.accept()[0] as line:
+                line.recv(65536)
+                line.sendall(bytes.fromhex("15030300020250"))  # internal_error
+
+        threading.Thread(target=complain, daemon=True).start()
+        with pytest.raises(TransportClosed, match="INTERNAL_ERROR") as told:
+            TlsTransport("127.0.0.1", server.getsockname()[1]).open()
+    assert not told.value.is_final
+
+
 def test_a_device_with_another_key_gets_not_a_byte(device: Crawler):
     let_in(device, "operator")
     keys.forget_device("crawler")
