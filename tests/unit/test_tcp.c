@@ -1,3 +1,4 @@
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/transport.h"
 #include "unity.h"
 
@@ -294,6 +295,7 @@ static void test_a_client_that_trickles_makes_room(void)
 {
     pf_tcp_config config = {.address = "127.0.0.1", .silence_ms = 200};
     bool fresh = true;
+    int late = -1;
     TEST_ASSERT_EQUAL_INT(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error));
     int trickling = connect_client();
     accept_client();
@@ -304,13 +306,18 @@ static void test_a_client_that_trickles_makes_room(void)
     }
     int next = connect_client();
     accept_client();
-    (void)usleep(300000);
-    line.ops->heard(line.self);
-    int third = connect_anything();
-    wait_readable();
-    TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+    for (int i = 0; i < 100 && fresh; i++) { /* again where the machine stood still for so long */
+        (void)usleep(300000);
+        uint64_t begin = pf_now();
+        line.ops->heard(line.self);
+        close(late);
+        late = connect_anything();
+        wait_readable();
+        TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+        TEST_ASSERT_TRUE(!fresh || pf_now() - begin >= 200000000);
+    }
     TEST_ASSERT_FALSE(fresh);
-    close(third);
+    close(late);
     close(next);
     close(trickling);
 }
