@@ -229,12 +229,14 @@ static void take_event(void *context, pf_session *s, const pf_link_event *e, uin
 static void take_visitor_event(void *context, pf_session *s, const pf_link_event *e, uint64_t now)
 {
     pf_courier *c = context;
-    if (e->type == PF_LINK_UP)
+    if (e->type == PF_LINK_UP) {
+        tell_host(s, "a host looks on");
         c->status_due = now;
-    else if (e->type == PF_LINK_DOWN)
+    } else if (e->type == PF_LINK_DOWN) {
         s->has_stream = false;
-    else if (e->type == PF_LINK_CONTROL)
+    } else if (e->type == PF_LINK_CONTROL) {
         take_event(c, s, e, now);
+    }
 }
 
 /* ---- bytes */
@@ -314,7 +316,6 @@ static void take_visitors(pf_courier *c, uint64_t now)
         pf_session_begin(&v->session, take_visitor_event, c, now);
         v->session.has_stream = true;
         v->since_ns = now;
-        tell_host(&v->session, "a host looks on");
     }
 }
 
@@ -448,10 +449,11 @@ static void *run(void *argument)
             c->status_due = now;
             pf_log(PF_LOG_DEBUG, "the link closes");
         }
-        service(c, now);
-        take_visitors(c, now);
+        /* Who has spoken is heard before another gets the line: this machine may have stood still meanwhile. */
         if (!pf_session_read(&c->host, take_event, c, now))
             lose_stream(c, now);
+        service(c, now);
+        take_visitors(c, now);
         hear_visitors(c, now);
         serve_keeper(c);
         if (is_watched(c)) {
@@ -474,6 +476,8 @@ static void *run(void *argument)
         if (!c->host.has_stream) /* the link has its hello ready all the time */
             deadline = now + PF_TRANSPORT_RETRY_MS * MS;
         latest = quit_at < visitors_due ? quit_at : visitors_due;
+        if (c->daemon->transport.ops->visitor != NULL && now + PF_TRANSPORT_RETRY_MS * MS < latest)
+            latest = now + PF_TRANSPORT_RETRY_MS * MS; /* handshakes that take too long, keys that were revoked */
         if (is_watched(c) && c->status_due < latest)
             latest = c->status_due;
         pf_pulse_rest();

@@ -90,6 +90,7 @@ bool pf_session_read(pf_session *s, pf_session_take *take, void *context, uint64
 {
     uint8_t bytes[4096];
     size_t total = 0, n = 0;
+    const uint64_t frames = pf_link_get_stats(s->link)->frames_in;
     while (s->has_stream && total < READ_MAX) {
         size_t at = 0;
         if (s->transport.ops->read(s->transport.self, bytes, sizeof bytes, &n) != PF_OK)
@@ -102,6 +103,8 @@ bool pf_session_read(pf_session *s, pf_session_take *take, void *context, uint64
         }
         total += n;
     }
+    if (s->transport.ops->heard != NULL && pf_link_get_stats(s->link)->frames_in != frames)
+        s->transport.ops->heard(s->transport.self);
     (void)pf_link_input(s->link, NULL, 0, now); /* a full line gets no output, and silence must be noticed */
     pf_session_events(s, take, context, now);
     return true;

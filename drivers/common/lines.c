@@ -1,4 +1,5 @@
 #include "common/lines.h"
+#include "pipefish/drivers/clock.h"
 
 #include <errno.h>
 #include <string.h>
@@ -53,10 +54,36 @@ pf_line *pf_lines_place(const pf_lines *lines)
     return NULL;
 }
 
-void pf_line_heard(pf_line *line, uint64_t now_ns)
+static void watch_listener(pf_lines *lines, uint32_t events)
 {
+    struct epoll_event e = {.events = events};
+    (void)epoll_ctl(lines->epoll, EPOLL_CTL_MOD, lines->listener, &e);
+}
+
+pf_status pf_lines_accept(pf_lines *lines, pf_address *peer, int *fd, uint64_t now_ns)
+{
+    if (now_ns < lines->retry_ns)
+        return PF_ERR_AGAIN;
+    if (lines->retry_ns != 0)
+        watch_listener(lines, EPOLLIN);
+    lines->retry_ns = 0;
+    *fd = pf_listener_accept(lines->listener, peer);
+    if (*fd >= 0)
+        return PF_OK;
+    if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
+        return PF_ERR_AGAIN;
+    pf_status status = pf_fail(&lines->failure, PF_ERR_IO, "accept: %s", strerror(errno));
+    watch_listener(lines, 0);
+    lines->retry_ns = now_ns + PF_TRANSPORT_RETRY_MS * UINT64_C(1000000);
+    return status;
+}
+
+void pf_line_heard(void *self)
+{
+    pf_line *line = self;
+    line->has_spoken = true;
     if (line == line->lines->host)
-        line->lines->heard_ns = now_ns;
+        line->lines->heard_ns = pf_now();
 }
 
 int pf_line_fd(void *self)

@@ -13,6 +13,7 @@ typedef struct pf_line {
     uint32_t events; /* that epoll watches */
     bool is_new;     /* a visitor whom nobody has taken over yet */
     bool has_begun;  /* tcp: its first byte has come */
+    bool has_spoken; /* a frame of it was intact */
 } pf_line;
 
 typedef struct pf_lines {
@@ -20,6 +21,7 @@ typedef struct pf_lines {
     pf_line *host, *visitors[PF_VISITORS_MAX];
     const pf_transport_ops *ops;   /* of a visitor */
     uint64_t silence_ns, heard_ns; /* of the host; 0 = no limit */
+    uint64_t retry_ns;             /* the listener is left alone until then; 0 = it is not */
     char name[PF_LISTENER_NAME_MAX];
     pf_failure failure;
 } pf_lines;
@@ -42,11 +44,13 @@ void pf_line_drop(pf_line *line);
 /* A place for one that looks on, or NULL. */
 pf_line *pf_lines_place(const pf_lines *lines);
 
-/* Bytes came: the host is there. */
-void pf_line_heard(pf_line *line, uint64_t now_ns);
+/* Takes the next one that waits. PF_ERR_AGAIN: nobody, or not now; PF_ERR_IO: it failed, and is tried again after
+ * PF_TRANSPORT_RETRY_MS: one that waits while no descriptor is free would keep the daemon awake. */
+pf_status pf_lines_accept(pf_lines *lines, pf_address *peer, int *fd, uint64_t now_ns);
 
 /* Of pf_transport_ops. */
 int pf_line_fd(void *self);
+void pf_line_heard(void *self);
 bool pf_line_visitor(void *self, pf_transport *visitor);
 size_t pf_line_room(void *self);
 const char *pf_line_name(void *self);

@@ -14,7 +14,7 @@
 /* A page in a browser can have any bytes sent to loopback, behind a request's first line. It must not have the line,
  * nor try session after session until it hits one. */
 #define LINK_BEGINS 0                   /* the delimiter in front of the first frame (lib/link/SPEC.md) */
-#define BEGIN_NS    UINT64_C(200000000) /* a connection that says nothing for so long, as browsers hold some ready */
+#define BEGIN_NS    UINT64_C(200000000) /* a connection without a frame for so long, as browsers hold some ready */
 
 typedef struct tcp {
     pf_lines lines; /* first: what a line belongs to is a tcp */
@@ -35,7 +35,7 @@ static void take(pf_line *l, int fd)
 
 static bool has_host(const tcp *t, uint64_t now)
 {
-    const uint64_t most = t->host.has_begun ? t->lines.silence_ns : BEGIN_NS;
+    const uint64_t most = t->host.has_spoken ? t->lines.silence_ns : BEGIN_NS;
     return t->host.fd >= 0 && (most == 0 || now - t->lines.heard_ns < most);
 }
 
@@ -53,12 +53,10 @@ static pf_status admit(tcp *t, bool *fresh)
     uint64_t now = pf_now();
     if (is_leaving(t))
         return PF_ERR_AGAIN;
-    int fd = pf_listener_accept(t->lines.listener, &peer);
-    if (fd < 0) {
-        if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
-            return PF_ERR_AGAIN;
-        return pf_fail(&t->lines.failure, PF_ERR_IO, "accept: %s", strerror(errno));
-    }
+    int fd;
+    pf_status status = pf_lines_accept(&t->lines, &peer, &fd, now);
+    if (status != PF_OK)
+        return status;
     pf_line *place = pf_lines_place(&t->lines);
     if (!has_host(t, now)) {
         take(&t->host, fd);
@@ -106,7 +104,6 @@ static pf_status tcp_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
     if (k > 0) {
         l->has_begun = true;
         *done = (size_t)k;
-        pf_line_heard(l, pf_now());
     } else if (k == 0) {
         return hang_up(l, "the other side closed the connection");
     } else if (errno != EAGAIN && errno != EINTR) {
@@ -159,6 +156,7 @@ static const pf_transport_ops tcp_ops = {
     .visitor = pf_line_visitor,
     .read = tcp_read,
     .write = tcp_write,
+    .heard = pf_line_heard,
     .room = pf_line_room,
     .peer = tcp_peer,
     .name = pf_line_name,

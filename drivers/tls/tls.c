@@ -19,7 +19,7 @@
 #define HANDSHAKE_NS         UINT64_C(5000000000)
 #define PATIENCE_NS          UINT64_C(1000000000) /* a handshake that lasts longer gives way to one that begins */
 #define LEAVING_NS           UINT64_C(1000000000) /* for the peer to read why */
-#define RECHECK_NS           UINT64_C(500000000)  /* between looks at the file of hosts */
+#define RECHECK_NS           UINT64_C(250000000)  /* between looks at the file of hosts */
 #define CERTIFICATE_MAX      8192                 /* bytes of a peer's chain */
 #define ACCEPTS_MAX          16                   /* of one call of service: the rest of the daemon waits */
 #define FINGERPRINT_IN_ERROR 16                   /* digits */
@@ -161,12 +161,10 @@ static pf_status take_guests(tls *t, uint64_t now)
     for (int i = 0; i < ACCEPTS_MAX; i++) {
         pf_address peer, own;
         uint8_t address[16];
-        int fd = pf_listener_accept(t->lines.listener, &peer);
-        if (fd < 0) {
-            if (errno == EAGAIN || errno == EINTR || errno == ECONNABORTED)
-                return PF_OK;
-            return pf_fail(&t->lines.failure, PF_ERR_IO, "accept: %s", strerror(errno));
-        }
+        int fd;
+        pf_status status = pf_lines_accept(&t->lines, &peer, &fd, now);
+        if (status != PF_OK)
+            return status == PF_ERR_AGAIN ? PF_OK : status;
         memset(&own, 0, sizeof own);
         (void)getsockname(fd, &own.any, &(socklen_t){sizeof own});
         pf_gate_address(&peer, &own, address);
@@ -334,12 +332,10 @@ static pf_status tls_read(void *self, uint8_t *bytes, size_t capacity, size_t *d
         return PF_OK;
     ERR_clear_error();
     int k = SSL_read(g->ssl, bytes, capacity > 65536 ? 65536 : (int)capacity);
-    if (k > 0) {
+    if (k > 0)
         *done = (size_t)k;
-        pf_line_heard(&g->line, pf_now());
-    } else if (!may_go_on(g, k, &is_full)) {
+    else if (!may_go_on(g, k, &is_full))
         return hang_up(g, "the other side closed the connection");
-    }
     rewatch(g, is_full);
     return PF_OK;
 }
@@ -421,6 +417,7 @@ static const pf_transport_ops tls_ops = {
     .visitor = pf_line_visitor,
     .read = tls_read,
     .write = tls_write,
+    .heard = pf_line_heard,
     .room = pf_line_room,
     .peer = tls_peer,
     .name = pf_line_name,

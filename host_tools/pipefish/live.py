@@ -25,6 +25,7 @@ from pipefish.scene import STATES, frames_in
 from pipefish.structure import REASONS
 from pipefish.survey import Keyframe, Observations, Survey
 from pipefish.surveywrite import OBJECT_END, OBJECT_KEYFRAME, OBJECT_START
+from pipefish.terminal import one_line
 
 WINDOW = 30  # keyframes that are measured together: 1.2 m of a DN300 pipe, one second of one core
 STEP = 6  # new ones from one run to the next
@@ -84,7 +85,9 @@ class Course:
             if name in TOLD and frames:
                 told += self._warn(name, frame.index, words[name] + LAMP.get(name, ""))
         if before is not None and (frame.after_break or before.boot != frame.boot):
-            told += self._warn("break", frame.index, frame.message.break_reason or "tracks do not go on from here")
+            told += self._warn(
+                "break", frame.index, one_line(frame.message.break_reason) or "tracks do not go on from here"
+            )
         return told
 
     def turn_to(self, survey_id: bytes) -> None:

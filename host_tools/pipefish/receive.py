@@ -68,6 +68,7 @@ class Receiver(ObjectHandlers):
         self._last_object: float | None = None
         self._clock_told_ns: int | None = None  # error of the clock that the device was told
         self._quiet = quiet
+        self._is_settling = False  # nothing more is taken
         self._asked_rest: tuple[int | None, int, float] = (None, 0, 0.0)  # request, objects received then, when
 
     # ---- handlers
@@ -78,14 +79,16 @@ class Receiver(ObjectHandlers):
         self._clock_told_ns = None
         self._info_id = self._ask(get_info=pb.Nothing())
 
-    def on_offer(self, name: bytes, kind: int, size: int) -> int:
+    def on_offer(self, name: bytes, kind: int, size: int) -> int | None:
         if kind not in SURVEY_KINDS:
             # A refusal would make the device delete it.
             raise PipefishError(
                 f"the device offers an object of kind {kind}, which this version of pipefish does not know; it stays "
                 "on the device, update pipefish"
             )
-        return STORED if self.store.has(name) else ACCEPT
+        if self.store.has(name):
+            return STORED
+        return None if self._is_settling else ACCEPT
 
     def on_object(self, name: bytes, kind: int, data: bytes) -> int | None:
         if self.store.has(name):
@@ -171,7 +174,9 @@ class Receiver(ObjectHandlers):
 
     def settle(self) -> None:
         """Where an interrupted run has stored the survey's last object: tells the device, if it is there, that all is
-        here. Else it would deliver the rest once more, into the next survey's files."""
+        here. Else it would deliver the rest once more, into the next survey's files. Of another survey, which it may
+        have by now, nothing is taken: it would be torn in two."""
+        self._is_settling = True
         with contextlib.suppress(PipefishError):
             self.client.open()
             self.client.run(lambda: self.client.up, LINGER_S)

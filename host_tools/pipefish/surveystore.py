@@ -113,6 +113,14 @@ class SurveyStore:
         """Tells which survey the given name is for; the first call that is not empty holds."""
         if survey_id and self.primary is None:
             self.primary = survey_id
+            if self._old is not None and is_of(partial_of(self.path), survey_id):
+                self._release_old()
+                self._resume(SurveyWriter(self.path, self._overwrite))
+
+    def _release_old(self) -> None:
+        if self._old is not None:
+            self._old.close()
+            self._old = None
 
     def has(self, name: bytes) -> bool:
         """Whether the object is stored durably."""
@@ -125,16 +133,16 @@ class SurveyStore:
 
     def writer(self, survey_id: bytes) -> SurveyWriter:
         """The file of a survey; created at its first object."""
+        if survey_id not in self.writers:
+            self.choose_primary(survey_id)
         if survey_id in self.writers:
             return self.writers[survey_id]
-        self.choose_primary(survey_id)
         path, is_primary = self.path, survey_id == self.primary
         if not is_primary:
             path = next(p for p in map(self._numbered, count(2)) if p in self._empty or not self._is_taken(p))
-        anew = is_primary and self._old is not None and not is_of(partial_of(path), survey_id)
-        if is_primary and self._old is not None:
-            self._old.close()
-            self._old = None
+        anew = is_primary and self._old is not None
+        if anew:
+            self._release_old()
         writer = self._empty.pop(path, None) or SurveyWriter(path, self._overwrite and is_primary, anew)
         if writer.content.survey_id not in (b"", survey_id):  # it was not there when we started
             writer.close()
@@ -212,6 +220,5 @@ class SurveyStore:
         """Leaves what is not complete as partial files. Returns the names of those that hold something."""
         for writer in (*self.writers.values(), *self._empty.values()):
             writer.close()
-        if self._old is not None:
-            self._old.close()
+        self._release_old()
         return [writer.partial for writer in self.writers.values()]

@@ -18,6 +18,11 @@ def printable(text: str, encoding: str | None = None) -> str:
     return text
 
 
+def one_line(text: str) -> str:
+    """A device's words as they may stand in a line of ours: they begin no other, which could look like ours."""
+    return text.replace("\n", "\\n")
+
+
 def say(text: str, quiet: bool = False) -> None:
     """What is going on, as a line on stderr."""
     if not quiet:

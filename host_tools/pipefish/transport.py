@@ -305,21 +305,20 @@ class TlsTransport(TcpTransport):
     def read(self) -> bytes:
         if self._socket is None:
             raise TransportClosed(f"{self.name}: not connected")
-        data = bytearray()
+        data, is_over = bytearray(), False
         try:
             # Also what is decrypted already, for which no descriptor becomes readable.
-            while len(data) < 65536 or self._socket.pending():
+            while not is_over and (len(data) < 65536 or self._socket.pending()):
                 part = self._socket.recv(65536)
-                if not part:
-                    break
+                is_over = not part
                 data += part
         except (ssl.SSLWantReadError, ssl.SSLWantWriteError, InterruptedError):
-            return bytes(data)
+            pass
         except OSError as error:
             raise self._failed(error) from error
-        if not data:
+        if is_over and not data:
             raise self._ended()
-        self._heard = True
+        self._heard = self._heard or bool(data)
         return bytes(data)
 
     def write(self, data: bytes) -> int:

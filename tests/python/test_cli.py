@@ -10,13 +10,18 @@ import subprocess
 import sys
 
 import pytest
+from pipefish._engine import Link
 
-from device import Device
+from device import ROLE_DEVICE, Device
 from pipefish import cli, progress
+from pipefish import pipefish_pb2 as pb
 from pipefish.camera import Camera
+from pipefish.client import OFFER, REFUSE
+from pipefish.live import Course
 from pipefish.survey import Survey
+from pipefish.surveywrite import OBJECT_KEYFRAME
 from pipefish.terminal import printable
-from synthetic import SURVEY, start, survey_objects, write_survey
+from synthetic import SURVEY, keyframe, start, survey_objects, write_survey
 
 
 def names_of(parser, before=()):
@@ -195,6 +200,49 @@ def test_a_terminal_without_the_letters_gets_others():
     assert printable("29.9 ± 0.25°, größer", "ascii") == "29.9 +- 0.25 deg, gr\\xf6\\xdfer"
     assert printable("± 1 in \udcff.csv", "utf-8") == "± 1 in \\udcff.csv", "a name that is no text takes no ± away"
     assert printable("29.9 ± 0.25°", "latin-1") == printable("29.9 ± 0.25°") == "29.9 ± 0.25°"
+
+
+EVIL = "no\npipefish: survey.mcap is complete\x1b[2J"
+
+
+class Liar(Device):
+    """Says the same to whatever it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__([], SURVEY)
+        self.link = Link(role=ROLE_DEVICE, nonce=7, boot_id=1, schema=1, max_control=1000, max_object=1 << 16)
+
+    def _control(self, request: pb.Request) -> None:
+        reply = pb.Reply(id=request.id, error=EVIL)
+        reply.profile.problem = EVIL
+        if request.WhichOneof("what") in ("get_profile", "get_status"):
+            reply.error = ""
+        self.link.send_control(reply.SerializeToString())
+
+    def _event(self, event) -> None:
+        if event.type == OFFER:
+            self.link.answer_object(event.slot, REFUSE)
+        super()._event(event)
+
+
+@pytest.mark.parametrize("command", ["status", "record", "flash"])
+def test_a_device_s_words_are_no_line_of_their_own(command: str, tmp_path, front: Camera, capsys):
+    (tmp_path / "camera.json").write_text(front.to_json())
+    more = {"record": ["-o", str(tmp_path / "out"), "--every", "0"], "flash": [str(tmp_path / "camera.json")]}
+    with Liar() as device:
+        assert cli.main([command, device.address, *more.get(command, [])]) == 1
+    told = capsys.readouterr().err
+    assert "no\\npipefish: survey.mcap is complete\\u001b[2J" in told
+    assert not any(line.startswith("pipefish: survey.mcap") for line in told.splitlines())
+
+
+def test_a_device_s_words_in_a_live_warning_are_no_line_of_their_own(tmp_path):
+    course, told = Course(tmp_path / "a.mcap"), []
+    for index in range(2):
+        message = pb.Keyframe.FromString(keyframe(index)[2])
+        message.after_break, message.break_reason = index == 1, EVIL
+        told += course.take(OBJECT_KEYFRAME, message.SerializeToString())
+    assert told == ["keyframe 1: " + EVIL.replace("\n", "\\n")]
 
 
 class Terminal(io.StringIO):

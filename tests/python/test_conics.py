@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -292,6 +294,24 @@ def test_a_picture_that_ends_early_is_named(tmp_path, capsys) -> None:
     (tmp_path / "x.png").write_bytes((tmp_path / "x.png").read_bytes()[:1000])
     assert cli.main(["homography", str(tmp_path / "x.png"), str(tmp_path / "x.png")]) == 1
     assert "x.png: not a whole picture" in capsys.readouterr().err
+
+
+def png(width: int, height: int) -> bytes:
+    """A picture of that size, without its pixels."""
+    chunks = (b"IHDR" + struct.pack(">II5B", width, height, 8, 0, 0, 0, 0), b"IDAT")
+    packed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+@pytest.mark.parametrize(
+    "name, data",
+    [("x.png", png(60000, 60000)), ("x.pgm", b"P5\n" + 100 * b"9" + b" 1\n255\n"), ("x.ppm", b"P6\n-1 1\n255\n")],
+)
+def test_a_picture_that_claims_what_none_has_is_named(tmp_path, capsys, name: str, data: bytes) -> None:
+    (tmp_path / name).write_bytes(data)
+    assert cli.main(["homography", str(tmp_path / name), str(tmp_path / name)]) == 1
+    error = capsys.readouterr().err
+    assert f"{name}: not a picture: " in error and error.count("\n") == 1 and "internal error" not in error
 
 
 def test_a_target_of_many_discs_and_a_picture_of_it_give_their_homography(tmp_path: Path, capsys) -> None:

@@ -3,14 +3,16 @@
 import contextlib
 import hashlib
 import os
+import signal
 import socket
 import subprocess
 import time
 from pathlib import Path
 
 import pytest
+from pipefish._engine import Link
 
-from crawler import PATIENCE_S, Crawler, Store, wait_for_log, wait_for_status
+from crawler import PATIENCE_S, Crawler, Store, wait_for_log, wait_for_status, write_recording
 from network_device import (
     IMPATIENT,
     Watcher,
@@ -25,10 +27,10 @@ from network_device import (
 from pipefish import keys
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
-from pipefish.client import BUSY, VIEWER, Client, Handlers, NoDevice
+from pipefish.client import BUSY, ROLE_HOST, VIEWER, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
 from pipefish.flash import Flasher
-from pipefish.transport import TlsTransport, TransportClosed
+from pipefish.transport import TcpTransport, TlsTransport, TransportClosed
 
 pytestmark = pytest.mark.usefixtures("own_keys")
 
@@ -270,6 +272,53 @@ def test_a_host_that_falls_silent_makes_room_for_another(device: Crawler, tmp_pa
     with taker.client(device) as client:
         client.run(lambda: taker.objects, PATIENCE_S)
     silent.close()
+
+
+def test_a_device_that_stood_still_hears_its_host_before_another_gets_the_line(tmp_path: Path):
+    """Suspended, or on a machine that is too busy: what a host has said meanwhile waits to be read."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    keepalive_ms = 500
+    crawler = Crawler(tmp_path, link__keepalive_ms=keepalive_ms, daemon__exit_when_done="false", daemon__drain_s=0)
+    crawler.start()
+    store = Store(crawler.port)
+    with store.client(crawler) as host:
+        host.link = Link(role=ROLE_HOST, nonce=9, schema=1, max_object=1 << 20, max_control=1000, keepalive_ms=60000)
+        host.run(lambda: len(store.statuses) > 1, PATIENCE_S)
+        os.kill(crawler.process.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, crawler.process.pid, os.WSTOPPED | os.WNOWAIT)
+        other = Client(TcpTransport("127.0.0.1", crawler.port), Handlers())
+        other.open()
+        end = time.monotonic() + 5 * keepalive_ms / 1000
+        host.run(lambda: time.monotonic() > end, PATIENCE_S)
+        host.ask(get_status=pb.Nothing())
+        host.step(0)
+        os.kill(crawler.process.pid, signal.SIGCONT)
+        with serving(host):
+            assert other.answer_to(PATIENCE_S, get_status=pb.Nothing()).status.looking_on == BUSY
+        assert host.up and host.reconnections == 0
+        other.close()
+
+
+def test_what_is_no_host_is_not_told_as_one_that_looks_on(tmp_path: Path):
+    """A page in a browser tries as often as it likes; the log has a line for each host."""
+    write_recording(tmp_path / "survey.y4m", 30)
+    crawler = Crawler(tmp_path, daemon__exit_when_done="false", daemon__drain_s=0)
+    crawler.start()
+    store = Store(crawler.port)
+    with store.client(crawler) as host:
+        host.run(lambda: store.statuses, PATIENCE_S)
+        with serving(host):
+            for _ in range(10):
+                page = socket.create_connection(("127.0.0.1", crawler.port), PATIENCE_S)
+                with page, contextlib.suppress(ConnectionError):
+                    page.sendall(b"POST / HTTP/1.1\r\n\r\n")
+                    while page.recv(4096):
+                        pass
+            other = Client(TcpTransport("127.0.0.1", crawler.port), Handlers())
+            other.open()
+            assert other.answer_to(PATIENCE_S, get_status=pb.Nothing()).status.looking_on == BUSY
+        other.close()
+    assert crawler.text().count("a host looks on") == 1
 
 
 def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawler):

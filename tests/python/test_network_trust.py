@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import os
+import select
 import socket
 import ssl
 import subprocess
@@ -86,6 +87,21 @@ def test_a_handshake_that_the_device_breaks_off_is_told_as_that_and_may_be_tried
     assert not told.value.is_final
 
 
+def test_an_alert_of_the_device_s_own_trouble_is_waited_out():
+    """OpenSSL's number of it is that of "not permitted" in the system."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def complain() -> None:
+            with server.accept()[0] as line:
+                line.recv(65536)
+                line.sendall(bytes.fromhex("15030300020250"))  # internal_error
+
+        threading.Thread(target=complain, daemon=True).start()
+        with pytest.raises(TransportClosed, match="INTERNAL_ERROR") as told:
+            TlsTransport("127.0.0.1", server.getsockname()[1]).open()
+    assert not told.value.is_final
+
+
 def test_a_device_with_another_key_gets_not_a_byte(device: Crawler):
     let_in(device, "operator")
     keys.forget_device("crawler")
@@ -108,6 +124,24 @@ def test_a_revoked_key_ends_its_session_at_once_and_never_comes_back(device: Cra
         [find_daemon(), "--config", device.config, "--pair", f"operator {keys.host_key()} me"], capture_output=True
     )
     assert again.returncode == 1 and b"revoked" in again.stderr
+
+
+@pytest.mark.parametrize("device", [60000], indirect=True, ids=["seldom"])
+def test_a_revoked_key_ends_a_session_in_which_nothing_happens(device: Crawler):
+    """The host has come up and says nothing more, for which the device would wait longer than the test."""
+    device.kill()
+    device.start("--set", "status.interval_ms=3600000", "--set", "status.preview_interval_ms=0")
+    let_in(device, "operator")
+    client = open_client_late(device)
+    end = time.monotonic() + 2
+    client.run(lambda: time.monotonic() > end, PATIENCE_S)  # the survey is over, the link has said what it had to
+    let_in(device, "revoked")
+    begin = time.monotonic()
+    with pytest.raises(TransportClosed, match="closed the connection"):
+        while time.monotonic() < begin + PATIENCE_S / 2:
+            select.select([client.transport], [], [], 1)
+            client.transport.read()
+    client.close()
 
 
 def test_no_certificate_an_old_tls_and_no_tls_at_all_are_refused(device: Crawler, tmp_path: Path):

@@ -152,6 +152,27 @@ def test_what_a_killed_run_stored_last_is_not_delivered_into_the_next_survey_s_f
     assert receive_from(device, tmp_path / "b.mcap")["keyframes"] == 4, "without the device it is complete all the same"
 
 
+def test_what_a_killed_run_completed_takes_nothing_of_the_next_survey(tmp_path):
+    """Half of it would be in a file beside, and the other half come to who asks for it next."""
+    objects, others = survey_objects(4), survey_objects(6, survey=bytes(15) + b"\x01")
+    store_as_if_killed(tmp_path / "a.mcap", objects)
+    with Device(objects[-2:] + others, bytes(15) + b"\x01") as device:
+        assert receive_from(device, tmp_path / "a.mcap")["keyframes"] == 4
+        assert list(device.spool) == [name for name, _, _ in others] and not device.refused
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_overwrite_said_again_finishes_what_a_killed_run_completed(tmp_path):
+    """Also where the device has heard that all is here, and forgotten all of it."""
+    path, objects = tmp_path / "a.mcap", survey_objects(4)
+    store_as_if_killed(path, objects)
+    write_survey(path.with_name("b.mcap"), objects=survey_objects(2, survey=bytes(15) + b"\x01"))
+    path.with_name("b.mcap").rename(path)
+    with Device([], SURVEY, state="idle") as device:
+        assert receive_from(device, path, overwrite=True)["keyframes"] == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
 def test_overwrite_said_again_does_not_drop_what_the_device_has_forgotten(tmp_path):
     """The same command goes on from there: also the one with --overwrite."""
     path, objects = tmp_path / "a.mcap", survey_objects(8)

@@ -13,12 +13,15 @@ typedef struct host {
 } host;
 
 static pf_session device;
-static uint32_t ups, downs, restarts;
+static uint32_t ups, downs, restarts, heard;
 static uint64_t now;
 static uint8_t to_device[1 << 16], to_host[1 << 16];
 static size_t to_device_n, to_host_n;
 
-void setUp(void) {}
+void setUp(void)
+{
+    heard = 0;
+}
 
 void tearDown(void)
 {
@@ -53,7 +56,13 @@ static size_t room_of_line(void *self)
     return sizeof to_host - to_host_n < 8192 ? 0 : 8192;
 }
 
-static const pf_transport_ops line = {.read = read_line, .write = write_line, .room = room_of_line};
+static void hear(void *self)
+{
+    (void)self;
+    heard++;
+}
+
+static const pf_transport_ops line = {.read = read_line, .write = write_line, .room = room_of_line, .heard = hear};
 
 /* ---- both ends */
 
@@ -126,9 +135,31 @@ static void test_a_host_that_comes_back_to_the_line_is_answered(void)
     free(hosts[1].link);
 }
 
+/* Proves: what keeps a host its line are frames, not bytes. */
+static void test_only_a_frame_is_heard(void)
+{
+    const pf_link_config config = {.role = PF_LINK_DEVICE, .boot_id = 1};
+    static const uint8_t request[] =
+        "\0\3\0\10\x21\x12\xa4\x42 a browser's request to a relay, whose first byte is 0\0";
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_session_open(&device, &config));
+    device.transport.ops = &line;
+    pf_session_begin(&device, take, NULL, now);
+    device.has_stream = true;
+    memcpy(to_device, request, to_device_n = sizeof request);
+    TEST_ASSERT_TRUE(pf_session_read(&device, take, NULL, now));
+    TEST_ASSERT_EQUAL_size_t(0, to_device_n);
+    TEST_ASSERT_EQUAL_UINT32(0, heard);
+    host h = open_host(100);
+    to_device_n = pf_link_output(h.link, to_device, sizeof to_device, now);
+    TEST_ASSERT_TRUE(pf_session_read(&device, take, NULL, now));
+    TEST_ASSERT_EQUAL_UINT32(1, heard);
+    free(h.link);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_a_host_that_comes_back_to_the_line_is_answered);
+    RUN_TEST(test_only_a_frame_is_heard);
     return UNITY_END();
 }

@@ -1,3 +1,4 @@
+#include "pipefish/drivers/clock.h"
 #include "pipefish/drivers/transport.h"
 #include "unity.h"
 
@@ -10,6 +11,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
@@ -80,6 +82,7 @@ static void accept_client(void)
     TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
     TEST_ASSERT_FALSE(fresh);
     expect_beginning(&line);
+    line.ops->heard(line.self); /* a frame */
 }
 
 static void expect_read(const char *text)
@@ -287,6 +290,68 @@ static void test_a_silent_client_makes_room(void)
     close(silent);
 }
 
+/* Proves: bytes that are no frames keep the line for nobody; frames do. */
+static void test_a_client_that_trickles_makes_room(void)
+{
+    pf_tcp_config config = {.address = "127.0.0.1", .silence_ms = 200};
+    bool fresh = true;
+    int late = -1;
+    TEST_ASSERT_EQUAL_INT(PF_OK, pf_tcp_listen(&line, &config, error, sizeof error));
+    int trickling = connect_client();
+    accept_client();
+    for (int i = 0; i < 30; i++) {
+        TEST_ASSERT_EQUAL_INT(1, write(trickling, "x", 1));
+        expect_read("x");
+        (void)usleep(10000);
+    }
+    int next = connect_client();
+    accept_client();
+    for (int i = 0; i < 100 && fresh; i++) { /* again where the machine stood still for so long */
+        (void)usleep(300000);
+        uint64_t begin = pf_now();
+        line.ops->heard(line.self);
+        close(late);
+        late = connect_anything();
+        wait_readable();
+        TEST_ASSERT_EQUAL_INT(PF_OK, line.ops->service(line.self, &fresh));
+        TEST_ASSERT_TRUE(!fresh || pf_now() - begin >= 200000000);
+    }
+    TEST_ASSERT_FALSE(fresh);
+    close(late);
+    close(next);
+    close(trickling);
+}
+
+/* Proves: one that waits while no descriptor is free does not keep the daemon awake, and comes in when one is. */
+static void test_who_cannot_be_taken_waits_without_waking_anybody(void)
+{
+    struct rlimit limit, none;
+    struct pollfd p = {.events = POLLIN};
+    bool fresh = false;
+    open_listener("127.0.0.1");
+    p.fd = line.ops->fd(line.self);
+    int host = connect_client();
+    TEST_ASSERT_EQUAL_INT(0, getrlimit(RLIMIT_NOFILE, &limit));
+    none = limit;
+    none.rlim_cur = 0;
+    wait_readable();
+    TEST_ASSERT_EQUAL_INT(0, setrlimit(RLIMIT_NOFILE, &none));
+    pf_status status = line.ops->service(line.self, &fresh);
+    TEST_ASSERT_EQUAL_INT(0, setrlimit(RLIMIT_NOFILE, &limit));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, status);
+    TEST_ASSERT_EQUAL_INT(0, poll(&p, 1, 0));
+    for (int i = 0; i < 60000 && !fresh; i++) {
+        (void)line.ops->service(line.self, &fresh);
+        (void)usleep(1000);
+    }
+    TEST_ASSERT_TRUE(fresh);
+    expect_beginning(&line);
+    int next = connect_anything();
+    wait_readable(); /* as before */
+    close(next);
+    close(host);
+}
+
 /* Proves: with a client that does not read, room falls to nothing instead of queueing without end, writing never
  * blocks, and every byte that was taken arrives. */
 static void test_room_bounds_the_queue(void)
@@ -385,6 +450,8 @@ int main(void)
     RUN_TEST(test_a_request_of_a_browser_is_closed);
     RUN_TEST(test_a_connection_that_never_began_makes_room);
     RUN_TEST(test_a_silent_client_makes_room);
+    RUN_TEST(test_a_client_that_trickles_makes_room);
+    RUN_TEST(test_who_cannot_be_taken_waits_without_waking_anybody);
     RUN_TEST(test_room_bounds_the_queue);
     RUN_TEST(test_other_addresses_are_refused);
     RUN_TEST(test_taken_port);

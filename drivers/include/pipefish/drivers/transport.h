@@ -36,7 +36,8 @@ typedef struct pf_transport_ops {
      * PF_TRANSPORT_RETRY_MS). It changes only in service, read and write. */
     int (*fd)(void *self);
 
-    /* Accepts or reopens as needed. PF_OK = a stream is there; *fresh is set (else cleared) when it is a new one
+    /* Accepts or reopens as needed, and sees to what takes too long or is no longer allowed: due every
+     * PF_TRANSPORT_RETRY_MS. PF_OK = a stream is there; *fresh is set (else cleared) when it is a new one
      * (pf_link_reset is due); PF_ERR_AGAIN = nobody there yet, or not to be opened yet (error() says why); PF_ERR_IO =
      * it failed now, and may be tried again. */
     pf_status (*service)(void *self, bool *fresh);
@@ -44,6 +45,10 @@ typedef struct pf_transport_ops {
     /* *done bytes were moved. PF_OK (maybe fewer than asked, maybe 0), PF_ERR_CLOSED (the stream is over; service). */
     pf_status (*read)(void *self, uint8_t *bytes, size_t capacity, size_t *done);
     pf_status (*write)(void *self, const uint8_t *bytes, size_t n, size_t *done);
+
+    /* What came makes sense: a frame of it was intact. A host of whom that was not said for too long is silent,
+     * whatever bytes he sends. NULL: a line that has room for one. */
+    void (*heard)(void *self);
 
     /* Bytes that may be written now without queueing more than a few milliseconds in front of urgent frames: 0, or at
      * least PF_LINK_FRAME_MAX. No descriptor tells when it rises: ask again after a millisecond or so.
@@ -83,7 +88,7 @@ pf_status pf_serial_open(pf_transport *transport, const pf_serial_config *config
 /* Listens; one client has the line, others that come meanwhile look on; the next of them has it when the first has gone
  * or been silent for `silence_ms`. Nothing is encrypted: only loopback addresses are accepted (pf_tls_listen is for the
  * others), and only streams that begin as the link does, with a zero: what else reaches loopback, such as a browser's
- * requests, is closed, and what says nothing for 200 ms gives the line to the next. */
+ * requests, is closed, and one without an intact frame for 200 ms gives the line to the next. */
 typedef struct pf_tcp_config {
     const char *address; /* "127.0.0.1", "::1" */
     uint16_t port;       /* 0 = any; name() tells which */
