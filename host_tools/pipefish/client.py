@@ -152,8 +152,10 @@ class Client:
         theirs = time.monotonic_ns() + stats["peer_clock_offset_ns"]
         if not self.up or stats["peer_clock_error_ns"] >= 2**63 or not 0 <= theirs < UPTIME_MAX_NS:
             return None
-        ours = time.time_ns() - time.monotonic_ns()
-        return BootClock(ours - stats["peer_clock_offset_ns"], stats["peer_clock_error_ns"])
+        # A busy machine may do something else between two looks at its clocks.
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        offset = wall - (before + after) // 2 - stats["peer_clock_offset_ns"]
+        return BootClock(offset, stats["peer_clock_error_ns"] + (after - before + 1) // 2)
 
     def run(self, until: Callable[[], bool], timeout_s: float = 0.0) -> None:
         """Serves the link until `until()`. Raises NoDevice when nobody answered for `timeout_s` (0 = wait for ever)."""

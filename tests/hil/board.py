@@ -160,6 +160,7 @@ class Board:
         return [
             *("qemu-system-aarch64", "-M", "virt", "-cpu", "cortex-a72", "-smp", "2", "-m", "512"),
             # The board's time runs with its instructions, 250 million a second: a busy host makes it late, never slow.
+            # While it idles, it runs with the host's: of a time that QEMU stood still in, the board sees a jump.
             *("-accel", "tcg", "-icount", "shift=2"),
             *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"),
             *("-serial", f"file:{self.folder}/console.log"),

@@ -142,7 +142,7 @@ class Crawl:
 
     def start_daemon(self) -> None:
         """The arm64 daemon, its spool on the board's disk and its frame index in the shared folder."""
-        self.board.run("mkdir -p /mnt/index; : > /run/empty.ini")
+        self.board.run("mkdir -p /mnt/index; : > /run/empty.ini; rm -f /run/status.json")
         settings = {
             "camera.index": "/mnt/index",
             "spool.path": "/data/spool.db",
@@ -216,10 +216,27 @@ class Crawl:
             time.sleep(0.1)
         return time.monotonic() - start
 
-    def show(self, first: int, count: int, rate: float, device: str, pixels: str = "GREY", encoder: str = "") -> int:
-        """Begins to show frames to the camera; the process id of the world."""
-        command = f"exec /mnt/pipefish-world /mnt/crawl.y4m {device} {pixels} {rate} {first} {count} {encoder}"
+    def show(
+        self,
+        first: int,
+        count: int,
+        rate: float,
+        device: str,
+        pixels: str = "GREY",
+        encoder: str = "",
+        on: bool = False,
+    ) -> int:
+        """Begins to show frames to the camera, once, or with `on` to and fro until hide(); the world's process id.
+
+        What is to happen while frames come has all the time it needs only with `on`."""
+        world = "/mnt/pipefish-world" + " --to-and-fro" * on
+        command = f"exec {world} /mnt/crawl.y4m {device} {pixels} {rate} {first} {count} {encoder}"
         return self.board.spawn(command, f"world{first}.log")
+
+    def hide(self, world: int) -> None:
+        """Ends a world that shows on and on; its last frame has a period's time to be taken."""
+        self.board.run(f"kill -TERM {world}")
+        self.board.wait(world)
 
     def measure(self, result: Result, process: int) -> None:
         """Adds the daemon's CPU time to the table, while it runs: its threads', the tracking's by the stage timers."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from board import CACHE, PACKAGES
 from crawl import Result
-from test_board import RATE, SERIAL, SIZE, frames, usb
+from test_board import SERIAL, SIZE, frames, show_beside_a_wheel, usb
 
 
 def output(*command: object) -> str:
@@ -60,15 +60,15 @@ def plug_in_what_has_another_driver(survey) -> None:
     assert "No such device or address" in said, said
 
 
-def show_beside_a_wheel(survey) -> int:
+def show_beside_a_wheel_of_its_own_group(survey) -> int:
     """The wheel is an input, which Raspberry Pi OS gives to its own group by a rule that comes after the package's."""
     board = survey.board
     rule = 'SUBSYSTEM==\\"input\\", GROUP=\\"input\\", MODE=\\"0660\\"'
     board.run(f'modprobe uinput; modprobe evdev; echo "{rule}" >/etc/udev/rules.d/99-com.rules; udevadm control -R')
-    world = survey.show(0, 45, RATE, "/dev/video0", encoder="--rotary /mnt/counts.txt")
-    board.run("i=0; until [ -e /dev/input/event0 ]; do sleep 0.1; i=$((i+1)); [ $i -lt 50 ] || exit 1; done")
+    world = show_beside_a_wheel(survey)
     board.run("udevadm settle")
     assert board.run("stat -c '%U:%G %a' /dev/input/event0").strip() == "root:pipefish 640"
+    board.run(f"kill -USR1 {world}")
     return world
 
 
@@ -99,17 +99,18 @@ def test_the_package_installed_by_dpkg_and_started_by_systemd_takes_a_survey(pac
     ]
     plug_in_what_has_another_driver(survey)
     survey.start_receiver(usb(survey))
-    world = show_beside_a_wheel(survey)
+    world = show_beside_a_wheel_of_its_own_group(survey)
     survey.wait_until(frames(15), "15 frames")
     process = board.run("systemctl show -P MainPID pipefishd").strip()
     shown = board.run(f"cat /proc/{process}/status")
     assert re.search(r"NoNewPrivs:\s+1", shown) and re.search(r"CapBnd:\s+0+$", shown, re.M), shown
     assert re.search(r"Seccomp:\s+2", shown) and not re.search(r"Uid:\s+0", shown), shown
     start = time.monotonic()
-    board.run(f"kill -9 {process}")
+    board.run(f"kill -9 {process}; rm -f /run/pipefish/status.json")
     survey.wait_for("goes on")
     recovery = time.monotonic() - start
-    board.wait(world)
+    survey.wait_until(frames(15), "15 frames again")
+    survey.hide(world)
     result = Result("package under systemd, killed", recovery_s=recovery)
     survey.measure(result, int(board.run("systemctl show -P MainPID pipefishd")))
     restart_one_that_stands_still(survey)

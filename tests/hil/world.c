@@ -1,19 +1,22 @@
 /* The world of the emulated board: shows recorded frames to a V4L2 camera and turns its wheel encoder with them.
  *
- *   pipefish-world FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT [--encoder PULL_A PULL_B COUNTS.txt | --rotary COUNTS.txt]
+ *   pipefish-world [--to-and-fro] FRAMES.y4m DEVICE FORMAT RATE FIRST COUNT
+ *                  [--encoder PULL_A PULL_B COUNTS.txt | --rotary COUNTS.txt]
  *   pipefish-world --overrun TTY
  *
- * DEVICE is a V4L2 output node: of v4l2loopback (frames are written, none is lost) or of vivid (its clock and the
- * capturing side's differ). FORMAT: GREY, YUYV, NV12, Y10 or Y12. COUNTS.txt has the encoder's count at each frame, one
- * a line; PULL_A and PULL_B are gpio-sim's files; --rotary is an input device such as the driver rotary-encoder makes.
- * Frame i is shown when the encoder has reached its count. --overrun makes a 16550 hear itself until the kernel has
- * counted an overrun: beside what the other end must send all that time it is more than its 16 bytes hold.
+ * Shows COUNT frames once; or to and fro, until SIGTERM. DEVICE is a V4L2 output node: of v4l2loopback (frames are
+ * written, none is lost) or of vivid (its clock and the capturing side's differ). FORMAT: GREY, YUYV, NV12, Y10 or Y12.
+ * COUNTS.txt has the encoder's count at each frame, one a line; PULL_A and PULL_B are gpio-sim's files; --rotary is an
+ * input device such as the driver rotary-encoder makes, which stands still until SIGUSR1. Frame i is shown when the
+ * encoder has reached its count. --overrun makes a 16550 hear itself until the kernel has counted an overrun: beside
+ * what the other end must send all that time it is more than its 16 bytes hold.
  */
 #include <errno.h>
 #include <fcntl.h>
 #include <linux/serial.h>
 #include <linux/uinput.h>
 #include <linux/videodev2.h>
+#include <signal.h>
 #include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -42,6 +45,14 @@ typedef struct world {
     int64_t *counts, count;
     uint32_t n_counts;
 } world;
+
+static volatile sig_atomic_t is_over;
+
+static void end(int signal_number)
+{
+    (void)signal_number;
+    is_over = 1;
+}
 
 static _Noreturn void fail(const char *what)
 {
@@ -265,13 +276,47 @@ static int overrun(const char *tty)
     return count_overruns(fd) == before;
 }
 
+/* The next frame is due a period after this one, however late this one was: a world that gets no time shows nothing
+ * meanwhile, and then not all at once. */
+static void run(world *w, uint32_t first, uint32_t count, double period, bool is_to_and_fro)
+{
+    /* The camera has a picture from now on: whoever waits for it gets the first frame. */
+    const double begin = now();
+    const uint32_t there_and_back = count > 1 ? 2 * (count - 1) : 1;
+    double due = begin + 1;
+    uint32_t shown = 0;
+    while (is_to_and_fro ? !is_over : shown < count) {
+        const uint32_t at = shown % there_and_back, i = first + (at < count ? at : there_and_back - at);
+        read_frame(w, i);
+        drive(w, i, due - 0.8 * period, 0.6 * period);
+        sleep_until(due);
+        show(w);
+        due = now() + period;
+        if (shown++ == 0) {
+            (void)puts("shows");
+            (void)fflush(stdout);
+        }
+    }
+    sleep_until(due + 0.2);
+    (void)printf("shown %u frames in %.2f s\n", shown, now() - begin);
+}
+
 int main(int argc, char **argv)
 {
     if (argc == 3 && strcmp(argv[1], "--overrun") == 0)
         return overrun(argv[2]);
     world w = {.fd = -1};
+    sigset_t go;
+    (void)sigemptyset(&go);
+    (void)sigaddset(&go, SIGUSR1);
+    (void)sigprocmask(SIG_BLOCK, &go, NULL);
+    (void)signal(SIGTERM, end);
+    const bool is_to_and_fro = argc > 1 && strcmp(argv[1], "--to-and-fro") == 0;
+    argc -= is_to_and_fro;
+    argv += is_to_and_fro;
     if (argc < 7) {
-        (void)fprintf(stderr, "usage: pipefish-world Y4M DEVICE FORMAT RATE FIRST COUNT [--encoder A B COUNTS]\n");
+        (void)fprintf(
+            stderr, "usage: pipefish-world [--to-and-fro] Y4M DEVICE FORMAT RATE FIRST COUNT [--encoder A B COUNTS]\n");
         return 2;
     }
     open_y4m(&w, argv[1]);
@@ -287,16 +332,9 @@ int main(int argc, char **argv)
     }
     if (w.n_counts > first) /* the wheel stands where the survey begins */
         w.count = first > 0 ? w.counts[first - 1] : w.counts[0];
-    /* The camera has a picture from now on, and the wheel is there: whoever waits for them gets the first frame. */
-    const double begin = now() + (w.rotary > 0 ? 5 : 1);
-    for (uint32_t i = 0; i < count; i++) {
-        const double due = begin + i * period;
-        read_frame(&w, first + i);
-        drive(&w, first + i, due - 0.8 * period, 0.6 * period);
-        sleep_until(due);
-        show(&w);
-    }
-    sleep_until(begin + count * period + 0.2);
-    (void)printf("shown %u frames in %.2f s\n", count, now() - begin);
+    int number;
+    if (w.rotary > 0)
+        (void)sigwait(&go, &number);
+    run(&w, first, count, period, is_to_and_fro);
     return 0;
 }

@@ -188,11 +188,16 @@ def test_a_quota_below_one_object_is_refused_at_the_start(crawler: Crawler):
 
 
 def test_a_full_spool_makes_a_live_survey_give_up_the_least_important_and_name_them(tmp_path: Path, crawler: Crawler):
-    write_recording(tmp_path / "survey.y4m", 80, rate=25)
+    write_recording(tmp_path / "survey.y4m", 1000, rate=25)
     store = Store(crawler.port)
-    crawler.start("--set", "spool.quota_mb=0.3", "--set", "camera.speed=recorded", *EVERY_FRAME)
-    wait_for_log(crawler, "survey ends")
-    assert receive_all(crawler, store) == 0
+    live = ("--set", "camera.speed=recorded", "--set", "camera.loops=0")
+    crawler.start("--set", "spool.quota_mb=0.3", *live, *EVERY_FRAME)
+    wait_for_status(crawler, lambda s: s["spool"]["evicted"] >= 3 and s["keyframes"] >= 120)
+    with store.client(crawler) as client:
+        serve(crawler, client, lambda: client.up)
+        client.ask(stop_survey=pb.Nothing())
+        serve(crawler, client, lambda: False)
+    assert crawler.wait() == 0
     [end_message] = store.ends
     lost, got = lost_indices(end_message), {k.index for k in store.keyframes}
     assert lost

@@ -57,10 +57,37 @@ def test_wall_time_comes_from_the_clock_measured_on_the_link(tmp_path):
     took = time.monotonic_ns() - before
     survey = Survey.open(tmp_path / "a.mcap")
     offset = survey.keyframes[0].time_ns - survey.keyframes[0].monotonic_ns
-    ours = time.time_ns() - time.monotonic_ns()
+    ours, apart = wall_of_monotonic()
     [error] = [r.clock.error_ns for r in survey.receipts if r.sha256 == keyframe(0)[0]]
     assert 0 < error < took / 2
-    assert abs(offset - ours) < error + 1_000_000  # the wall clock itself may be slewed by 0.5 ms a second
+    assert abs(offset - ours) < error + apart + 1_000_000  # the wall clock itself may be slewed by 0.5 ms a second
+
+
+def wall_of_monotonic() -> tuple[int, int]:
+    """The wall clock's offset from the monotonic one, and by how much less it may be."""
+    before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return wall - before, after - before
+
+
+def test_a_host_that_stood_still_between_its_two_clocks_says_how_wrong_their_offset_may_be(monkeypatch):
+    class Late:
+        monotonic_ns = staticmethod(time.monotonic_ns)
+
+        @staticmethod
+        def time_ns() -> int:
+            wall = time.time_ns()
+            time.sleep(0.1)
+            return wall
+
+    with Device([], SURVEY) as device:
+        asker = client.Client(open_transport(device.address), client.Handlers())
+        asker.open()
+        asker.run(lambda: asker.clock is not None, PATIENCE_S)
+        monkeypatch.setattr(client, "time", Late)
+        clock = asker.clock
+        ours, apart = wall_of_monotonic()
+        assert abs(clock.offset_ns - ours) < clock.error_ns + apart + 1_000_000
+        asker.close()
 
 
 def test_a_device_whose_clock_none_can_have_is_received_all_the_same(tmp_path):

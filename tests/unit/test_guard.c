@@ -29,10 +29,13 @@ static const char *wait_for_hung(void)
 /* After longer than a thread may work on one thing; a busy machine gets more time. */
 static bool is_well_again(void)
 {
+    bool is_well = false;
     (void)poll(NULL, 0, 60);
-    for (int i = 0; i < 3000 && hung() != NULL; i++)
+    for (int i = 0; i < 3000 && !is_well; i++) {
         (void)poll(NULL, 0, 10);
-    return hung() == NULL;
+        is_well = hung() == NULL;
+    }
+    return is_well;
 }
 
 static _Atomic bool is_hanging;
