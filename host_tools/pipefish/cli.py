@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from pipefish import __version__
 from pipefish.errors import PipefishError
 from pipefish.files import plain
-from pipefish.terminal import printable, say
+from pipefish.terminal import in_line, printable, say
 
 DONE, FAILED, USAGE = 0, 1, 2
 DEFAULT_BAUD = 921600  # the same as transport.DEFAULT_BAUD, whose import costs time here
@@ -30,7 +30,7 @@ DEVICE_HELP = (
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
     """Two aligned columns, a line a row; rows whose value is None or "" are left out."""
-    shown = [(name, str(value).replace("\n", "\\n")) for name, value in rows if value is not None and value != ""]
+    shown = [(name, in_line(str(value))) for name, value in rows if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)
 

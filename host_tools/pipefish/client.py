@@ -16,6 +16,7 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
 from pipefish.survey import UPTIME_MAX_NS
 from pipefish.surveywrite import BootClock
+from pipefish.terminal import in_line
 from pipefish.transport import Transport, TransportClosed
 
 SCHEMA_VERSION = 1  # of pipefish.proto
@@ -297,7 +298,7 @@ class Client:
             raise NoDevice(f"the device on {self.transport.name} did not reply within {timeout_s:g} s")
         reply = self.replies.pop(wanted)
         if reply.error:
-            raise PipefishError(f"the device says: {reply.error}")
+            raise PipefishError(f"the device says: {in_line(reply.error)}")
         return reply
 
     def _leave(self, looking: int) -> None:

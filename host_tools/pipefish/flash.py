@@ -8,6 +8,7 @@ import time
 from pipefish import pipefish_pb2 as pb
 from pipefish.client import BUSY, LOOKING, Client, Handlers, NoDevice
 from pipefish.errors import PipefishError
+from pipefish.terminal import in_line
 
 KIND_PROFILE = 4  # pf_object_kind
 SEND_S = 60.0  # longest time for the 8 kB of a profile: six times what 9600 baud take
@@ -61,7 +62,7 @@ class Flasher:
             raise NoDevice(f"the device on {self._client.transport.name} did not take the profile")
         state = self.state()
         if not self._delivery.stored:
-            raise PipefishError(f"the device refuses the profile: {state.problem or 'it does not say why'}")
+            raise PipefishError(f"the device refuses the profile: {in_line(state.problem) or 'it does not say why'}")
         if state.stored.sha256 != name:
             raise PipefishError("the device has stored another profile than the one that was sent")
         return state

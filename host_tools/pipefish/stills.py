@@ -28,6 +28,7 @@ from .calib_input import TELEMETRY
 from .client import ACCEPT, AGAIN, REFUSE, STORED, Client, NoDevice, ObjectHandlers
 from .errors import PipefishError, file_error
 from .files import write_atomically
+from .terminal import in_line
 from .transport import Transport, TransportClosed
 
 OBJECT_RAW_FRAME = 5  # pf_object_kind
@@ -170,8 +171,8 @@ class Stills(ObjectHandlers):
         if reply.error == "unknown request":
             raise PipefishError("the device sends no stills: its pipefishd is too old")
         if "survey is over" in reply.error:
-            raise SurveyOver(f"the device says: {reply.error}")
-        raise PipefishError(f"the device says: {reply.error}")
+            raise SurveyOver(f"the device says: {in_line(reply.error)}")
+        raise PipefishError(f"the device says: {in_line(reply.error)}")
 
 
 def _cell(value: float) -> str:

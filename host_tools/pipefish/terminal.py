@@ -18,6 +18,11 @@ def printable(text: str, encoding: str | None = None) -> str:
     return text
 
 
+def in_line(text: str) -> str:
+    """On one line, for what a device or a file says: it must not fake another."""
+    return text.replace("\n", "\\n")
+
+
 def say(text: str, quiet: bool = False) -> None:
     """What is going on, as a line on stderr."""
     if not quiet:

@@ -58,6 +58,7 @@ class Device(threading.Thread):
         self.clock: pb.ClockSync | None = None
         self.connections = 0
         self._sent = 0
+        self.cannot = "this device cannot do that"
         self._under_way: set[bytes] = set()
         self._done = threading.Event()
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -160,5 +161,5 @@ class Device(threading.Thread):
             case "get_still":
                 reply.error = "still: the survey is over, the camera gives no frames"
             case _:
-                reply.error = "this device cannot do that"
+                reply.error = self.cannot
         self.link.send_control(reply.SerializeToString())

@@ -197,6 +197,13 @@ def test_a_terminal_without_the_letters_gets_others():
     assert printable("29.9 ± 0.25°", "latin-1") == printable("29.9 ± 0.25°") == "29.9 ± 0.25°"
 
 
+def test_what_a_device_says_fakes_no_other_line(capsys):
+    with Device([], SURVEY) as device:
+        device.cannot = "no\npipefish: the profile is stored"
+        assert cli.main(["flash", device.address]) == 1
+    assert capsys.readouterr().err == "pipefish: the device says: no\\npipefish: the profile is stored\n"
+
+
 class Terminal(io.StringIO):
     """That rich takes for one."""
 
