@@ -125,8 +125,8 @@ static pf_status count_start(pf_keeper *k, bool can_write)
     return status;
 }
 
-/* is_check: nothing is to change. */
-static bool open_store(pf_keeper *k, bool is_check, char *error, size_t n)
+/* is_check: nothing is to change. PF_ERR_SPACE: there is no store, and none can be made now. */
+static pf_status open_store(pf_keeper *k, bool is_check, char *error, size_t n)
 {
     const char *path = k->daemon->config.camera.profile_store;
     const bool can_write = access(path, W_OK) == 0 || errno != EROFS;
@@ -144,7 +144,7 @@ static bool open_store(pf_keeper *k, bool is_check, char *error, size_t n)
     }
     if (status != PF_OK)
         (void)snprintf(error, n, "camera.profile_store: %s", why);
-    return status == PF_OK;
+    return status;
 }
 
 bool pf_keeper_open(pf_daemon *d, char *error, size_t n)
@@ -156,10 +156,15 @@ bool pf_keeper_open(pf_daemon *d, char *error, size_t n)
     }
     k->daemon = d;
     pthread_mutex_init(&k->mutex, NULL);
-    if (!open_store(k, false, error, n)) {
+    const pf_status status = open_store(k, false, error, n);
+    if (status != PF_OK)
         free(k);
-        return false;
+    if (status == PF_ERR_SPACE) { /* nothing was ever kept there: a survey needs none */
+        pf_log(PF_LOG_ERROR, "%s; no profiles are kept until the next start", error);
+        return true;
     }
+    if (status != PF_OK)
+        return false;
     d->keeper = k;
     take_into_use(k);
     return true;
@@ -175,7 +180,7 @@ bool pf_keeper_check(pf_daemon *d, char *error, size_t n)
     k->daemon = d;
     pthread_mutex_init(&k->mutex, NULL);
     if (access(d->config.camera.profile_store, F_OK) == 0) { /* else the first start makes it */
-        is_good = open_store(k, true, error, n);
+        is_good = open_store(k, true, error, n) == PF_OK;
         if (is_good) {
             (void)load(k, &size, &is_trial);
             is_good = k->texts.problem[0] == '\0';

@@ -11,12 +11,13 @@
 #include "config.h"
 #include "pipefish/drivers/clock.h"
 
-#define KINDS     256u /* of lines: their formats. More than the daemon has; what has no place is told */
+#define KINDS     256u /* of lines: their formats and levels. More than the daemon has; what has no place is told */
 #define BURST     60u  /* lines of one kind that may follow each other at once */
 #define REFILL_NS UINT64_C(1000000000) /* until one more may */
 
 typedef struct kind {
     const char *format;
+    uint32_t level;    /* what is only "%s" is one format, whoever tells it: an error is not left out for news */
     uint64_t since_ns; /* when `left` was right */
     uint32_t left, withheld;
 } kind;
@@ -27,19 +28,19 @@ static kind kinds[KINDS];
 
 /* A switch that chatters or a disk that fails tells itself again and again: on a card a log of that drives out all
  * else. *withheld: lines of this kind that were not told since the last one. */
-static bool may_tell(const char *format, uint32_t *withheld)
+static bool may_tell(uint32_t level, const char *format, uint32_t *withheld)
 {
-    const uint64_t now = pf_now();
     uint32_t i = 0;
     bool may = true;
     *withheld = 0;
     pthread_mutex_lock(&mutex);
-    while (i < KINDS && kinds[i].format != NULL && kinds[i].format != format)
+    const uint64_t now = pf_now(); /* not before: one that another thread has overtaken lies before since_ns */
+    while (i < KINDS && kinds[i].format != NULL && (kinds[i].format != format || kinds[i].level != level))
         i++;
     if (i < KINDS) {
         kind *k = &kinds[i];
         if (k->format == NULL)
-            *k = (kind){.format = format, .since_ns = now, .left = BURST};
+            *k = (kind){.format = format, .level = level, .since_ns = now, .left = BURST};
         const uint64_t more = (now - k->since_ns) / REFILL_NS;
         k->left = more >= BURST - k->left ? BURST : k->left + (uint32_t)more;
         k->since_ns = k->left == BURST ? now : k->since_ns + more * REFILL_NS;
@@ -54,6 +55,14 @@ static bool may_tell(const char *format, uint32_t *withheld)
     return may;
 }
 
+/* Names and reasons come from files, devices and hosts: what they say stays in its line. */
+static void keep_in_line(char *text)
+{
+    for (; *text != '\0'; text++)
+        if ((unsigned char)*text < ' ' || *text == 0x7F)
+            *text = ' ';
+}
+
 void pf_log_set_level(uint32_t level)
 {
     most = level;
@@ -66,7 +75,7 @@ void pf_log(uint32_t level, const char *format, ...)
     size_t n;
     va_list arguments;
     uint32_t withheld;
-    if (level > most || !may_tell(format, &withheld))
+    if (level > most || !may_tell(level, format, &withheld))
         return;
     /* systemd sets this and reads the priority from the prefix; people need not see it. */
     if (getenv("JOURNAL_STREAM"))
@@ -79,6 +88,7 @@ void pf_log(uint32_t level, const char *format, ...)
     va_start(arguments, format);
     (void)vsnprintf(line + n, sizeof line - n - 1, format, arguments);
     va_end(arguments);
+    keep_in_line(line);
     n = strlen(line);
     if (withheld > 0)
         n += (size_t)snprintf(line + n, sizeof line - n, " (and %u more like it)", withheld);

@@ -7,8 +7,9 @@
 /* Lines of a level above this (pf_config's PF_LOG_...) are left out. */
 void pf_log_set_level(uint32_t level);
 
-/* `format` is a literal: of the lines of one format no more than 60 follow each other at once, and one a second after
- * that; the next that is told says how many were not. Any thread. */
+/* `format` is a literal: of the lines of one format and level no more than 60 follow each other at once, and one a
+ * second after that; the next that is told says how many were not. One line, whatever the arguments: control characters
+ * become spaces. Any thread. */
 __attribute__((format(printf, 2, 3))) void pf_log(uint32_t level, const char *format, ...);
 
 #endif

@@ -43,7 +43,7 @@ static const char usage[] =
     "                           when three starts in a row fail\n"
     "  --pair \"ROLE KEY NAME\"   let a host in over the network (viewer, operator, calibrator; revoked\n"
     "                           = never again), print this device's key; see `pipefish pair`\n"
-    "  --check-config           check the settings and the profile, start nothing\n"
+    "  --check-config           check settings, profile, recording; start nothing\n"
     "  --help-config            print every setting with its meaning: an example file\n"
     "  --version                print the version\n"
     "\n"
@@ -322,6 +322,22 @@ static bool open_transport(pf_daemon *d, char *error, size_t n)
     return status == PF_OK;
 }
 
+/* What --check-config looks at beyond settings and profile: mistakes that a running daemon does not make different. A
+ * camera or a line may be in use by one. */
+static bool check_rest(pf_daemon *d, char *error, size_t n)
+{
+    const pf_config *c = &d->config;
+    if (c->link.transport == PF_TRANSPORT_TCP &&
+        pf_tcp_check(&(pf_tcp_config){.address = c->link.address}, error, n) != PF_OK)
+        return false;
+    if (c->camera.driver != PF_CAMERA_REPLAY)
+        return true;
+    if (!open_camera(d, error, n))
+        return false;
+    d->camera.ops->close(d->camera.self);
+    return true;
+}
+
 static bool open_random(pf_daemon *d, char *error, size_t n)
 {
     while (d->boot_id == 0) {
@@ -570,6 +586,10 @@ int main(int argc, char **argv)
         return code;
     }
     if (!load_profile(&d, o.check, error, sizeof error)) {
+        pf_log(PF_LOG_ERROR, "%s", error);
+        return FAILED;
+    }
+    if (o.check && !check_rest(&d, error, sizeof error)) {
         pf_log(PF_LOG_ERROR, "%s", error);
         return FAILED;
     }

@@ -112,7 +112,9 @@ static bool ask_keeper(pf_daemon *d, pf_session *s, const pf_msg_request *reques
     pf_keeper *keeper = d->keeper;
     pf_keeper_job job = {.what = PF_KEEPER_REVERT, .id = request->id};
     if (keeper == NULL) {
-        reply->error = "this device keeps no profiles: camera.profile_store is not set";
+        reply->error = d->config.camera.profile_store[0] == '\0'
+                           ? "this device keeps no profiles: camera.profile_store is not set"
+                           : "this device keeps no profiles: its disk was full or read-only when it started";
         return true;
     }
     if (request->what == PF_REQUEST_GET_PROFILE) {

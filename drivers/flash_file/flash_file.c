@@ -126,12 +126,15 @@ pf_status pf_flash_file_open(pf_flash *flash, const pf_flash_file_config *config
     struct stat info;
     int flags = config->is_read_only ? O_RDONLY : O_RDWR;
     int fd = open(config->path, flags | O_CLOEXEC);
-    if (fd < 0 && errno == ENOENT && config->is_read_only)
+    const bool is_to_be_made = fd < 0 && errno == ENOENT;
+    if (is_to_be_made && config->is_read_only)
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_END, "%s: not there", config->path), error, n);
-    if (fd < 0 && errno == ENOENT && make_file(config->path))
+    if (is_to_be_made && make_file(config->path))
         fd = open(config->path, flags | O_CLOEXEC);
     pf_status status = PF_OK;
-    if (fd < 0 || fstat(fd, &info) != 0)
+    if (fd < 0 && is_to_be_made && (errno == ENOSPC || errno == EDQUOT || errno == EROFS))
+        status = pf_fail(&failure, PF_ERR_SPACE, "%s: %s", config->path, strerror(errno));
+    else if (fd < 0 || fstat(fd, &info) != 0)
         status = pf_fail(&failure, PF_ERR_IO, "%s: %s", config->path, strerror(errno));
     else if (!S_ISREG(info.st_mode) || info.st_size != SIZE)
         status =

@@ -4,6 +4,7 @@
 #include "spool/schema.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
@@ -31,6 +32,22 @@ static const char *const sql[SQL_STATEMENTS] = {
     [SQL_KEEP_ALL] = "DELETE FROM evictable",
     [SQL_FREE_PAGES] = "PRAGMA freelist_count",
 };
+
+/* A user's own limit is none that SQLite knows; and where a file cannot be made it tells what came of looking for one,
+ * so that one is tried. */
+static bool has_no_room(const pf_spool_database *d)
+{
+    char name[1100];
+    int why = sqlite3_system_errno(d->db);
+    if (sqlite3_errcode(d->db) == SQLITE_CANTOPEN && snprintf(name, sizeof name, "%s-room", d->path) < 1100) {
+        const int fd = open(name, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
+        why = fd < 0 ? errno : 0;
+        if (fd >= 0)
+            (void)close(fd);
+        (void)unlink(name);
+    }
+    return why == ENOSPC || why == EDQUOT;
+}
 
 static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
 {
@@ -60,6 +77,10 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
     case SQLITE_FULL:
     case SQLITE_TOOBIG:
         status = PF_ERR_SPACE;
+        break;
+    case SQLITE_CANTOPEN:
+    case SQLITE_IOERR:
+        status = has_no_room(d) ? PF_ERR_SPACE : PF_ERR_IO;
         break;
     default:
         break;
@@ -303,11 +324,18 @@ static pf_status measure(pf_spool_database *d)
 static pf_status open_file(pf_spool_database *d)
 {
     d->is_read_only = pf_spool_is_read_only(d->path);
+    d->is_full = false;
     d->stats.objects = d->stats.bytes = 0;
     const uint32_t version = pf_spool_version_of(d->path);
     if (version > PF_SPOOL_VERSION) /* whatever else is in it, damaged or not */
         return fail_version(d, version);
-    pf_status status = d->is_read_only ? open_for_reading(d) : open_for_writing(d);
+    pf_status status = d->is_read_only ? PF_ERR_SPACE : open_for_writing(d);
+    if (status == PF_ERR_SPACE) { /* a disk too full for an empty spool, too: a survey needs none to begin */
+        pf_spool_database_close(d);
+        d->is_full = !d->is_read_only;
+        d->is_read_only = true;
+        status = open_for_reading(d);
+    }
     if (status == PF_OK)
         status = measure(d);
     return status;
@@ -337,10 +365,23 @@ pf_status pf_spool_database_open(pf_spool_database *d)
     return status;
 }
 
+static uint64_t room_on(const struct statvfs *disk)
+{
+    return (uint64_t)disk->f_bavail * disk->f_frsize;
+}
+
+/* Whether what kept it from being written may have gone. */
+static bool may_be_written(const pf_spool_database *d)
+{
+    struct statvfs disk;
+    return !pf_spool_is_read_only(d->path) &&
+           (!d->is_full || statvfs(d->path, &disk) != 0 || room_on(&disk) >= ROOM_BYTES);
+}
+
 bool pf_spool_enter(pf_spool_database *d)
 {
     pthread_mutex_lock(&d->mutex);
-    if (d->is_read_only && !pf_spool_is_read_only(d->path))
+    if (d->is_read_only && may_be_written(d))
         pf_spool_database_close(d);
     if (d->db != NULL || pf_spool_database_open(d) == PF_OK)
         return true;
@@ -371,7 +412,7 @@ pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
     sqlite3_reset(q);
     if (pages <= unused || statvfs(d->path, &disk) != 0)
         return PF_OK;
-    const uint64_t growth = (pages - unused) * PF_SPOOL_PAGE, left = (uint64_t)disk.f_bavail * disk.f_frsize;
+    const uint64_t growth = (pages - unused) * PF_SPOOL_PAGE, left = room_on(&disk);
     if (left >= (is_exchange ? ROOM_BYTES / 2 : ROOM_BYTES) + 2 * growth)
         return PF_OK;
     d->stats.errors++;
@@ -382,6 +423,7 @@ pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
 pf_status pf_spool_fail_read_only(pf_spool_database *d)
 {
     d->stats.errors++;
-    (void)pf_spool_is_read_only(d->path);
-    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: cannot be written: %s", d->path, strerror(errno));
+    const bool is_forbidden = pf_spool_is_read_only(d->path);
+    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: cannot be written: %s", d->path,
+                   strerror(is_forbidden ? errno : ENOSPC));
 }

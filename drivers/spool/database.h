@@ -36,9 +36,10 @@ typedef struct pf_spool_database {
     char *path;
     uint64_t quota;
     void (*alive)(void);
-    bool is_damaged; /* SQLite has found the file to be, and it is to be replaced */
-    bool is_read_only;
-    int64_t highest; /* row given or shown to anybody */
+    bool is_damaged;   /* SQLite has found the file to be, and it is to be replaced */
+    bool is_read_only; /* it cannot be written: the medium does not allow it, */
+    bool is_full;      /* or had no room for what an opening writes */
+    int64_t highest;   /* row given or shown to anybody */
     pf_spool_stats stats;
     pf_failure failure, healing;
 } pf_spool_database;
@@ -48,7 +49,7 @@ pf_status pf_spool_database_open(pf_spool_database *d);
 void pf_spool_database_close(pf_spool_database *d);
 
 /* Takes the mutex and sees to it that the database is open. False, without the mutex: it cannot be. A medium that was
- * read-only is asked whether it still is. */
+ * read-only or full is asked whether it still is. */
 bool pf_spool_enter(pf_spool_database *d);
 
 /* Gives the mutex back; what was found damaged meanwhile is replaced first. */
@@ -73,7 +74,7 @@ pf_status pf_spool_fail(pf_spool_database *d, const char *doing);
  * for it (is_exchange). PF_OK; PF_ERR_SPACE, counted and told; PF_ERR_IO. */
 pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange);
 
-/* As pf_spool_fail where the medium is read-only: later it may be written. PF_ERR_SPACE. */
+/* As pf_spool_fail where it is opened for reading only: later it may be written. PF_ERR_SPACE. */
 pf_status pf_spool_fail_read_only(pf_spool_database *d);
 
 #endif

@@ -164,16 +164,29 @@ static const pf_transport_ops tcp_ops = {
     .close = tcp_close,
 };
 
+static pf_status parse(pf_address *a, const pf_tcp_config *config, pf_failure *failure)
+{
+    pf_status status = pf_address_parse(a, config->address, config->port, "tcp", failure);
+    if (status == PF_OK && !pf_address_is_loopback(a))
+        status = pf_fail(failure, PF_ERR_UNSUPPORTED,
+                         "tcp: %s is not a loopback address (127.0.0.1, ::1): what others can reach must be encrypted "
+                         "(link.transport = tls)",
+                         config->address);
+    return status;
+}
+
+pf_status pf_tcp_check(const pf_tcp_config *config, char *error, size_t n)
+{
+    pf_failure failure = {""};
+    pf_address a;
+    return pf_failure_copy(&failure, parse(&a, config, &failure), error, n);
+}
+
 pf_status pf_tcp_listen(pf_transport *transport, const pf_tcp_config *config, char *error, size_t n)
 {
     pf_failure failure = {""};
     pf_address a;
-    pf_status status = pf_address_parse(&a, config->address, config->port, "tcp", &failure);
-    if (status == PF_OK && !pf_address_is_loopback(&a))
-        status = pf_fail(&failure, PF_ERR_UNSUPPORTED,
-                         "tcp: %s is not a loopback address (127.0.0.1, ::1): what others can reach must be encrypted "
-                         "(link.transport = tls)",
-                         config->address);
+    pf_status status = parse(&a, config, &failure);
     if (status != PF_OK)
         return pf_failure_copy(&failure, status, error, n);
     tcp *t = calloc(1, sizeof *t);

@@ -46,7 +46,7 @@ def test_help_config_is_the_committed_example_and_a_valid_file(tmp_path: Path):
     assert text == (ROOT / "firmware" / "pipefishd.ini.example").read_text()
     config = tmp_path / "c.ini"
     config.write_text(text)
-    assert run("--config", config, "--check-config", "--set", "camera.path=x").returncode == 0
+    assert run("--config", config, "--check-config", "--set", "camera.driver=v4l2").returncode == 0
 
 
 def test_check_config_accepts_a_good_file(crawler: Crawler):
@@ -101,6 +101,19 @@ def test_a_wheel_that_nothing_counts_is_refused_with_a_camera_and_told_with_a_re
     crawler.start()
     assert receive_all(crawler, Store(crawler.port)) == 0
     assert crawler.text().count("frames came without an encoder count") == 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "what"),
+    [
+        ("camera.path=absent.y4m", "absent.y4m: No such file"),
+        ("link.address=0.0.0.0", "what others can reach must be encrypted (link.transport = tls)"),
+        ("link.address=crawler.local", "no numeric address"),
+    ],
+)
+def test_check_config_finds_what_would_keep_it_from_starting(crawler: Crawler, setting: str, what: str):
+    done = run("--config", crawler.config, "--check-config", "--set", setting)
+    assert done.returncode == 1 and what in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_profile_that_is_none_is_refused_before_anything_starts(tmp_path: Path, crawler: Crawler):

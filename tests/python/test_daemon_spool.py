@@ -97,6 +97,33 @@ def test_a_read_only_medium_is_sent_and_written_to_once_it_can_be(tmp_path: Path
     assert lost_indices(second) == set(), "a fast replay waits until it can be stored"
 
 
+@pytest.mark.parametrize("options", ["size=16m", "size=16m,nr_inodes=5"], ids=["bytes", "files"])
+def test_a_disk_that_is_full_at_the_first_start_lets_the_survey_begin_once_there_is_room(
+    tmp_path: Path, crawler: Crawler, options: str
+):
+    """Neither the spool nor the store of profiles can be made: the host is served, and told why nothing is stored."""
+    with mounted(tmp_path / "medium", options) as medium:
+        with contextlib.suppress(OSError):
+            for name in range(100):
+                (medium / f"other{name}").write_bytes(bytes(0 if "nr_inodes" in options else 1 << 20))
+        on_medium = ("--set", f"spool.path={medium}/spool.db", "--set", f"camera.profile_store={medium}/profiles")
+        crawler.start(*on_medium, *EVERY_FRAME)
+        wait_for_status(crawler, lambda s: "cannot be written: No space left" in s["spool_trouble"])
+        store = Store(crawler.port)
+        with store.client(crawler) as client:
+            serve(crawler, client, lambda: store.statuses)
+            assert not store.objects
+            for other in medium.glob("other*"):
+                other.unlink()
+            serve(crawler, client, lambda: store.ends)
+            crawler.terminate()
+            serve(crawler, client, lambda: False)
+        assert crawler.wait() == 0
+    [end] = store.ends
+    assert lost_indices(end) == set() and {k.index for k in store.keyframes} == set(range(end.keyframes))
+    assert "profiles: No space left on device" in crawler.text()
+
+
 @pytest.mark.parametrize("speed", ["fast", "recorded"])
 def test_a_spool_that_has_filled_the_disk_makes_room_and_goes_on_once_a_host_comes(
     tmp_path: Path, crawler: Crawler, speed: str

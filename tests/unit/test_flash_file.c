@@ -129,7 +129,7 @@ static void test_a_failing_disk_is_an_error_and_the_profile_stays(void)
 
     failing = ENOSPC;
     const char *path = temporary_path("never.store");
-    TEST_ASSERT_EQUAL_INT(PF_ERR_IO, open_file(path, false));
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, open_file(path, false));
     TEST_ASSERT_NOT_NULL(strstr(error, "No space left"));
     TEST_ASSERT_EQUAL_INT(-1, access(path, F_OK));
 }

@@ -1,5 +1,5 @@
 /* Proves: of what is told again and again a line a second is left, which says how many are not; other lines come
- * through all the while; no text is too long, and every line ends. */
+ * through all the while; no text is too long, none makes a second line, and every line ends. */
 #include "config.h"
 #include "log.h"
 #include "unity.h"
@@ -85,6 +85,24 @@ static void test_what_is_told_again_and_again_is_left_out_and_counted(void)
     TEST_ASSERT_EQUAL_UINT32(60, count("switch"));
 }
 
+/* What is only "%s" is one format for the whole program. */
+static void test_an_error_is_told_whatever_news_there_were(void)
+{
+    (void)count(NULL);
+    for (int i = 0; i < 200; i++)
+        pf_log(PF_LOG_INFO, "%s", "host is there");
+    pf_log(PF_LOG_ERROR, "%s", "it does not start");
+    TEST_ASSERT_EQUAL_UINT32(1, count("it does not start"));
+    later_ns += UINT64_C(3600000000000);
+}
+
+static void test_no_text_makes_a_line_of_its_own(void)
+{
+    (void)count(NULL);
+    pf_log(PF_LOG_WARNING, "host %s: %s", "a\n<3>pipefishd: error: forged", "\r\x1b[2Jb\x7f\xc3\xa9\n");
+    TEST_ASSERT_EQUAL_UINT32(1, count("host a <3>pipefishd: error: forged:   [2Jb \xc3\xa9 \n"));
+}
+
 static void test_long_lines_end(void)
 {
     char text[3000];
@@ -126,6 +144,8 @@ int main(void)
 {
     UNITY_BEGIN();
     RUN_TEST(test_what_is_told_again_and_again_is_left_out_and_counted);
+    RUN_TEST(test_an_error_is_told_whatever_news_there_were);
+    RUN_TEST(test_no_text_makes_a_line_of_its_own);
     RUN_TEST(test_long_lines_end);
     RUN_TEST(test_threads_share_the_limit);
     return UNITY_END();

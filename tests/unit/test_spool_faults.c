@@ -416,6 +416,48 @@ static void test_a_medium_that_refuses_writes_loses_nothing(void)
         hook(((const char *[]){"write", "pwrite", "pwrite64", "fallocate", "ftruncate"})[i], NULL);
 }
 
+/* Proves: on a disk too full for an empty spool one is opened all the same: it says that it is full, and what is put
+ * once there is room is stored for good; a damaged one found there waits, and is read then. A user's own limit is such
+ * a disk too. */
+static void test_a_spool_on_a_disk_that_is_full_opens_and_begins_once_there_is_room(void)
+{
+    static uint8_t file[1 << 20];
+    pf_spool_item item;
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_or_not);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_or_not);
+    for (int round = 0; round < 4; round++) {
+        const bool is_damaged = round & 1;
+        forget("begun.db");
+        if (is_damaged) {
+            open_spool("begun.db", 0);
+            TEST_ASSERT_EQUAL_INT(PF_OK, put(1));
+            close_spool();
+            const size_t n = slurp(temporary_path("begun.db"), file, sizeof file);
+            memset(file + 40, 0x5A, 100);
+            (void)temporary_write("begun.db", file, n);
+        }
+        refuse_with = round & 2 ? EDQUOT : ENOSPC;
+        open_spool("begun.db", 0);
+        TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, 0, &item));
+        const uint64_t errors = stats().errors;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(2));
+        TEST_ASSERT_TRUE(stats().errors > errors);
+        TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "cannot be written: No space left"));
+        refuse_with = 0;
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(2));
+        close_spool();
+        open_spool("begun.db", 0);
+        uint64_t row = 0;
+        for (uint64_t id = is_damaged ? 1 : 2; id <= 2; id++, row = item.row) {
+            TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, row, &item));
+            TEST_ASSERT_EQUAL_UINT64(id, check_item(&item));
+        }
+        TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, row, &item));
+    }
+    hook("pwrite", NULL);
+    hook("pwrite64", NULL);
+}
+
 int main(int argc, char **argv)
 {
     if (argc == 4) /* look() has begun it */
@@ -430,6 +472,7 @@ int main(int argc, char **argv)
     RUN_TEST(test_full_medium);
     RUN_TEST(test_killed_at_every_write_nothing_acknowledged_is_lost);
     RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);
+    RUN_TEST(test_a_spool_on_a_disk_that_is_full_opens_and_begins_once_there_is_room);
     temporary_remove();
     return UNITY_END();
 }

@@ -188,10 +188,11 @@ static void test_a_camera_that_is_not_there_yet_is_waited_for(void)
 static void test_a_camera_that_another_program_uses_is_waited_for(void)
 {
     pf_frame frame;
-    for (int i = 0; i < 2; i++) {
+    for (int i = 0; i < 3; i++) {
         close_camera();
         k.is_busy = true;
         k.is_busy_early = i == 1;
+        k.is_busy_file = i == 2;
         start();
         TEST_ASSERT_EQUAL_INT(PF_ERR_CLOSED, camera.ops->next(camera.self, 500, &frame));
         TEST_ASSERT_NOT_NULL(strstr(camera.ops->error(camera.self), "busy"));

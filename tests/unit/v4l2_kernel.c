@@ -23,6 +23,9 @@ static int fake_open(void *self, const char *path)
     errno = ENOENT;
     if (!k.is_plugged)
         return -1;
+    errno = EBUSY;
+    if (k.is_busy && k.is_busy_file)
+        return -1;
     TEST_ASSERT_FALSE_MESSAGE(k.is_open, "opened twice");
     k.is_open = true;
     return 5;

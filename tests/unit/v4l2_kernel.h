@@ -19,6 +19,7 @@ typedef struct v4l2_kernel {
     uint64_t now, next_frame, period;
     bool is_plugged, is_open, is_streaming, is_silent, restart_helps, has_error, is_busy;
     bool is_busy_early; /* is_busy is told when the format is set, not when buffers are asked for */
+    bool is_busy_file;  /* or when it is opened */
     fake_format formats[FORMATS];
     uint32_t n_formats, width, height, fourcc, sequence, n_buffers, restarts;
     bool is_queued[SLOTS], is_done[SLOTS], is_mplane;

@@ -16,7 +16,8 @@ typedef struct pf_flash_file_config {
 } pf_flash_file_config;
 
 /* Returns PF_OK; PF_ERR_FORMAT (the file has another size: not a store); PF_ERR_AGAIN (another process has it);
- * PF_ERR_END; PF_ERR_IO. error[n] says why. */
+ * PF_ERR_END; PF_ERR_SPACE (it is not there, and its medium, full or read-only, takes none); PF_ERR_IO. error[n] says
+ * why. */
 pf_status pf_flash_file_open(pf_flash *flash, const pf_flash_file_config *config, char *error, size_t n);
 void pf_flash_file_close(pf_flash *flash);
 

@@ -90,8 +90,9 @@ typedef struct pf_spool_config {
 /* Opens or creates. A spool whose file is damaged, now or while it is in use, is set aside as <path>.damaged-N, and a
  * new one begun with every object that can still be read: under its row, but never to make room for others. What a
  * kill, or a new file that is full, keeps from that is done at the next opening. Anybody else's file is refused. A
- * medium that is read-only gives what is there, takes and removes nothing, and is asked at each call whether it still
- * is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a spool), PF_ERR_VERSION.
+ * medium that is read-only, or too full for an empty spool, gives what is there, takes and removes nothing, and is
+ * asked at each call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a
+ * spool), PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
 

@@ -99,4 +99,7 @@ typedef struct pf_tcp_config {
  * numeric address); PF_ERR_UNSUPPORTED (not a loopback address). */
 pf_status pf_tcp_listen(pf_transport *transport, const pf_tcp_config *config, char *error, size_t n);
 
+/* What pf_tcp_listen would say of the address, without listening. PF_OK, PF_ERR_ARGUMENT, PF_ERR_UNSUPPORTED. */
+pf_status pf_tcp_check(const pf_tcp_config *config, char *error, size_t n);
+
 #endif
