@@ -216,7 +216,9 @@ def add_unroll(commands: Any) -> None:
         "pipefish unroll out/ -o unrolled.png --labels",
     )
     p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
+    p.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="PNG to write; a .json beside it says where each pixel is"
+    )
     p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
     p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
     p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
