@@ -85,7 +85,9 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
     default:
         break;
     }
-    return pf_fail(&d->failure, status, "%s: %s: %s", d->path, doing, sqlite3_errmsg(d->db));
+    bool has_reason = sqlite3_errcode(d->db) == SQLITE_CANTOPEN && sqlite3_system_errno(d->db) != 0;
+    return pf_fail(&d->failure, status, "%s: %s: %s%s%s", d->path, doing, sqlite3_errmsg(d->db), has_reason ? ": " : "",
+                   has_reason ? strerror(sqlite3_system_errno(d->db)) : "");
 }
 
 pf_status pf_spool_fail(pf_spool_database *d, const char *doing)

@@ -7,6 +7,7 @@
 #include <pipefish/profile.h>
 #include <pipefish/track.h>
 
+#include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -28,6 +29,7 @@ static int fail(const char *what, const char *why)
 static bool load_pgm(const char *path, pf_image *image, uint8_t **pixels)
 {
     unsigned width, height, most;
+    errno = 0;
     FILE *in = fopen(path, "rb");
     bool ok = in != NULL && fscanf(in, "P5 %5u %5u %3u", &width, &height, &most) == 3 && fgetc(in) != EOF &&
               most == 255 && width > 0 && height > 0 && width <= PF_IMAGE_SIZE_MAX && height <= PF_IMAGE_SIZE_MAX;
@@ -69,22 +71,23 @@ int main(int argc, char **argv)
     void *workspace = NULL;
     uint8_t *kept = NULL; /* the last frame: the tracker looks back at it */
     uint32_t known = 0;
-    int first = 1;
-    if (argc > 3 && strcmp(argv[1], "--profile") == 0) {
+    const int first = argc > 1 && strcmp(argv[1], "--profile") == 0 ? 3 : 1;
+    if (argc <= first) {
+        (void)fail("usage", "track [--profile camera.profile] FRAME.pgm...");
+        return 2;
+    }
+    if (first > 1) {
         const char *why;
         if (!load_profile(argv[2], &profile, &why))
             return fail(argv[2], why);
         camera = &profile.camera;
-        first = 3;
     }
-    if (argc <= first)
-        return fail("usage", "track [--profile camera.profile] FRAME.pgm...");
     for (int i = first; i < argc; i++) {
         pf_image frame;
         uint8_t *pixels;
         uint32_t n, still = 0;
         if (!load_pgm(argv[i], &frame, &pixels))
-            return fail(argv[i], "no binary PGM of 8 bits");
+            return fail(argv[i], errno != 0 ? strerror(errno) : "no binary PGM of 8 bits, or not whole");
         if (tracker == NULL) {
             const pf_tracker_config config = {.width = frame.width, .height = frame.height, .max_tracks = TRACKS};
             size_t size = pf_tracker_workspace_size(&config);

@@ -11,12 +11,26 @@ from typing import Any
 from pipefish.cli import DONE, FAILED, Result, UsageError, add_command, table
 from pipefish.intervals import SAID, Z95
 
+LEAST_MM = 10  # no pipe is as narrow, none as short: who says less means metres or inches
+
 
 def _millimetres(text: str) -> float:
     value = float(text)
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"{text} is not a length above zero")
     return value / 1000
+
+
+def _check_pipe(text: str, value: float) -> None:
+    """value: metres."""
+    if value < LEAST_MM / 1000:
+        raise argparse.ArgumentTypeError(f"'{text}' is in millimetres: no pipe has less than {LEAST_MM}")
+
+
+def _nominal(text: str) -> float:
+    value = _millimetres(text)
+    _check_pipe(text, value)
+    return value
 
 
 def _known(text: str) -> Any:
@@ -29,6 +43,7 @@ def _known(text: str) -> Any:
     if not found or float(found[1]) <= 0:
         raise argparse.ArgumentTypeError(f"'{text}' is not a length in mm such as 1000 or 1000+-2")
     value = float(found[1]) / 1000
+    _check_pipe(text, value)
     return value if found[2] is None else Known(value, float(found[2]) / 1000 / Z95)
 
 
@@ -81,7 +96,7 @@ def add_reconstruct(commands: Any) -> None:
         metavar="FILE",
         help="a flat target in the pipe, as `pipefish target` describes it: where it is seen it tells the scale",
     )
-    p.add_argument("--nominal", type=_millimetres, metavar="MM", help="nominal diameter [the survey's]")
+    p.add_argument("--nominal", type=_nominal, metavar="MM", help="nominal diameter [the survey's]")
     p.add_argument(
         "--method",
         choices=("hierarchical", "incremental"),
@@ -201,12 +216,14 @@ def add_unroll(commands: Any) -> None:
         "pipefish unroll out/ -o unrolled.png --labels",
     )
     p.add_argument("source", metavar="DIR|SURVEY", help="of pipefish reconstruct; or a survey file, measured first")
-    p.add_argument("-o", "--output", required=True, metavar="FILE", help="PNG to write; FILE.json says where it is")
+    p.add_argument(
+        "-o", "--output", required=True, metavar="FILE", help="PNG to write; a .json beside it says where each pixel is"
+    )
     p.add_argument("--survey", metavar="FILE", help="survey with the pictures [where it was when it was measured]")
     p.add_argument("--mm", type=_millimetres, metavar="MM", help="of wall a pixel [as fine as the pictures show it]")
     p.add_argument("--cut", type=_hour, default=0.0, metavar="HOUR", help="clock of the upper edge, 0 to 12 [12]")
     p.add_argument("--from", dest="start", type=float, metavar="M", help="chainage to begin with, metres")
-    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with")
+    p.add_argument("--to", dest="end", type=float, metavar="M", help="chainage to end with, metres")
     p.add_argument("--labels", action="store_true", help="clock, chainage and a scale bar around the picture")
 
 
@@ -214,17 +231,20 @@ def run_unroll(args: argparse.Namespace) -> Result:
     """Runs the command."""
     from pipefish.progress import Progress
     from pipefish.unroll import Unroller
-    from pipefish.unroll_files import from_source, write_unrolled
+    from pipefish.unroll_files import check_name, from_source, write_unrolled
 
+    check_name(Path(args.output))
+    span = None
+    if args.start is not None or args.end is not None:
+        span = (-math.inf if args.start is None else args.start, math.inf if args.end is None else args.end)
+        if not span[0] < span[1]:
+            raise UsageError(f"unroll: --from {span[0]:g} --to {span[1]:g}: ends before it begins")
     with Progress("unroll", 100, args.json) as bar:
 
         def tell(done: float, word: str) -> None:
             bar.update(round(100 * done), word)
 
         wall = from_source(Path(args.source), Path(args.survey) if args.survey else None, tell)
-        span = None
-        if args.start is not None or args.end is not None:
-            span = (-math.inf if args.start is None else args.start, math.inf if args.end is None else args.end)
         if args.mm is not None and wall.unit != "metre":
             raise UsageError("--mm: there is no scale, lengths are in mean diameters")
         unroller = Unroller(wall, cell=args.mm, cut=args.cut, span=span, tell=tell)

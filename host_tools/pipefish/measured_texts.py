@@ -133,6 +133,8 @@ def read_measured(folder: Path) -> dict[str, Any]:
     path = folder / "reconstruction.json"
     if folder.is_file():
         raise FormatError(folder, None, "a file; `pipefish reconstruct SURVEY -o DIR` makes the folder that is wanted")
+    if folder.is_dir() and not path.exists():
+        raise FormatError(folder, None, "no reconstruction.json here: `pipefish reconstruct SURVEY -o DIR` writes it")
     document = read_document(path, FORMAT, "pipefish reconstruct")
     if document.get("version") != VERSION:
         raise FormatError(path, "version", f"{document.get('version')}; this program reads {VERSION}")

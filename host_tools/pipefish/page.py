@@ -437,7 +437,7 @@ def write_statistics(survey: Survey, out: Path) -> int:
         raise PipefishError(f"{survey.path}: no track statistics: recorded by an older device, or no keyframes")
     main = fill("stats.html", {"tracks": "".join(map(chart_html, charts))})
     lead = f"What became of the tracks, over {len(survey.keyframes)} keyframes."
-    name = survey.info["name"] or survey.info["survey_id"]
+    name = survey.info["name"] or survey.path.name
     data = whole_page("Pipefish tracks", name, lead, main, charts).encode()
     write_atomically(out, data)
     return len(data)

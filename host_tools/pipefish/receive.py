@@ -57,6 +57,7 @@ class Receiver(ObjectHandlers):
         self._line: tuple[float, str] = (-LINE_S, "")  # of the live measurement: when it was last written, what
         self.client = Client(transport, self, link=link)
         self.status: pb.Status | None = None
+        self._expected: int | None = None  # objects in all, as the last status had it: until the next one it stays
         self.again = 0
         self.received = 0
         self.received_bytes = 0
@@ -112,6 +113,7 @@ class Receiver(ObjectHandlers):
 
     def on_status(self, status: pb.Status) -> None:
         self.status = status
+        self._expected = self.received + status.spool.objects
         self.store.choose_primary(status.survey_id)
         writer = self.store.writers.get(status.survey_id)
         clock = self._clocks.get(status.time.boot_id)
@@ -249,8 +251,7 @@ class Receiver(ObjectHandlers):
             bar.say(text)
 
     def _progress(self) -> tuple[int, int | None]:
-        waiting = self.status.spool.objects if self.status else None
-        return self.received, None if waiting is None else self.received + waiting
+        return self.received, None if self._expected is None else max(self._expected, self.received)
 
     def _note(self, start: float) -> str:
         if not self.client.up:

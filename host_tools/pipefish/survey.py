@@ -297,7 +297,8 @@ class Survey:
         partial = self.path.name.endswith(".partial")
         for damage in scan.damage:
             if not (partial and damage.tail):
-                raise FormatError(self.path, f"offset {damage.offset}", damage.reason)
+                cut = f" (a copy that was cut? Named {self.path.name}.partial, what is whole of it is read)"
+                raise FormatError(self.path, f"offset {damage.offset}", damage.reason + (cut if damage.tail else ""))
         if not partial and not (self.starts or self.end or seen):
             raise FormatError(self.path, f"offset {scan.end}", "an MCAP file, but not a pipefish survey")
         for index in sorted(seen):

@@ -11,6 +11,7 @@ from pipefish.files import rounded
 from pipefish.scene import REASONS, STATES, frames_in
 from pipefish.survey import Survey
 
+MOST_REASONS = 5  # layers of a chart of reasons
 Line = Callable[..., dict[str, Any]]  # a name, values and more: a line of a chart
 
 
@@ -61,14 +62,21 @@ def _live(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> di
 
 
 def _lost(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> dict[str, Any]:
+    """The most frequent reasons each, the rest in one layer: a page has so many colours, and a legend so much room."""
+    seen = [(name, words) for name, words in REASONS if np.nansum(stats[name]) > 0]
+    seen.sort(key=lambda reason: -np.nansum(stats[reason[0]]))
+    own, rest = (seen, []) if len(seen) <= MOST_REASONS else (seen[: MOST_REASONS - 1], seen[MOST_REASONS - 1 :])
+    layers = [(words, stats[name]) for name, words in own]
+    if rest:
+        layers.append(("other", np.sum([stats[name] for name, _ in rest], axis=0)))
+    other = f" Other: {', '.join(words for _, words in rest)}." if rest else ""
     return {
         "id": "stats-lost",
         "title": "Why tracks end",
-        "text": "Tracks lost in a camera frame, by reason, in the mean since the keyframe before.",
+        "text": "Tracks lost in a camera frame, by reason, in the mean since the keyframe before." + other,
         "data": [
-            line(words, stats[name], stackgroup="lost", hovertemplate="%{y:.2f}", line={"width": 0.5})
-            for name, words in REASONS
-            if np.nansum(stats[name]) > 0
+            line(words, values, stackgroup="lost", hovertemplate="%{y:.2f}", line={"width": 0.5})
+            for words, values in layers
         ],
         "layout": {
             "xaxis": xaxis,
@@ -98,6 +106,7 @@ def _age(stats: dict[str, np.ndarray], line: Line, xaxis: dict[str, Any]) -> dic
                 "side": "right",
                 "showgrid": False,
                 "tickformat": ".3f",
+                "tickmode": "auto",  # else its ticks are where the other axis has its own
             },
         },
     }

@@ -347,7 +347,8 @@ def open_transport(address: str, baud: int | None = None) -> Transport:
             )
         return (TlsTransport if address[1] == "l" else TcpTransport)(match[1].strip("[]"), port)
     path = address.removeprefix("serial:")
-    if "://" in path or not path:
+    is_host = address == path and re.fullmatch(r"[\w.-]+:\d+|(\d+\.){3}\d+", path) is not None  # its tcp:// forgotten
+    if "://" in path or not path or is_host:
         raise PipefishError(
             f"'{address}' is no device; write /dev/ttyUSB0, serial:/dev/ttyUSB0@3000000, tls://host:port or tcp://host:port"
         )

@@ -69,7 +69,8 @@ class Unroller:
         low, high = span or (wall.start, wall.end)
         low, high = max(low, wall.start), min(high, wall.end)
         if not high > low:
-            raise ArgumentError(f"span: the wall was measured from {wall.start:.2f} to {wall.end:.2f}")
+            unit = "m" if wall.unit == "metre" else "mean diameters"
+            raise ArgumentError(f"span: the wall was measured from {wall.start:.2f} to {wall.end:.2f} {unit}")
         if cell is not None and not (math.isfinite(cell) and cell > 0):
             raise ArgumentError(f"cell: {cell} is not a positive length")
         balance, fine = _engine.UnrollBalance(), []

@@ -29,6 +29,12 @@ def picture(drawn: Drawn) -> Image.Image:
     return Image.merge("LA", (Image.fromarray(drawn.grey), Image.fromarray(drawn.seen)))
 
 
+def check_name(out: Path) -> None:
+    """Of the picture, before anything is measured for it. Raises ArgumentError."""
+    if out.suffix.lower() != ".png":
+        raise ArgumentError(f"{out}: the unrolled picture is a PNG file: a name that ends in .png")
+
+
 def write_unrolled(
     unroller: Unroller, out: Path, *, labels: bool = False, tell: Tell | None = None
 ) -> tuple[dict[str, Any], list[str]]:
@@ -36,8 +42,7 @@ def write_unrolled(
     clock, chainage and a scale bar around it. Returns the document and the files' names. Raises ArgumentError, OSError.
 
     At most one part is in memory."""
-    if out.suffix.lower() != ".png":
-        raise ArgumentError(f"{out}: the unrolled picture is a PNG file: a name that ends in .png")
+    check_name(out)
     tell = tell or (lambda fraction, word: None)
     count = math.ceil(unroller.columns / LONGEST)
     edges = np.linspace(0, unroller.columns, count + 1).round().astype(int)
@@ -175,4 +180,4 @@ def from_source(source: Path, survey: Path | None, tell: Tell) -> Any:
     if survey is not None:
         raise PipefishError(f"{source}: is no folder of `pipefish reconstruct`, so --survey has no use")
     m = measure(Survey.open(source), tell=lambda done, word: tell(0.4 * done, word))
-    return measured_wall(m, measured_document(m, []))
+    return measured_wall(m, measured_document(m))

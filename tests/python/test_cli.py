@@ -95,6 +95,8 @@ def test_show_writes_what_it_says(survey, tmp_path, capsys):
         (["show", "a.mcap", "-o", "no/such/folder/o.png"], "pipefish: no/such/folder/o.png: No such file"),
         (["show", "a.mcap", "-o", "a.mcap/o.png"], "pipefish: a.mcap/o.png: Not a directory"),
         (["receive", "http://x", "-o", "b.mcap"], "'http://x' is no device"),
+        (["receive", "10.0.0.7:7447", "-o", "b.mcap"], "'10.0.0.7:7447' is no device; write"),
+        (["status", "10.0.0.7"], "'10.0.0.7' is no device; write"),
         (["receive", "tcp://127.0.0.1:1", "-o", "a.mcap"], "a.mcap exists already"),
         (["receive", "tcp://127.0.0.1:1", "-o", ".", "--overwrite"], ". is a folder; name a file in it"),
         (["receive", "tcp://127.0.0.1:1", "-o", "a.mcap/b.mcap"], "a.mcap is not a folder"),

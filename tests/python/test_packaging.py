@@ -196,6 +196,9 @@ def test_pkg_config_finds_the_library_where_it_was_installed(installed: Path, tm
     command = ["cc", source, "-o", tmp_path / "track", *flags]
     subprocess.run(command, check=True)
     check_tracks(run_on_frames(tmp_path / "track", tmp_path))
+    for arguments, code, told in [((), 2, "usage"), (("--profile", "a"), 2, "usage"), (("no.pgm",), 1, "No such file")]:
+        done = subprocess.run([tmp_path / "track", *arguments], capture_output=True, text=True)
+        assert done.returncode == code and told in done.stderr
 
 
 def test_the_headers_stand_alone_in_c_and_cxx(installed: Path, tmp_path: Path):

@@ -25,7 +25,7 @@ from device import Device
 from pipefish import client
 from pipefish import pipefish_pb2 as pb
 from pipefish.errors import PipefishError
-from pipefish.receive import Interrupted, receive
+from pipefish.receive import Interrupted, Receiver, receive
 from pipefish.survey import Survey
 from pipefish.surveystore import SurveyStore
 from pipefish.transport import SerialTransport, TcpTransport, TransportClosed, open_transport
@@ -34,6 +34,20 @@ from synthetic import BOOT, SURVEY, end, keyframe, name_of, start, store_all, su
 
 def receive_from(device: Device, path: Path, **options):
     return receive(open_transport(device.address), path, timeout_s=PATIENCE_S, quiet=True, **options)
+
+
+def test_the_progress_total_stays_between_two_statuses(tmp_path):
+    """Each object that arrives was counted as waiting by the last status already."""
+    receiver = Receiver(open_transport("tcp://127.0.0.1:1"), SurveyStore(tmp_path / "a.mcap"), quiet=True)
+    assert receiver._progress() == (0, None)
+    status = pb.Status()
+    status.spool.objects = 3
+    receiver.on_status(status)
+    seen = [receiver._progress()]
+    for _ in range(5):
+        receiver.received += 1
+        seen.append(receiver._progress())
+    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (4, 4), (5, 5)]
 
 
 def test_a_survey_arrives_whole_and_the_device_is_empty(tmp_path):

@@ -562,7 +562,14 @@ def test_texts_of_the_survey_cannot_break_the_report(out, tmp_path):
 
 
 def test_a_folder_that_is_none_is_named(tmp_path, capsys):
-    assert "reconstruction.json" in failure(capsys, "report", tmp_path, "-o", tmp_path / "r.html")
+    told = failure(capsys, "report", tmp_path, "-o", tmp_path / "r.html")
+    assert "reconstruction.json" in told and "`pipefish reconstruct SURVEY -o DIR` writes it" in told
     (tmp_path / "reconstruction.json").write_text("{}")
     assert "pipefish reconstruct" in failure(capsys, "report", tmp_path, "-o", tmp_path / "r.html")
     assert main(["report", str(tmp_path), "-o", "r.html", "--limit", "beauty=3"]) == 2
+
+
+@pytest.mark.parametrize("option", ["--diameter", "--joint-spacing", "--nominal"])
+def test_metres_where_millimetres_are_wanted_are_wrong_usage(tmp_path, capsys, option):
+    assert main(["reconstruct", str(tmp_path / "a.mcap"), "-o", str(tmp_path), option, "0.3"]) == 2
+    assert f"{option}: '0.3' is in millimetres" in capsys.readouterr().err

@@ -14,9 +14,10 @@ from pipefish import pipefish_pb2 as pb
 from pipefish.colours import age_colours
 from pipefish.errors import PipefishError
 from pipefish.page import write_statistics
+from pipefish.scene import REASONS
 from pipefish.show import Painter, Style, animation, show, spread
 from pipefish.survey import Survey
-from pipefish.trackstats import statistics
+from pipefish.trackstats import charts, statistics
 from synthetic import as_object, survey_objects, write_survey
 
 
@@ -118,6 +119,26 @@ def test_the_statistics_page_has_its_charts_and_needs_counters(tmp_path, survey)
     assert "drifted from its template" in text and "saturated" not in text.split("application/json")[1][:20000]
     with pytest.raises(PipefishError, match="no track statistics"):
         write_statistics(survey, tmp_path / "none.html")
+
+
+def test_reasons_that_have_no_colour_of_their_own_are_one_layer_and_none_is_lost(tmp_path):
+    survey = tracking_survey(tmp_path)
+    for number, (name, _) in enumerate(REASONS):
+        for frame in survey.keyframes:
+            setattr(frame.message.tracking, name, 10 * (number + 1))
+    chart = next(c for c in charts(survey, np.arange(6.0), "m") if c["id"] == "stats-lost")
+    names = [layer["name"] for layer in chart["data"]]
+    assert names == ["saturated", "stands still in the picture", "masked", "drifted from its template", "other"]
+    assert all(words in chart["text"] for _, words in REASONS if words not in names)
+    total = np.sum([layer["y"] for layer in chart["data"]], axis=0)
+    np.testing.assert_allclose(total, sum(range(10, 110, 10)) / 5)
+
+
+def test_the_statistics_page_of_a_survey_without_a_name_is_called_as_its_file(tmp_path):
+    survey = tracking_survey(tmp_path)
+    survey.start.name = ""
+    write_statistics(survey, tmp_path / "s.html")
+    assert f"<h1>{survey.path.name}" in (tmp_path / "s.html").read_text(encoding="utf-8")
 
 
 def test_colour_by_quality_differs_from_colour_by_age(survey):

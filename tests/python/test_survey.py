@@ -206,8 +206,9 @@ def test_damage_in_a_finished_file_names_file_and_offset(tmp_path):
     with pytest.raises(FormatError, match=r"a\.mcap.*offset \d+"):
         Survey.open(path)
     path.write_bytes(bytes(data[: len(data) // 3]))
-    with pytest.raises(FormatError, match="offset"):
+    with pytest.raises(FormatError, match=r"offset .*Named a\.mcap\.partial, what is whole"):
         Survey.open(path)
+    assert len(Survey.open(path.rename(tmp_path / "a.mcap.partial")).keyframes) < 3, "as the message says"
 
 
 @pytest.mark.parametrize("content", [b"", b"not a survey at all", b"\x89MCAP0\r\n"])

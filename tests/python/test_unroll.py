@@ -155,6 +155,31 @@ def test_a_survey_becomes_a_picture_that_says_where_it_is(measured, tmp_path, ca
     assert document["scale"]["along"] == 1.0 and document["scale"]["around"] == pytest.approx(1.0, rel=0.001)
 
 
+def test_a_survey_file_is_measured_first(measured, tmp_path, capsys):
+    """The same wall from both, but for what tables round."""
+    documents = []
+    for name, source in (("a.png", "survey.mcap"), ("b.png", "out")):
+        arguments = ["--mm", "2", "--from", "0.2", "--to", "0.5", "--json"]
+        capsys.readouterr()
+        assert main(["unroll", str(measured / source), "-o", str(tmp_path / name), *arguments]) == 0
+        documents.append(json.loads(capsys.readouterr().out))
+    one, two = documents
+    assert (one["rows"], one["columns"]) == (two["rows"], two["columns"])
+    assert one["diameter"] == pytest.approx(two["diameter"], rel=1e-6)
+    first, second = (np.asarray(Image.open(tmp_path / name).convert("L"), float) for name in ("a.png", "b.png"))
+    assert np.abs(first - second).mean() < 1
+
+
+def test_what_cannot_be_drawn_is_told_before_a_survey_is_measured(measured, tmp_path, capsys, monkeypatch):
+    from pipefish import measure
+
+    monkeypatch.setattr(measure, "measure", lambda *_, **__: pytest.fail("measured"))
+    survey = measured / "survey.mcap"
+    assert ".png" in failure(capsys, "unroll", survey, "-o", tmp_path / "a.tif")
+    assert main(["unroll", str(survey), "-o", str(tmp_path / "a.png"), "--from", "3", "--to", "1"]) == 2
+    assert "--from 3 --to 1: ends before it begins" in capsys.readouterr().err
+
+
 def test_labels_stand_around_the_picture(measured, tmp_path):
     plain, labelled = tmp_path / "a.png", tmp_path / "b.png"
     for path, more in ((plain, []), (labelled, ["--labels"])):

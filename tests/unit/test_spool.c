@@ -1,5 +1,6 @@
 #include "spool_objects.h"
 
+#include <errno.h>
 #include <pthread.h>
 #include <sched.h>
 #include <sqlite3.h>
@@ -185,8 +186,8 @@ static void test_wrong_files_are_refused_and_untouched(void)
     close_spool();
     run_sql(temporary_path("newer.db"), "PRAGMA user_version = 2");
     refused(temporary_path("newer.db"), PF_ERR_VERSION, "version 2");
-    refused(temporary_root, PF_ERR_IO, "open");
-    refused(temporary_path("no/such/folder.db"), PF_ERR_IO, "open");
+    refused(temporary_root, PF_ERR_IO, strerror(EISDIR));
+    refused(temporary_path("no/such/folder.db"), PF_ERR_IO, strerror(ENOENT));
     open_spool("empty.db", 0); /* an empty file, as a cut during creation may leave it, is a new spool */
     close_spool();
     temporary_write("empty.db", "", 0);
