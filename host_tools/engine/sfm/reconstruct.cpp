@@ -425,7 +425,10 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     anchor(segment, options);
     pf_camera central = camera;
     BundleOptions settings;
-    if (!segment.metric) { // a length, and lengths are not known
+    if (!segment.metric) { // the pupil's shift is a length, and lengths are not known
+        if (options.pupil_sigma > 0.0) {
+            straighten(map, table);
+        }
         guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
         central.pupil_e1 = settings.pupil;
     }
@@ -448,18 +451,15 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     }
     if (part.poses.size() < map.poses.size()) {
         map = std::move(part);
-        const bool was_metric = segment.metric;
         const double length = (map.poses.back().centre() - map.poses.front().centre()).norm();
         anchor(segment, options);
         settings.odometry = segment.metric ? options.odometry : nullptr;
-        if (was_metric && !segment.metric) {
-            guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
-            central.pupil_e1 = settings.pupil;
-        } else if (!segment.metric) {
-            for (double *shift : {&central.pupil_e1, &settings.pupil, &settings.pupil_sigma}) {
-                *shift /= length;
-            }
+        if (!segment.metric) {
+            central.pupil_e1 /= length;
         }
+    }
+    if (!segment.metric) { // once more, by the map as it is now: its start had been built without the pupil
+        guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
     }
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
