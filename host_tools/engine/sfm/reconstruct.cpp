@@ -422,13 +422,13 @@ void anchor(Segment &segment, const ReconstructOptions &options)
 bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
+    if (options.pupil_sigma > 0.0 || (options.odometry && camera.pupil_e1 != 0.0)) {
+        straighten(map, table);
+    }
     anchor(segment, options);
     pf_camera central = camera;
     BundleOptions settings;
     if (!segment.metric) { // the pupil's shift is a length, and lengths are not known
-        if (options.pupil_sigma > 0.0) {
-            straighten(map, table);
-        }
         guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
         central.pupil_e1 = settings.pupil;
     }
