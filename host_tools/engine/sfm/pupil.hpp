@@ -7,7 +7,7 @@ namespace pipefish::sfm
 {
 
 // A map that was built without the pupil's shift grows or shrinks by as much on each metre of the way: by a factor of
-// ten over 40 m of DN300 and 1 mm per rad^2, from where no adjustment finds back. Takes out what of the wall's distance
+// ten over 24 m of DN300 and 1 mm per rad^2, from where no adjustment finds back. Takes out what of the wall's distance
 // from the camera's way is such a growth, to start from; the distance from the first frame to the last stays.
 void straighten(Submap &map, const TrackTable &table);
 
