@@ -128,6 +128,17 @@ void straighten(Submap &map, const TrackTable &table)
     }
 }
 
+bool is_unread(const Submap &map, const TrackTable &table, const Odometry &odometry)
+{
+    double run = 0.0, longest = 0.0;
+    for (int f = map.first; f + 1 < map.end(); f++) {
+        const bool read = std::isfinite(odometry.step[static_cast<size_t>(f)]);
+        run = read ? 0.0 : run + (map.pose(f + 1).centre() - map.pose(f).centre()).norm();
+        longest = std::max(longest, run);
+    }
+    return longest > wall_radius(map, table);
+}
+
 void guess_pupil(BundleOptions &settings, const Submap &map, const TrackTable &table, const pf_camera &camera,
                  double pupil_sigma, double pipe_radius)
 {
