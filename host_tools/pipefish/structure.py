@@ -142,7 +142,7 @@ class Reconstruction:
                      camera_parameters; None where the profile has no covariance. See camera_of()
     cost             sum of half the squared residuals
     pupil            of each segment, the shift of the camera's pupil as estimated, in its unit; empty where a wheel's
-                     metres tell that
+                     metres tell that all along
     joined           (n,2) int64 tracks that are another's continuation under a name of their own, and that one
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
                      covariance (m,m); poses, points and tracks as they are then; noise, the factor
@@ -450,7 +450,8 @@ def reconstruct(
                as stated even where residuals are smaller, against the encoder and in the covariances
     shutter    of a camera whose rows are exposed one after the other; None: all at once
     pupil_sigma   metres, above 0: where no chainage tells lengths the pupil's shift is estimated in the structure's
-               unit, about the camera's, which is known to this sigma. 0: there lenses count as central
+               unit, about the camera's, which is known to this sigma, and where the chainage is not known all along, in
+               metres, unless the camera's covariance holds it. 0: without chainage lenses count as central
     diameter   of the pipe, metres, to a few per cent: what that unit is, for the pupil's shift alone; None: not known
 
     What cannot be measured is a status with a reason; what was measured is kept. Raises ArgumentError for arguments
@@ -661,7 +662,7 @@ def _result(
         camera_share=share,
         cost=sum(s["cost"] for s in segments),
         sag=[s["sag"] for s in segments],
-        pupil=[] if metric else [s["pupil"] for s in segments],
+        pupil=[] if metric and not any(s["frees_pupil"] for s in segments) else [s["pupil"] for s in segments],
         iterations=[s["iterations"] for s in segments],
         drift=[s["drift"] | {"tracks": names[s["drift"]["tracks"]]} for s in segments if s["drift"]],
         parts=[(s["random"], s["total"]) for s in segments],

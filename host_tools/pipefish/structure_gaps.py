@@ -31,7 +31,7 @@ TRIES = 24  # whole reconstructions that doubts may cost: stretches that break o
 
 def in_unit_of(camera: Camera, segment: dict[str, Any]) -> Camera:
     """The camera with its pupil's shift in the unit of one of the engine's stretches."""
-    return camera if segment["metric"] else dataclasses.replace(camera, pupil_e1=segment["pupil"])
+    return dataclasses.replace(camera, pupil_e1=segment["pupil"])
 
 
 @dataclass

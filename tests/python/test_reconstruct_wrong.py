@@ -127,7 +127,7 @@ def test_a_track_that_is_twice_in_a_frame_tells_the_same_zoom() -> None:
     t, middle = drive.tracks, np.array([drive.camera.c_u, drive.camera.c_v])
     known, on = np.unique(t.track[t.frame < frame]), t.frame == frame
     stretch = {"tracks": known, "points": drive.points[known], "first": 0, "poses": drive.poses[:frame]}
-    stretch["metric"] = True
+    stretch["pupil"] = drive.camera.pupil_e1
     track, pixels = t.track[on], middle + by * (t.pixels[on] - middle)
     once = zoom_between(drive.camera, stretch, frame, track, pixels, 0.3)
     twice = zoom_between(drive.camera, stretch, frame, np.repeat(track, 2), np.repeat(pixels, 2, axis=0), 0.3)

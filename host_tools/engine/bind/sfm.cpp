@@ -243,6 +243,7 @@ nb::dict segment_dict(sfm::Segment &segment)
     out["wheel"] = segment.report.wheel;
     out["sag"] = to_numpy<double>(segment.report.sag.data(), {3});
     out["pupil"] = segment.report.pupil;
+    out["frees_pupil"] = segment.frees_pupil;
     out["late"] = segment.late;
     out["late_sigma"] = segment.late_sigma;
     out["down"] = to_numpy<double>(segment.report.down.data(), {3});

@@ -347,7 +347,10 @@ private:
 
     // The pupil's shift is a length, and would say how long the wheel's metre is: in truth it is known too badly for
     // that, and what is wrong with the tracks would be read as a scale. So it is taken in the wheel's metres, too.
-    bool measures_pupil() const { return options_.odometry && original_.pupil_e1 != 0.0; }
+    bool measures_pupil() const
+    {
+        return options_.odometry && (original_.pupil_e1 != 0.0 || priors_.layout.pupil_at >= 0);
+    }
     double yardstick() const { return measures_pupil() ? 1.0 + state_.wheel : 1.0; }
 
     // How far the sag moves observation k.

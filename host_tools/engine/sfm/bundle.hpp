@@ -68,7 +68,8 @@ struct BundleOptions {
     double sag_sigma = 0.0;  // px^2, of the tracks' common sag all around alike (tracks.hpp), about 0, and half of
                              // it of its other parts; 0: there is none
     double late_sigma = 0.0; // of the line time as a share of the stated one, about 1; 0: it is as stated
-    // Where no odometry tells lengths: the pupil's shift e1 in the map's unit, as known beforehand; 0: as the camera's.
+    // Where odometry does not tell lengths all along: the pupil's shift e1 in the map's unit (the wheel's metres), as
+    // known beforehand; 0: as the camera's.
     double pupil = 0.0, pupil_sigma = 0.0;
     const std::vector<int> *only =
         nullptr; // places of the observations to use, as BundleReport::used; null: by the gate

@@ -418,16 +418,29 @@ void anchor(Segment &segment, const ReconstructOptions &options)
     }
 }
 
+// Whether the camera's own uncertainty holds that of its pupil's shift, in metres.
+bool knows_pupil(const ReconstructOptions &options)
+{
+    return options.camera_prior && std::count(options.camera_prior->parameter.begin(),
+                                              options.camera_prior->parameter.end(), PF_PARAM_PUPIL_E1) > 0;
+}
+
 // False: too little of it agrees for poses.
 bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const ReconstructOptions &options)
 {
     Submap &map = segment.map;
+    if (options.pupil_sigma > 0.0 || (options.odometry && camera.pupil_e1 != 0.0)) {
+        straighten(map, table);
+    }
     anchor(segment, options);
     pf_camera central = camera;
     BundleOptions settings;
-    if (!segment.metric) { // a length, and lengths are not known
+    if (!segment.metric) { // the pupil's shift is a length, and lengths are not known
         guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
         central.pupil_e1 = settings.pupil;
+    } else if (options.pupil_sigma > 0.0 && !knows_pupil(options) && is_unread(map, table, *options.odometry)) {
+        settings.pupil = camera.pupil_e1;
+        settings.pupil_sigma = options.pupil_sigma;
     }
     table.shift_pupil(central.pupil_e1);
     settings.threads = options.threads;
@@ -448,19 +461,17 @@ bool finish(Segment &segment, TrackTable &table, const pf_camera &camera, const 
     }
     if (part.poses.size() < map.poses.size()) {
         map = std::move(part);
-        const bool was_metric = segment.metric;
         const double length = (map.poses.back().centre() - map.poses.front().centre()).norm();
         anchor(segment, options);
         settings.odometry = segment.metric ? options.odometry : nullptr;
-        if (was_metric && !segment.metric) {
-            guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
-            central.pupil_e1 = settings.pupil;
-        } else if (!segment.metric) {
-            for (double *shift : {&central.pupil_e1, &settings.pupil, &settings.pupil_sigma}) {
-                *shift /= length;
-            }
+        if (!segment.metric) {
+            central.pupil_e1 /= length;
         }
     }
+    if (!segment.metric) { // once more, by the map as it is now: its start had been built without the pupil
+        guess_pupil(settings, map, table, camera, options.pupil_sigma, options.radius);
+    }
+    segment.frees_pupil = settings.pupil_sigma > 0.0;
     settings.max_iterations = 30;
     // Where a step gains less than a hundredth of a unit nothing moves by more than a seventh of its sigma.
     settings.cost_tolerance = 0.01 / std::max(observations, 1);

@@ -21,7 +21,7 @@ struct ReconstructOptions {
     bool common_errors = false;               // noise that no residual shows is in what is stated: it is the least
     double sag_sigma = 0.0;                   // as in BundleOptions
     // Metres of the pupil's shift e1 that the camera leaves open; 0: where no odometry tells lengths lenses are
-    // central.
+    // central, and where it was not read all along they are as stated.
     double pupil_sigma = 0.0;
     double radius = 0.0;              // metres, of the pipe, about; 0: unknown
     const Shutter *shutter = nullptr; // that rolls; times by frame of the table
@@ -50,6 +50,7 @@ struct Segment {
     Drift drift;                    // empty without drift_prior
     double sigma = 1.0;             // robust, of the whitened residuals before the last selection
     bool metric = false;            // scale from odometry
+    bool frees_pupil = false;       // its shift was estimated
     double late = 1.0, late_sigma = 0.0; // line time over the stated one, by the survey itself; sigma 0: not looked at
     double scale_sigma = 0.0;            // relative, of the scale from odometry before the adjustment
 };
