@@ -420,8 +420,8 @@ def _sigmas(m: Measurement) -> None:
             continue
         rest = math.sqrt(max(0.0, (factor * exact.mean_random) ** 2 - (wheel * mean) ** 2))
         stretch.d_mean_sigma = math.hypot(stretch.d_mean_sigma, rest)
-    # Else it is in what the diameter was set to, or was estimated.
-    if m.scale.unit == "metre" and not m.scale.diameter_from_prior and not m.structure.pupil:
+    # Else it is in what the diameter was set to, or was estimated. One number stands for all stretches.
+    if m.scale.unit == "metre" and not m.scale.diameter_from_prior and not m.structure.pupil_free:
         seen = m.residuals.inlier
         m.pupil_sigma = pupil_sigma(
             m.camera, m.residuals.theta[seen], m.residuals.point[seen], 0.5 * mean_diameter(m)[0]

@@ -146,6 +146,8 @@ class Report(Charts):
         pupil = self.summary["systematic"]["pupil"]
         if pupil:
             return f"± {Z95 * 100 * pupil:.2f} %, assumed: the profile does not say how well it knows it"
+        if self.document["structure"].get("pupil_e1"):
+            return "in the repeatability: the survey's own tracks tell the shift"
         known = self.document["camera"].get("pupil_known", False)
         return "in the camera's, as calibrated" if known else "not counted: no diameter was measured"
 

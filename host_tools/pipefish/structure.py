@@ -143,6 +143,7 @@ class Reconstruction:
     cost             sum of half the squared residuals
     pupil            of each segment, the shift of the camera's pupil as estimated, in its unit; empty where a wheel's
                      metres tell that all along
+    pupil_free       whether it was estimated in all of them, and not in some held at the camera's
     joined           (n,2) int64 tracks that are another's continuation under a name of their own, and that one
     drift            of each segment, with reconstruct(drift=...): camera (m,) changes of the parameters and their
                      covariance (m,m); poses, points and tracks as they are then; noise, the factor
@@ -179,6 +180,7 @@ class Reconstruction:
     cost: float
     sag: list[Floats] = field(default_factory=list)
     pupil: list[float] = field(default_factory=list)
+    pupil_free: bool = False
     own_covariance: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)), repr=False)
     iterations: list[int] = field(default_factory=list)
     joined: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64), repr=False)
@@ -663,6 +665,7 @@ def _result(
         cost=sum(s["cost"] for s in segments),
         sag=[s["sag"] for s in segments],
         pupil=[] if metric and not any(s["frees_pupil"] for s in segments) else [s["pupil"] for s in segments],
+        pupil_free=all(s["frees_pupil"] for s in segments),
         iterations=[s["iterations"] for s in segments],
         drift=[s["drift"] | {"tracks": names[s["drift"]["tracks"]]} for s in segments if s["drift"]],
         parts=[(s["random"], s["total"]) for s in segments],

@@ -193,6 +193,23 @@ def test_behind_where_an_encoder_stopped_stations_hold_the_truth_though_the_prof
     assert m.structure.pupil == [pytest.approx(SHIFT, rel=0.2)]
 
 
+def test_a_stretch_whose_pupil_is_held_counts_what_is_open_of_it_though_another_estimates_its_own(tmp_path) -> None:
+    """The encoder stops in the second of two: its shift is in its stations' sigmas, in the first nothing told it."""
+    drive = driven(14, 4.0)
+    bare = (drive.tracks.frame >= 35) & (drive.tracks.frame <= 45)
+    keep = ~bare | (np.random.default_rng(0).uniform(size=len(bare)) < 0.05)
+    path = tmp_path / "a.mcap"
+    write_survey(path, objects=objects_of(drive, keep=keep, profile=calibrated(drive.camera, None), nominal=SIZE))
+    survey = Survey.open(path)
+    chainage = survey.chainage().copy()
+    chainage[55:] = np.nan
+    survey.chainage = lambda: chainage  # type: ignore[method-assign]
+    m = measure(survey, pictures=False, threads=2)
+    assert m.structure.unit == "metre" and len(m.structure.pupil) == 2
+    assert m.structure.pupil[0] == 0.0 and m.structure.pupil[1] == pytest.approx(SHIFT, rel=0.5)
+    assert m.pupil_sigma > 0.0
+
+
 def test_without_any_length_the_taper_is_within_its_interval_too(tmp_path) -> None:
     drive = driven(61)
     m = measured(tmp_path, drive, calibrated(drive.camera, SHIFT), nominal=0.0)

@@ -86,6 +86,13 @@ def test_a_report_without_a_name_is_called_by_its_file_and_date(measured, tmp_pa
     assert report.name() == "Mill Lane"
 
 
+def test_a_pupils_shift_that_the_survey_tells_is_not_said_to_be_left_out(measured):
+    report = Report(measured / "out", [], WallPicture("", None), DensePart())
+    report.document["structure"]["pupil_e1"] = [0.001]
+    report.summary["systematic"]["pupil"] = 0.0
+    assert "in the repeatability" in dict(report.accuracy_rows())["  of which pupil shift"]
+
+
 def test_every_figure_of_the_head_has_its_interval_and_what_it_is_stands_once(measured, page):
     text = page.read_text()
     report = Report(measured / "out", [], WallPicture("", None), DensePart())
