@@ -143,7 +143,7 @@ pf_status pf_flash_file_open(pf_flash *flash, const pf_flash_file_config *config
         status = pf_fail(&failure, PF_ERR_AGAIN, "%s: another process has it open", config->path);
     flash_file *f = status == PF_OK ? malloc(sizeof *f) : NULL;
     if (status == PF_OK && f == NULL)
-        status = pf_fail(&failure, PF_ERR_SPACE, "%s: no memory", config->path);
+        status = pf_fail(&failure, PF_ERR_IO, "%s: no memory", config->path);
     if (status != PF_OK) {
         if (fd >= 0)
             (void)close(fd);

@@ -42,9 +42,10 @@ static bool has_no_room(const pf_spool_database *d)
     if (sqlite3_errcode(d->db) == SQLITE_CANTOPEN && snprintf(name, sizeof name, "%s-room", d->path) < 1100) {
         const int fd = open(name, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
         why = fd < 0 ? errno : 0;
-        if (fd >= 0)
+        if (fd >= 0) {
             (void)close(fd);
-        (void)unlink(name);
+            (void)unlink(name);
+        }
     }
     return why == ENOSPC || why == EDQUOT;
 }
