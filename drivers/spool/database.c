@@ -1,4 +1,5 @@
 #include "spool/database.h"
+#include "pipefish/drivers/clock.h"
 #include "spool/readonly.h"
 #include "spool/salvage.h"
 #include "spool/schema.h"
@@ -8,10 +9,11 @@
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
-#include <sys/statvfs.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
-#define ROOM_BYTES UINT64_C(8388608) /* twice what the log has between two checkpoints */
+#define ROOM_BYTES UINT64_C(8388608)    /* twice what the log has between two checkpoints */
+#define RETRY_NS   UINT64_C(1000000000) /* between tries of what costs reads and writes: the disk may still be full */
 
 static const char *const sql[SQL_STATEMENTS] = {
     [SQL_BEGIN] = "BEGIN IMMEDIATE",
@@ -31,28 +33,42 @@ static const char *const sql[SQL_STATEMENTS] = {
                      "WHERE e.row > ?1 AND e.importance <= ?2 ORDER BY e.importance, e.row LIMIT ?3"),
     [SQL_KEEP_ALL] = "DELETE FROM evictable",
     [SQL_FREE_PAGES] = "PRAGMA freelist_count",
+    [SQL_PAGES] = "PRAGMA page_count",
 };
 
-/* A user's own limit is none that SQLite knows; and where a file cannot be made it tells what came of looking for one,
- * so that one is tried. */
-static bool has_no_room(const pf_spool_database *d)
+/* What the log's file failed with last: a commit keeps it to itself. */
+static int reason_of_log(const pf_spool_database *d)
+{
+    sqlite3_file *log = NULL;
+    int reason = 0;
+    if (sqlite3_file_control(d->db, "main", SQLITE_FCNTL_JOURNAL_POINTER, (void *)&log) != SQLITE_OK || log == NULL ||
+        log->pMethods == NULL || log->pMethods->xFileControl(log, SQLITE_FCNTL_LAST_ERRNO, &reason) != SQLITE_OK)
+        return 0;
+    return reason;
+}
+
+/* errno of what SQLite failed in; 0: not known. Where a file cannot be made it tells what came of looking for one, so
+ * that one is tried. */
+static int reason_of(const pf_spool_database *d)
 {
     char name[1100];
-    int why = sqlite3_system_errno(d->db);
-    if (sqlite3_errcode(d->db) == SQLITE_CANTOPEN && snprintf(name, sizeof name, "%s-room", d->path) < 1100) {
-        const int fd = open(name, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
-        why = fd < 0 ? errno : 0;
-        if (fd >= 0) {
-            (void)close(fd);
-            (void)unlink(name);
-        }
-    }
-    return why == ENOSPC || why == EDQUOT;
+    const int reason = sqlite3_system_errno(d->db);
+    if (sqlite3_errcode(d->db) != SQLITE_CANTOPEN)
+        return reason != 0 ? reason : reason_of_log(d);
+    if (snprintf(name, sizeof name, "%s-room", d->path) >= 1100)
+        return reason;
+    const int fd = open(name, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
+    if (fd < 0)
+        return errno;
+    (void)close(fd);
+    (void)unlink(name);
+    return reason;
 }
 
 static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
 {
     pf_status status = PF_ERR_IO;
+    int reason = 0;
     switch (sqlite3_errcode(d->db)) {
     case SQLITE_NOTADB:
         d->is_damaged = pf_spool_was_one(d->path);
@@ -75,20 +91,26 @@ static pf_status fail_sqlite(pf_spool_database *d, const char *doing)
                        doing);
     case SQLITE_BUSY:
         return pf_fail(&d->failure, PF_ERR_IO, "%s: another program uses it", d->path);
-    case SQLITE_FULL:
     case SQLITE_TOOBIG:
+        status = PF_ERR_SPACE;
+        break;
+    case SQLITE_FULL: /* its words say all */
+        d->no_room = ENOSPC;
         status = PF_ERR_SPACE;
         break;
     case SQLITE_CANTOPEN:
     case SQLITE_IOERR:
-        status = has_no_room(d) ? PF_ERR_SPACE : PF_ERR_IO;
+        reason = reason_of(d); /* a user's own limit is none that SQLite knows */
+        if (reason == ENOSPC || reason == EDQUOT) {
+            d->no_room = reason;
+            status = PF_ERR_SPACE;
+        }
         break;
     default:
         break;
     }
-    bool has_reason = sqlite3_errcode(d->db) == SQLITE_CANTOPEN && sqlite3_system_errno(d->db) != 0;
-    return pf_fail(&d->failure, status, "%s: %s: %s%s%s", d->path, doing, sqlite3_errmsg(d->db), has_reason ? ": " : "",
-                   has_reason ? strerror(sqlite3_system_errno(d->db)) : "");
+    return pf_fail(&d->failure, status, "%s: %s: %s%s%s", d->path, doing, sqlite3_errmsg(d->db),
+                   reason != 0 ? ": " : "", reason != 0 ? strerror(reason) : "");
 }
 
 pf_status pf_spool_fail(pf_spool_database *d, const char *doing)
@@ -246,8 +268,10 @@ static pf_status open_for_writing(pf_spool_database *d)
     pf_spool_schema schema = {0};
     pf_spool_finish_setting_aside(d->path);
     if (sqlite3_open_v2(d->path, &d->db, SQLITE_OPEN_READWRITE | SQLITE_OPEN_CREATE | SQLITE_OPEN_NOMUTEX, NULL) !=
-        SQLITE_OK)
+        SQLITE_OK) {
+        d->no_room = d->db == NULL ? ENOMEM : 0;
         return d->db != NULL ? fail_sqlite(d, "opening") : pf_fail(&d->failure, PF_ERR_SPACE, "%s: no memory", d->path);
+    }
     (void)sqlite3_busy_timeout(d->db, 2000); /* the daemon before us may still be closing */
     /* Exclusive: a second daemon on the same spool is refused, and WAL needs no shared memory. */
     pf_status status = run_text(d, "PRAGMA locking_mode = EXCLUSIVE");
@@ -328,6 +352,8 @@ static pf_status open_file(pf_spool_database *d)
 {
     d->is_read_only = pf_spool_is_read_only(d->path);
     d->is_full = false;
+    d->no_room = 0;
+    d->retry_ns = 0;
     d->stats.objects = d->stats.bytes = 0;
     const uint32_t version = pf_spool_version_of(d->path);
     if (version > PF_SPOOL_VERSION) /* whatever else is in it, damaged or not */
@@ -341,6 +367,8 @@ static pf_status open_file(pf_spool_database *d)
     }
     if (status == PF_OK)
         status = measure(d);
+    if (d->is_full)
+        d->retry_ns = pf_now() + RETRY_NS;
     return status;
 }
 
@@ -373,12 +401,15 @@ static uint64_t room_on(const struct statvfs *disk)
     return (uint64_t)disk->f_bavail * disk->f_frsize;
 }
 
-/* Whether what kept it from being written may have gone. */
+/* Whether what kept it from being written may have gone. Of a user's own limit the disk's room says nothing: it is
+ * tried, which reads the whole spool again. */
 static bool may_be_written(const pf_spool_database *d)
 {
     struct statvfs disk;
-    return !pf_spool_is_read_only(d->path) &&
-           (!d->is_full || statvfs(d->path, &disk) != 0 || room_on(&disk) >= ROOM_BYTES);
+    if (pf_spool_is_read_only(d->path))
+        return false;
+    return !d->is_full ||
+           (pf_now() >= d->retry_ns && (!pf_spool_look_at_disk(d->path, &disk) || room_on(&disk) >= ROOM_BYTES));
 }
 
 bool pf_spool_enter(pf_spool_database *d)
@@ -400,33 +431,89 @@ void pf_spool_leave(pf_spool_database *d)
     pthread_mutex_unlock(&d->mutex);
 }
 
+static bool count(pf_spool_database *d, pf_spool_statement which, uint64_t *pages)
+{
+    sqlite3_stmt *q = pf_spool_prepare(d, which);
+    const bool is_known = sqlite3_step(q) == SQLITE_ROW;
+    *pages = is_known ? (uint64_t)sqlite3_column_int64(q, 0) : 0;
+    sqlite3_reset(q);
+    return is_known;
+}
+
+/* Whether the file has no place yet for all that the log has: it must grow before the log can begin anew. */
+static bool must_grow(pf_spool_database *d)
+{
+    struct stat file;
+    uint64_t pages;
+    return count(d, SQL_PAGES, &pages) && stat(d->path, &file) == 0 && (uint64_t)file.st_size < pages * PF_SPOOL_PAGE;
+}
+
+/* By how many pages an object of n bytes, and what its row changes in the trees, may make the file larger. False: it
+ * cannot be told. */
+static bool measure_growth(pf_spool_database *d, size_t n, uint64_t *pages)
+{
+    uint64_t unused;
+    const bool is_known = count(d, SQL_FREE_PAGES, &unused);
+    const uint64_t needed = pf_spool_pages(n) + 8;
+    *pages = needed > unused ? needed - unused : 0;
+    return is_known;
+}
+
 /* Removing takes room too: in the log, and, before the log can begin anew, in the file for what the log still has. A
  * spool that had filled the disk to the last byte could never get rid of anything again, so some is left. What comes
  * instead of others takes a page more now and then. */
-pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
+static bool has_room(const pf_spool_database *d, uint64_t pages, bool is_exchange, uint64_t *left)
 {
     struct statvfs disk;
-    sqlite3_stmt *q = pf_spool_prepare(d, SQL_FREE_PAGES);
-    if (sqlite3_step(q) != SQLITE_ROW) {
-        sqlite3_reset(q);
+    if (pages == 0 || !pf_spool_look_at_disk(d->path, &disk))
+        return true;
+    *left = room_on(&disk);
+    return *left >= (is_exchange ? ROOM_BYTES / 2 : ROOM_BYTES) + 2 * pages * PF_SPOOL_PAGE;
+}
+
+pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
+{
+    uint64_t growth, left = 0;
+    if (!measure_growth(d, n, &growth))
         return pf_spool_fail(d, "storing");
-    }
-    const uint64_t pages = n / (PF_SPOOL_PAGE - 4) + 8, unused = (uint64_t)sqlite3_column_int64(q, 0);
-    sqlite3_reset(q);
-    if (pages <= unused || statvfs(d->path, &disk) != 0)
+    if (has_room(d, growth, is_exchange, &left))
         return PF_OK;
-    const uint64_t growth = (pages - unused) * PF_SPOOL_PAGE, left = room_on(&disk);
-    if (left >= (is_exchange ? ROOM_BYTES / 2 : ROOM_BYTES) + 2 * growth)
-        return PF_OK;
+    d->no_room = must_grow(d) ? ENOSPC : 0; /* while there is room */
     d->stats.errors++;
     return pf_fail(&d->failure, PF_ERR_SPACE, "%s: the disk is full: the last %" PRIu64 " bytes are for removing",
                    d->path, left);
 }
 
+pf_status pf_spool_pages_to_free(pf_spool_database *d, size_t n, uint64_t *pages)
+{
+    uint64_t left = 0;
+    if (!measure_growth(d, n, pages))
+        return pf_spool_fail(d, "making room");
+    if (has_room(d, *pages, true, &left))
+        *pages = 0;
+    return PF_OK;
+}
+
+bool pf_spool_reuse_log(pf_spool_database *d)
+{
+    int frames = 0, done = 0;
+    if (d->is_read_only || d->no_room == 0 || pf_now() < d->retry_ns)
+        return false;
+    const int code = sqlite3_wal_checkpoint_v2(d->db, NULL, SQLITE_CHECKPOINT_PASSIVE, &frames, &done);
+    const bool is_reusable = code == SQLITE_OK && frames > 0 && done == frames;
+    if (!is_reusable)
+        d->retry_ns = pf_now() + RETRY_NS;
+    return is_reusable;
+}
+
 pf_status pf_spool_fail_read_only(pf_spool_database *d)
 {
-    d->stats.errors++;
+    struct statvfs disk;
     const bool is_forbidden = pf_spool_is_read_only(d->path);
-    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: cannot be written: %s", d->path,
-                   strerror(is_forbidden ? errno : ENOSPC));
+    const int reason = is_forbidden ? errno : d->no_room;
+    const bool has_no_files =
+        reason == ENOSPC && pf_spool_look_at_disk(d->path, &disk) && disk.f_files > 0 && disk.f_favail == 0;
+    d->stats.errors++;
+    return pf_fail(&d->failure, PF_ERR_SPACE, "%s: cannot be written: %s%s", d->path, strerror(reason),
+                   has_no_files ? " for one more file" : "");
 }

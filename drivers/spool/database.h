@@ -5,6 +5,7 @@
 
 #include "common/failure.h"
 #include "pipefish/drivers/spool.h"
+#include "spool/schema.h"
 
 #include <pthread.h>
 #include <sqlite3.h>
@@ -26,6 +27,7 @@ typedef enum pf_spool_statement {
     SQL_VICTIMS,
     SQL_KEEP_ALL,
     SQL_FREE_PAGES,
+    SQL_PAGES,
     SQL_STATEMENTS,
 } pf_spool_statement;
 
@@ -39,6 +41,8 @@ typedef struct pf_spool_database {
     bool is_damaged;   /* SQLite has found the file to be, and it is to be replaced */
     bool is_read_only; /* it cannot be written: the medium does not allow it, */
     bool is_full;      /* or had no room for what an opening writes */
+    int no_room;       /* errno of the last that found no room where it writes: ENOSPC, EDQUOT, ENOMEM; 0: none did */
+    uint64_t retry_ns; /* not before: opening a full one for writing; pf_spool_reuse_log */
     int64_t highest;   /* row given or shown to anybody */
     pf_spool_stats stats;
     pf_failure failure, healing;
@@ -70,9 +74,23 @@ bool pf_spool_run(pf_spool_database *d, pf_spool_statement which);
 /* The call that failed is counted and told in SQLite's words. PF_ERR_SPACE, else PF_ERR_IO. */
 pf_status pf_spool_fail(pf_spool_database *d, const char *doing);
 
+/* Pages that n bytes of an object fill for sure, beside its row's: each begins with the next one's number. */
+static inline uint64_t pf_spool_pages(size_t n)
+{
+    return n / (PF_SPOOL_PAGE - 4);
+}
+
 /* Whether an object of n bytes may make the file larger, if it has to: inside the open transaction, after what has gone
  * for it (is_exchange). PF_OK; PF_ERR_SPACE, counted and told; PF_ERR_IO. */
 pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange);
+
+/* How many pages of others have to go lest an object of n bytes make the file larger on a disk where it must not; 0: it
+ * may, or does not. PF_OK; PF_ERR_IO. */
+pf_status pf_spool_pages_to_free(pf_spool_database *d, size_t n, uint64_t *pages);
+
+/* After PF_ERR_SPACE, outside of transactions: true if SQLite had no room, or soon has none, and may have now, for what
+ * is in the log has gone into the file, so that the log begins anew where it lies. */
+bool pf_spool_reuse_log(pf_spool_database *d);
 
 /* As pf_spool_fail where it is opened for reading only: later it may be written. PF_ERR_SPACE. */
 pf_status pf_spool_fail_read_only(pf_spool_database *d);

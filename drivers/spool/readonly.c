@@ -13,14 +13,26 @@ static bool is_forbidden(const char *path)
     return access(path, W_OK) != 0 && (errno == EROFS || errno == EACCES || errno == EPERM);
 }
 
+/* False: too long a name. */
+static bool name_folder(const char *path, char folder[PATH_MAX_HERE])
+{
+    const char *slash = strrchr(path, '/');
+    int n = slash == NULL   ? snprintf(folder, PATH_MAX_HERE, ".")
+            : slash == path ? snprintf(folder, PATH_MAX_HERE, "/")
+                            : snprintf(folder, PATH_MAX_HERE, "%.*s", (int)(slash - path), path);
+    return n < PATH_MAX_HERE;
+}
+
 bool pf_spool_is_read_only(const char *path)
 {
     char folder[PATH_MAX_HERE];
-    const char *slash = strrchr(path, '/');
-    int n = slash == NULL   ? snprintf(folder, sizeof folder, ".")
-            : slash == path ? snprintf(folder, sizeof folder, "/")
-                            : snprintf(folder, sizeof folder, "%.*s", (int)(slash - path), path);
-    return is_forbidden(path) || (n < (int)sizeof folder && is_forbidden(folder));
+    return is_forbidden(path) || (name_folder(path, folder) && is_forbidden(folder));
+}
+
+bool pf_spool_look_at_disk(const char *path, struct statvfs *disk)
+{
+    char folder[PATH_MAX_HERE];
+    return statvfs(path, disk) == 0 || (name_folder(path, folder) && statvfs(folder, disk) == 0);
 }
 
 int pf_spool_open_read_only(const char *path, sqlite3 **db)

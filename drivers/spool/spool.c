@@ -100,6 +100,7 @@ static pf_status try_to_store(pf_spool_database *d, const object *o, const char 
     uint32_t gone = 0;
     if (d->is_read_only)
         return pf_spool_fail_read_only(d);
+    d->no_room = 0;
     pf_status status = pf_spool_run(d, SQL_BEGIN) ? PF_OK : pf_spool_fail(d, "storing");
     if (status == PF_OK && o != NULL)
         status = evict(d, o, &freed, &gone);
@@ -130,7 +131,8 @@ static pf_status store(pf_spool_database *d, const object *o, const char *key, c
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
     pf_status status = try_to_store(d, o, key, value, value_n);
-    if (d->is_damaged && pf_spool_heal(d) == PF_OK) /* what is to be stored comes but once */
+    if (d->is_damaged ? pf_spool_heal(d) == PF_OK /* what is to be stored comes but once */
+                      : status == PF_ERR_SPACE && pf_spool_reuse_log(d))
         status = try_to_store(d, o, key, value, value_n);
     pf_spool_leave(d);
     return status;
@@ -167,28 +169,29 @@ static pf_status spool_victims(void *self, uint64_t after, uint32_t importance, 
                                pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX], uint32_t *count)
 {
     pf_spool_database *d = self;
-    pf_status status = PF_OK;
-    uint64_t freed = 0;
+    uint64_t freed = 0, pages_freed = 0, pages = 0;
     int code = SQLITE_ROW;
     *count = 0;
     if (!pf_spool_enter(d))
         return PF_ERR_IO;
+    pf_status status = pf_spool_pages_to_free(d, n, &pages);
     sqlite3_stmt *q = pf_spool_prepare(d, SQL_VICTIMS);
     (void)sqlite3_bind_int64(q, 1, (int64_t)after);
     (void)sqlite3_bind_int64(q, 2, importance);
     (void)sqlite3_bind_int64(q, 3, PF_SPOOL_VICTIMS_MAX);
-    while (freed < n && (code = sqlite3_step(q)) == SQLITE_ROW) {
+    while (status == PF_OK && (freed < n || pages_freed < pages) && (code = sqlite3_step(q)) == SQLITE_ROW) {
         pf_spool_victim *v = &victims[(*count)++];
         *v = (pf_spool_victim){.row = (uint64_t)sqlite3_column_int64(q, 0),
                                .number = (uint32_t)sqlite3_column_int64(q, 1),
                                .size = (uint32_t)sqlite3_column_int64(q, 2)};
         freed += v->size;
+        pages_freed += pf_spool_pages(v->size);
     }
     if (code != SQLITE_ROW && code != SQLITE_DONE)
         status = pf_spool_fail(d, "making room");
-    else if (d->is_read_only)
+    else if (status == PF_OK && d->is_read_only)
         status = pf_spool_fail_read_only(d);
-    else if (freed < n)
+    else if (status == PF_OK && code == SQLITE_DONE)
         status = pf_fail(&d->failure, PF_ERR_SPACE, "%s: full, and nothing in it is less important", d->path);
     sqlite3_reset(q);
     pf_spool_leave(d);
@@ -282,17 +285,11 @@ static pf_status spool_read(void *self, const pf_spool_item *item, void *bytes, 
     return status;
 }
 
-static pf_status spool_remove(void *self, uint64_t row)
+static pf_status try_to_remove(pf_spool_database *d, uint64_t row)
 {
-    pf_spool_database *d = self;
-    pf_status status = PF_OK;
-    if (!pf_spool_enter(d))
-        return PF_ERR_IO;
-    if (d->is_read_only) {
-        (void)pf_spool_fail_read_only(d);
-        pf_spool_leave(d);
-        return PF_ERR_IO;
-    }
+    if (d->is_read_only)
+        return pf_spool_fail_read_only(d);
+    d->no_room = 0;
     sqlite3_stmt *q = pf_spool_prepare(d, SQL_SIZE);
     (void)sqlite3_bind_int64(q, 1, (int64_t)row);
     int code = sqlite3_step(q);
@@ -300,15 +297,26 @@ static pf_status spool_remove(void *self, uint64_t row)
     sqlite3_reset(q);
     if (code == SQLITE_ROW) /* not before: it would wipe out the error */
         (void)sqlite3_bind_int64(pf_spool_prepare(d, SQL_REMOVE), 1, (int64_t)row);
-    if (code != SQLITE_DONE && (code != SQLITE_ROW || !pf_spool_run(d, SQL_REMOVE))) {
-        status = pf_spool_fail(d, "removing");
-    } else if (code == SQLITE_ROW) {
+    if (code != SQLITE_DONE && (code != SQLITE_ROW || !pf_spool_run(d, SQL_REMOVE)))
+        return pf_spool_fail(d, "removing");
+    if (code == SQLITE_ROW) {
         d->stats.objects--;
         d->stats.bytes -= size;
         d->stats.acknowledged++;
     }
+    return PF_OK;
+}
+
+static pf_status spool_remove(void *self, uint64_t row)
+{
+    pf_spool_database *d = self;
+    if (!pf_spool_enter(d))
+        return PF_ERR_IO;
+    pf_status status = try_to_remove(d, row);
+    if (status == PF_ERR_SPACE && pf_spool_reuse_log(d))
+        status = try_to_remove(d, row);
     pf_spool_leave(d);
-    return status;
+    return status == PF_OK ? PF_OK : PF_ERR_IO;
 }
 
 static pf_status spool_get(void *self, const char *key, void *bytes, size_t capacity, size_t *n)

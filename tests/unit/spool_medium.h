@@ -9,13 +9,15 @@
 #include <sqlite3.h>
 
 /* SQLite's own way to put other system calls in place. */
-static int refuse_with;  /* errno of every write; 0 = none fails */
-static uint64_t allowed; /* writes before that */
+static int refuse_with;         /* errno of every write; 0 = none fails */
+static uint64_t allowed;        /* writes before that */
+static uint64_t refused_writes; /* writes so far */
 
 static inline bool refuses(void)
 {
     if (refuse_with == 0 || (allowed > 0 && allowed--))
         return false;
+    refused_writes++;
     errno = refuse_with;
     return true;
 }

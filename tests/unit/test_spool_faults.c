@@ -4,6 +4,8 @@
 #include <fcntl.h>
 #include <signal.h>
 #include <sys/resource.h>
+#include <sys/stat.h>
+#include <sys/statvfs.h>
 #include <sys/syscall.h>
 #include <sys/wait.h>
 #include <time.h>
@@ -22,6 +24,28 @@ int fdatasync(int fd)
 {
     syncs++;
     return (int)syscall(SYS_fdatasync, fd);
+}
+
+/* ---- the clock, which a test can put forward ---- */
+
+static long seconds_ahead;
+
+int clock_gettime(clockid_t which, struct timespec *t)
+{
+    const int code = (int)syscall(SYS_clock_gettime, which, t);
+    t->tv_sec += seconds_ahead;
+    return code;
+}
+
+/* ---- the disk, which is as full as it says when it refuses ---- */
+
+static fsblkcnt_t room_left = 1 << 20; /* while it does not, in blocks */
+
+int statvfs(const char *path, struct statvfs *disk)
+{
+    (void)path;
+    *disk = (struct statvfs){.f_bsize = 4096, .f_frsize = 4096, .f_bavail = refuse_with == ENOSPC ? 0 : room_left};
+    return 0;
 }
 
 /* Proves: each store and each removal is told to the medium before it is reported; a kill would not show that. */
@@ -416,9 +440,90 @@ static void test_a_medium_that_refuses_writes_loses_nothing(void)
         hook(((const char *[]){"write", "pwrite", "pwrite64", "fallocate", "ftruncate"})[i], NULL);
 }
 
+static ssize_t pwrite_in_place(int fd, const void *bytes, size_t n, off_t at)
+{
+    struct stat s;
+    if (refuse_with != 0 && fstat(fd, &s) == 0 && at + (off_t)n > s.st_size) {
+        errno = refuse_with;
+        return -1;
+    }
+    return pwrite(fd, bytes, n, at);
+}
+
+static void remove_in_order(uint64_t id, uint64_t last)
+{
+    pf_spool_item item;
+    for (; id <= last; id++) {
+        TEST_ASSERT_EQUAL_INT(PF_OK, spool.ops->next(spool.self, 0, &item));
+        TEST_ASSERT_EQUAL_UINT64(id, check_item(&item));
+        const pf_status status = spool.ops->remove(spool.self, item.row);
+        TEST_ASSERT_EQUAL_INT_MESSAGE(PF_OK, status, spool.ops->error(spool.self));
+    }
+}
+
+/* Proves: on a disk that others have filled to the last byte, or up to a user's own limit, all that is in the spool can
+ * be removed, and what needs no more room than that left can be stored: the log, which had a few pages only, begins
+ * anew. What does not fit is refused with the reason, and costs nothing that is there. */
+static void test_a_disk_filled_by_others_lets_go_of_everything(void)
+{
+    enum { OBJECTS = 40 };
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_in_place);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_in_place);
+    for (int round = 0; round < 2; round++) {
+        forget("others.db");
+        open_spool("others.db", 0);
+        for (uint64_t id = 1; id <= OBJECTS; id++)
+            TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+        close_spool();
+        open_spool("others.db", 0);
+        remove_in_order(1, 4); /* the log's length */
+        refuse_with = round == 0 ? ENOSPC : EDQUOT;
+        remove_in_order(5, OBJECTS);
+        uint64_t id = OBJECTS + 1;
+        pf_status status = PF_OK;
+        for (; id < 1000 && (status = put(id)) == PF_OK; id++) {
+        }
+        TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, status);
+        const char *why = round == 0 ? "disk is full" : strerror(EDQUOT);
+        TEST_ASSERT_NOT_NULL_MESSAGE(strstr(spool.ops->error(spool.self), why), spool.ops->error(spool.self));
+        if (round == 1) /* which the disk's room says nothing of: the log may have taken what the file cannot */
+            refuse_with = 0;
+        remove_in_order(OBJECTS + 1, id - 1);
+        TEST_ASSERT_EQUAL_UINT64(0, stats().objects);
+        TEST_ASSERT_EQUAL_INT(PF_OK, put_small(1));
+        refuse_with = 0;
+        close_spool();
+        open_spool("others.db", 0);
+        TEST_ASSERT_EQUAL_UINT64(1, stats().objects);
+    }
+    hook("pwrite", NULL);
+    hook("pwrite64", NULL);
+}
+
+/* Proves: once a disk has become too full for more, the file takes what so far only the log has, while there is room
+ * for that: when the rest of the disk is filled all the same, everything can still be removed. */
+static void test_a_disk_that_becomes_full_slowly_lets_go_of_everything(void)
+{
+    hook("pwrite", (sqlite3_syscall_ptr)pwrite_in_place);
+    hook("pwrite64", (sqlite3_syscall_ptr)pwrite_in_place);
+    open_spool("slowly.db", 0);
+    for (uint64_t id = 1; id <= 20; id++)
+        TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    room_left = 512;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(21));
+    refuse_with = ENOSPC;
+    remove_in_order(1, 20);
+    TEST_ASSERT_EQUAL_UINT64(0, stats().objects);
+    refuse_with = 0;
+    room_left = 1 << 20;
+    hook("pwrite", NULL);
+    hook("pwrite64", NULL);
+}
+
 /* Proves: on a disk too full for an empty spool one is opened all the same: it says that it is full, and what is put
  * once there is room is stored for good; a damaged one found there waits, and is read then. A user's own limit is such
- * a disk too. */
+ * a disk too, and named. What the disk's room does not tell is tried once a second, not at each call: that reads all of
+ * it. */
 static void test_a_spool_on_a_disk_that_is_full_opens_and_begins_once_there_is_room(void)
 {
     static uint8_t file[1 << 20];
@@ -440,9 +545,18 @@ static void test_a_spool_on_a_disk_that_is_full_opens_and_begins_once_there_is_r
         open_spool("begun.db", 0);
         TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, 0, &item));
         const uint64_t errors = stats().errors;
+        refused_writes = 0;
         TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(2));
+        TEST_ASSERT_EQUAL_INT(PF_ERR_END, spool.ops->next(spool.self, 0, &item));
+        TEST_ASSERT_EQUAL_UINT64_MESSAGE(0, refused_writes, "tried again at once");
         TEST_ASSERT_TRUE(stats().errors > errors);
-        TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "cannot be written: No space left"));
+        TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), "cannot be written: "));
+        TEST_ASSERT_NOT_NULL(strstr(spool.ops->error(spool.self), strerror(refuse_with)));
+        seconds_ahead++;
+        TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(2));
+        TEST_ASSERT_TRUE_MESSAGE((refused_writes > 0) == (refuse_with == EDQUOT),
+                                 "the disk itself says when it is full");
+        seconds_ahead++;
         refuse_with = 0;
         TEST_ASSERT_EQUAL_INT(PF_OK, put(2));
         close_spool();
@@ -472,6 +586,8 @@ int main(int argc, char **argv)
     RUN_TEST(test_full_medium);
     RUN_TEST(test_killed_at_every_write_nothing_acknowledged_is_lost);
     RUN_TEST(test_a_medium_that_refuses_writes_loses_nothing);
+    RUN_TEST(test_a_disk_filled_by_others_lets_go_of_everything);
+    RUN_TEST(test_a_disk_that_becomes_full_slowly_lets_go_of_everything);
     RUN_TEST(test_a_spool_on_a_disk_that_is_full_opens_and_begins_once_there_is_room);
     temporary_remove();
     return UNITY_END();

@@ -59,9 +59,9 @@ typedef struct pf_spool_ops {
     pf_status (*put_and_set)(void *self, uint32_t kind, const uint8_t name[32], const void *bytes, size_t n,
                              const char *key, const void *value, size_t value_n);
 
-    /* What would have to go so that at least n bytes become free: of the objects with a rank after row `after`, none
-     * more important than `importance`. PF_OK; PF_ERR_SPACE (all of them, or as many as fit into victims, are not
-     * enough); PF_ERR_IO. */
+    /* What would have to go so that at least n bytes become free, and on a disk that is full also room for n bytes in
+     * the file as it is: of the objects with a rank after row `after`, none more important than `importance`. PF_OK;
+     * PF_ERR_SPACE (all of them, or as many as fit into victims, are not enough); PF_ERR_IO. */
     pf_status (*victims)(void *self, uint64_t after, uint32_t importance, size_t n,
                          pf_spool_victim victims[PF_SPOOL_VICTIMS_MAX], uint32_t *count);
 
@@ -91,8 +91,8 @@ typedef struct pf_spool_config {
  * new one begun with every object that can still be read: under its row, but never to make room for others. What a
  * kill, or a new file that is full, keeps from that is done at the next opening. Anybody else's file is refused. A
  * medium that is read-only, or too full for an empty spool, gives what is there, takes and removes nothing, and is
- * asked at each call whether it still is. All calls may come from any thread. PF_OK, PF_ERR_IO, PF_ERR_FORMAT (not a
- * spool), PF_ERR_VERSION.
+ * asked at each call, a full one once a second, whether it still is. All calls may come from any thread. PF_OK,
+ * PF_ERR_IO, PF_ERR_FORMAT (not a spool), PF_ERR_VERSION.
  */
 pf_status pf_spool_open(pf_spool *spool, const pf_spool_config *config, char *error, size_t n);
 
