@@ -170,7 +170,7 @@ bool pf_keeper_open(pf_daemon *d, char *error, size_t n)
     return true;
 }
 
-bool pf_keeper_check(pf_daemon *d, char *error, size_t n)
+bool pf_keeper_check(pf_daemon *d, uint32_t width, uint32_t height, char *error, size_t n)
 {
     pf_keeper *k = calloc(1, sizeof *k);
     bool is_trial = false, is_good = true;
@@ -178,6 +178,7 @@ bool pf_keeper_check(pf_daemon *d, char *error, size_t n)
     if (k == NULL)
         return false;
     k->daemon = d;
+    pf_keeper_set_size(k, width, height);
     pthread_mutex_init(&k->mutex, NULL);
     if (access(d->config.camera.profile_store, F_OK) == 0) { /* else the first start makes it */
         is_good = open_store(k, true, error, n) == PF_OK;

@@ -21,8 +21,9 @@ typedef struct pf_keeper_job {
 /* Opens camera.profile_store, makes it if it is not there, counts a start, and loads the profile into the daemon. A
  * profile that cannot be used is no reason to fail: the host could then not send another one. False: error[n]. */
 bool pf_keeper_open(pf_daemon *daemon, char *error, size_t n);
-/* Only looks: for --check-config. False: error[n], also for a stored profile that cannot be used. */
-bool pf_keeper_check(pf_daemon *daemon, char *error, size_t n);
+/* Only looks: for --check-config. width, height: of the camera's frames; 0 = not known. False: error[n], also for a
+ * stored profile that cannot be used. */
+bool pf_keeper_check(pf_daemon *daemon, uint32_t width, uint32_t height, char *error, size_t n);
 void pf_keeper_close(pf_keeper *keeper);
 
 /* The camera's frame size is known: a profile of another one is not used. */

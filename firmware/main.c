@@ -43,7 +43,7 @@ static const char usage[] =
     "                           when three starts in a row fail\n"
     "  --pair \"ROLE KEY NAME\"   let a host in over the network (viewer, operator, calibrator; revoked\n"
     "                           = never again), print this device's key; see `pipefish pair`\n"
-    "  --check-config           check settings, profile, recording; start nothing\n"
+    "  --check-config           check settings, profile, recording, keys; start nothing\n"
     "  --help-config            print every setting with its meaning: an example file\n"
     "  --version                print the version\n"
     "\n"
@@ -148,7 +148,7 @@ static bool load_profile(pf_daemon *d, bool is_check, char *error, size_t n)
     FILE *in;
     bool is_read, is_good;
     if (d->config.camera.profile_store[0] != '\0')
-        return is_check ? pf_keeper_check(d, error, n) : pf_keeper_open(d, error, n);
+        return is_check || pf_keeper_open(d, error, n); /* checked once the size of the frames is known */
     if (path[0] == '\0')
         return true;
     in = fopen(path, "rb");
@@ -218,6 +218,15 @@ static pf_status open_replay(pf_daemon *d, char *error, size_t n)
     return pf_replay_open(&d->camera, &replay, error, n);
 }
 
+static bool fits_camera(const pf_daemon *d, uint32_t width, uint32_t height, char *error, size_t n)
+{
+    if (!d->has_profile || (d->profile.camera.width == width && d->profile.camera.height == height))
+        return true;
+    (void)snprintf(error, n, "%s: the profile is for %u x %u, the camera gives %u x %u", d->config.camera.profile,
+                   d->profile.camera.width, d->profile.camera.height, width, height);
+    return false;
+}
+
 static bool open_camera(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
@@ -229,13 +238,10 @@ static bool open_camera(pf_daemon *d, char *error, size_t n)
     pf_utf8_clean(d->source);
     if (d->keeper != NULL)
         pf_keeper_set_size(d->keeper, info->width, info->height);
-    if (d->has_profile && (d->profile.camera.width != info->width || d->profile.camera.height != info->height)) {
-        (void)snprintf(error, n, "%s: the profile is for %u x %u, the camera gives %u x %u", c->camera.profile,
-                       d->profile.camera.width, d->profile.camera.height, info->width, info->height);
-        d->camera.ops->close(d->camera.self);
-        return false;
-    }
-    return true;
+    if (fits_camera(d, info->width, info->height, error, n))
+        return true;
+    d->camera.ops->close(d->camera.self);
+    return false;
 }
 
 static bool open_gpio(pf_daemon *d, char *error, size_t n)
@@ -327,15 +333,25 @@ static bool open_transport(pf_daemon *d, char *error, size_t n)
 static bool check_rest(pf_daemon *d, char *error, size_t n)
 {
     const pf_config *c = &d->config;
+    uint32_t width = c->camera.width, height = c->camera.height;
     if (c->link.transport == PF_TRANSPORT_TCP &&
         pf_tcp_check(&(pf_tcp_config){.address = c->link.address}, error, n) != PF_OK)
         return false;
-    if (c->camera.driver != PF_CAMERA_REPLAY)
-        return true;
-    if (!open_camera(d, error, n))
+    if (c->link.transport == PF_TRANSPORT_TLS &&
+        pf_tls_check(&(pf_tls_config){.address = c->link.address}, error, n) != PF_OK)
         return false;
-    d->camera.ops->close(d->camera.self);
-    return true;
+    if (!pf_pairing_check(d, error, n))
+        return false;
+    if (c->camera.driver == PF_CAMERA_REPLAY) {
+        if (!open_camera(d, error, n))
+            return false;
+        width = d->camera.ops->info(d->camera.self)->width;
+        height = d->camera.ops->info(d->camera.self)->height;
+        d->camera.ops->close(d->camera.self);
+    } else if (width != 0 && !fits_camera(d, width, height, error, n)) {
+        return false;
+    }
+    return c->camera.profile_store[0] == '\0' || pf_keeper_check(d, width, height, error, n);
 }
 
 static bool open_random(pf_daemon *d, char *error, size_t n)

@@ -8,11 +8,29 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "log.h"
+
 bool pf_pairing_open(pf_daemon *d, char *error, size_t n)
 {
     const char *folder = d->config.link.trust;
     char why[768] = "";
     if (folder[0] == '\0' || pf_trust_open(&d->trust, folder, why, sizeof why) == PF_OK)
+        return true;
+    (void)snprintf(error, n, "link.trust: %s", why);
+    return false;
+}
+
+bool pf_pairing_check(const pf_daemon *d, char *error, size_t n)
+{
+    const char *folder = d->config.link.trust;
+    char why[768] = "";
+    if (folder[0] == '\0')
+        return true;
+    if (access(folder, R_OK | X_OK) != 0 && errno == EACCES) {
+        pf_log(PF_LOG_WARNING, "link.trust: %s: not for this user to look at: it is not checked", folder);
+        return true;
+    }
+    if (pf_trust_check(folder, why, sizeof why) == PF_OK)
         return true;
     (void)snprintf(error, n, "link.trust: %s", why);
     return false;

@@ -251,7 +251,7 @@ pf_status pf_y4m_open_fd(pf_y4m *y4m, int fd, const char *name, pf_failure *fail
 
 pf_status pf_y4m_open(pf_y4m *y4m, const char *name, pf_failure *failure)
 {
-    int fd = open(name, O_RDONLY | O_CLOEXEC);
+    int fd = open(name, O_RDONLY | O_CLOEXEC | O_NONBLOCK); /* else a pipe waits for its writer */
     if (fd < 0)
         return pf_fail(failure, PF_ERR_IO, "%s: %s", name, strerror(errno));
     return pf_y4m_open_fd(y4m, fd, name, failure);

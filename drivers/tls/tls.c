@@ -425,6 +425,13 @@ static const pf_transport_ops tls_ops = {
     .close = tls_close,
 };
 
+pf_status pf_tls_check(const pf_tls_config *config, char *error, size_t n)
+{
+    pf_failure failure = {""};
+    pf_address a;
+    return pf_failure_copy(&failure, pf_address_parse(&a, config->address, config->port, "tls", &failure), error, n);
+}
+
 pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, char *error, size_t n)
 {
     pf_failure failure = {""};

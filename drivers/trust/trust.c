@@ -6,6 +6,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <libgen.h>
 #include <openssl/err.h>
 #include <openssl/pem.h>
 #include <openssl/rand.h>
@@ -283,20 +284,45 @@ const char *pf_trust_error(const pf_trust *trust)
     return trust->failure.text;
 }
 
-static pf_status open_folder(pf_trust *t)
+/* PF_ERR_END: there is none. */
+static pf_status look_at_folder(pf_trust *t)
 {
     struct stat s;
-    if (mkdir(t->folder, 0700) != 0 && errno != EEXIST)
-        return fail_errno(t, t->folder, "making the folder");
     if (stat(t->folder, &s) != 0)
-        return fail_errno(t, t->folder, "opening");
+        return errno == ENOENT ? PF_ERR_END : fail_errno(t, t->folder, "opening");
     if ((s.st_mode & S_IWOTH) != 0)
         return pf_fail(&t->failure, PF_ERR_UNSUPPORTED, "%s: anybody may write in this folder of keys: chmod o-w",
                        t->folder);
     return PF_OK;
 }
 
-pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_t n)
+static pf_status open_folder(pf_trust *t)
+{
+    if (mkdir(t->folder, 0700) != 0 && errno != EEXIST)
+        return fail_errno(t, t->folder, "making the folder");
+    pf_status status = look_at_folder(t);
+    if (status == PF_OK)
+        status = open_identity(t);
+    if (status == PF_OK && !pf_certificate_key(t->certificate, t->key))
+        status = fail_crypto(t, "hashing the device's key");
+    return status == PF_OK ? refresh(t) : status;
+}
+
+static pf_status check_folder(pf_trust *t)
+{
+    char around[PATH_BYTES];
+    pf_status status = look_at_folder(t);
+    if (status == PF_ERR_END) { /* the first start makes it */
+        (void)snprintf(around, sizeof around, "%s", t->folder);
+        return access(dirname(around), F_OK) == 0 ? PF_OK : fail_errno(t, t->folder, "making the folder");
+    }
+    if (status == PF_OK)
+        status = load_identity(t);
+    return status == PF_OK || status == PF_ERR_END ? refresh(t) : status;
+}
+
+/* On failure of `look` *trust is untouched. */
+static pf_status with_folder(pf_trust **trust, const char *folder, pf_status (*look)(pf_trust *), char *error, size_t n)
 {
     pf_failure failure = {""};
     if (folder[0] == '\0' || strlen(folder) > PATH_BYTES - 32)
@@ -306,13 +332,7 @@ pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_
         free(t);
         return pf_failure_copy(&failure, pf_fail(&failure, PF_ERR_SPACE, "trust: no memory"), error, n);
     }
-    pf_status status = open_folder(t);
-    if (status == PF_OK)
-        status = open_identity(t);
-    if (status == PF_OK && !pf_certificate_key(t->certificate, t->key))
-        status = fail_crypto(t, "hashing the device's key");
-    if (status == PF_OK)
-        status = refresh(t);
+    pf_status status = look(t);
     if (status != PF_OK) {
         pf_failure_copy(&t->failure, status, error, n);
         pf_trust_close(t);
@@ -320,6 +340,19 @@ pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_
     }
     *trust = t;
     return PF_OK;
+}
+
+pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_t n)
+{
+    return with_folder(trust, folder, open_folder, error, n);
+}
+
+pf_status pf_trust_check(const char *folder, char *error, size_t n)
+{
+    pf_trust *trust = NULL;
+    pf_status status = with_folder(&trust, folder, check_folder, error, n);
+    pf_trust_close(trust);
+    return status;
 }
 
 void pf_trust_close(pf_trust *trust)

@@ -116,6 +116,39 @@ def test_check_config_finds_what_would_keep_it_from_starting(crawler: Crawler, s
     assert done.returncode == 1 and what in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_check_config_looks_at_address_and_keys_of_an_encrypted_line_and_makes_nothing(
+    tmp_path: Path, crawler: Crawler
+):
+    trust = tmp_path / "trust"
+
+    def check(**settings: object) -> str:
+        """What is wrong; "" = nothing."""
+        settings = {"transport": "tls", "address": "0.0.0.0", "trust": trust} | settings
+        pairs = (pair for key, value in settings.items() for pair in ("--set", f"link.{key}={value}"))
+        done = run("--config", crawler.config, "--check-config", *pairs)
+        assert (done.returncode == 0) == (done.stderr == "")
+        return done.stderr
+
+    assert check() == "" and not trust.exists()  # the first start makes it
+    assert 'tls: "crawler.local" is no numeric address' in check(address="crawler.local")
+    assert "absent/trust: making the folder: No such file" in check(trust=tmp_path / "absent" / "trust")
+    trust.mkdir(0o700)
+    assert check() == "" and not list(trust.iterdir())
+    (trust / "peers").write_text("nonsense\n")
+    assert "peers: line 1" in check(transport="tcp", address="127.0.0.1")
+    (trust / "peers").unlink()
+    (trust / "device.pem").touch(0o600)
+    assert "device.pem: no private key with its certificate" in check()
+    trust.chmod(0o777)
+    assert "anybody may write in this folder of keys" in check()
+
+
+def test_a_pipe_as_recording_is_refused_and_not_waited_for(tmp_path: Path, crawler: Crawler):
+    os.mkfifo(tmp_path / "pipe.y4m")
+    done = run("--config", crawler.config, "--check-config", "--set", f"camera.path={tmp_path}/pipe.y4m")
+    assert done.returncode == 1 and "pipe.y4m: not a regular file" in done.stderr
+
+
 def test_a_profile_that_is_none_is_refused_before_anything_starts(tmp_path: Path, crawler: Crawler):
     profile = tmp_path / "p.bin"
     profile.write_bytes(b"nonsense")

@@ -285,6 +285,24 @@ def flip(path: Path, at: int) -> None:
         file.write(bytes([byte ^ 1]))
 
 
+def test_check_config_finds_a_stored_profile_of_another_size(tmp_path: Path, crawler: Crawler):
+    restart(crawler)
+    install(crawler, OLD)
+    crawler.kill()
+    (tmp_path / "other.y4m").write_bytes(b"YUV4MPEG2 W64 H32 F25:1 Ip A1:1 Cmono\nFRAME\n" + bytes(64 * 32))
+    size = f"{OLD.width} x {OLD.height}"
+    for settings, given in [
+        ((f"camera.path={tmp_path}/other.y4m",), "64 x 32"),
+        (("camera.driver=v4l2", "gpio.encoder=auto", "camera.width=1280", "camera.height=800"), "1280 x 800"),
+    ]:
+        pairs = (pair for setting in settings for pair in ("--set", setting))
+        done = run("--config", crawler.config, "--check-config", *pairs)
+        assert done.returncode == 1
+        assert f"camera.profile_store: the stored profile is for {size}, the camera gives {given}" in done.stderr
+    live = ("--set", "camera.driver=v4l2", "--set", "gpio.encoder=auto")  # whose size nobody knows before it is there
+    assert run("--config", crawler.config, "--check-config", *live).returncode == 0
+
+
 def test_a_damaged_store_is_told_and_can_be_written_again(tmp_path: Path, crawler: Crawler):
     assert run("--config", crawler.config, "--check-config").returncode == 0 and not crawler.store.exists()
     restart(crawler)

@@ -53,6 +53,9 @@ typedef struct pf_trust pf_trust;
 pf_status pf_trust_open(pf_trust **trust, const char *folder, char *error, size_t n);
 void pf_trust_close(pf_trust *trust); /* NULL is allowed */
 
+/* What pf_trust_open would say of what is there; nothing is made. A folder that is not there can be, in one that is. */
+pf_status pf_trust_check(const char *folder, char *error, size_t n);
+
 /* The device's own key. */
 const uint8_t *pf_trust_key(const pf_trust *trust);
 
@@ -77,5 +80,8 @@ typedef struct pf_tls_config {
     pf_trust *trust;
 } pf_tls_config;
 pf_status pf_tls_listen(pf_transport *transport, const pf_tls_config *config, char *error, size_t n);
+
+/* What pf_tls_listen would say of the address, without listening. PF_OK, PF_ERR_ARGUMENT. */
+pf_status pf_tls_check(const pf_tls_config *config, char *error, size_t n);
 
 #endif
