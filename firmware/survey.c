@@ -39,6 +39,18 @@ size_t pf_survey_pack(const pf_survey *s, uint8_t *out)
     return HEADER + 8 * (size_t)n;
 }
 
+/* What pack() makes always is so; a host would take ranges beyond all that was made for losses. */
+static bool is_possible(const pf_survey *s)
+{
+    uint64_t after = 0; /* the last range */
+    for (uint32_t i = 0; i < s->lost_ranges; i++) {
+        if (s->lost_count[i] == 0 || s->lost_first[i] < after + (i > 0))
+            return false;
+        after = (uint64_t)s->lost_first[i] + s->lost_count[i];
+    }
+    return s->boots > 0 && after <= s->next_index;
+}
+
 static bool unpack(pf_survey *s, const uint8_t *in, size_t n)
 {
     if (n < HEADER || in[0] != FORMAT || get_u32(in + 57) > PF_SURVEY_LOST_MAX ||
@@ -53,7 +65,7 @@ static bool unpack(pf_survey *s, const uint8_t *in, size_t n)
         s->lost_first[i] = get_u32(in + HEADER + 8 * i);
         s->lost_count[i] = get_u32(in + HEADER + 8 * i + 4);
     }
-    return true;
+    return is_possible(s);
 }
 
 bool pf_survey_open(pf_survey *survey, pf_survey *before, const pf_spool *spool, const uint8_t setup[32], char *error,

@@ -31,6 +31,7 @@ void setUp(void)
 {
     memset(&survey, 0, sizeof survey);
     memcpy(survey.setup, setup, sizeof setup);
+    survey.boots = 1;
     kept_n = 0;
 }
 
@@ -96,7 +97,6 @@ static void test_no_number_of_losses_is_too_large(void)
 /* Proves: what the spool keeps comes back, without losses whose numbers the next boot uses again. */
 static void test_losses_to_come_are_not_kept(void)
 {
-    survey.boots = 1;
     memset(survey.id, 0xA5, sizeof survey.id);
     for (uint32_t i = 2; i < 5; i++)
         pf_survey_lose(&survey, i);
@@ -147,6 +147,33 @@ static void test_a_full_list_and_a_foreign_value(void)
     expect_a_new_survey();
 }
 
+/* Proves: a value of the right length whose numbers cannot be is no survey either, whichever of them the medium has
+ * damaged: a host told of ranges that overlap, or that reach beyond what was made, would count losses that are none. */
+static void test_numbers_that_cannot_be_are_no_survey(void)
+{
+    enum { BOOTS = 49, NEXT = 53, FIRST = 61, COUNT = 65, SECOND = 69 };
+    static const struct {
+        size_t at;
+        uint8_t value[4];
+    } damages[] = {{BOOTS, {0}},  {NEXT, {20}},
+                   {FIRST, {30}}, {FIRST, {18}},
+                   {COUNT, {0}},  {COUNT, {0xFF, 0xFF, 0xFF, 0xFF}},
+                   {SECOND, {4}}, {SECOND, {0, 0, 0, 0x80}}};
+    for (size_t i = 0; i <= sizeof damages / sizeof damages[0]; i++) {
+        setUp();
+        survey.next_index = 30;
+        pf_survey_lose(&survey, 3);
+        pf_survey_lose(&survey, 4);
+        pf_survey_lose(&survey, 20);
+        reopen();
+        keep(&survey);
+        if (i < sizeof damages / sizeof damages[0]) {
+            memcpy(kept + damages[i].at, damages[i].value, 4);
+            expect_a_new_survey();
+        }
+    }
+}
+
 /* Proves: another setup begins another survey and hands back the one that was interrupted, with its losses. */
 static void test_another_setup_is_another_survey(void)
 {
@@ -177,6 +204,7 @@ int main(void)
     RUN_TEST(test_no_number_of_losses_is_too_large);
     RUN_TEST(test_losses_to_come_are_not_kept);
     RUN_TEST(test_a_full_list_and_a_foreign_value);
+    RUN_TEST(test_numbers_that_cannot_be_are_no_survey);
     RUN_TEST(test_another_setup_is_another_survey);
     return UNITY_END();
 }
