@@ -440,12 +440,14 @@ static bool count(pf_spool_database *d, pf_spool_statement which, uint64_t *page
     return is_known;
 }
 
-/* Whether the file has no place yet for all that the log has: it must grow before the log can begin anew. */
-static bool must_grow(pf_spool_database *d)
+/* By how many bytes the file must grow for what the log has, before the log can begin anew. */
+static uint64_t pending_growth(pf_spool_database *d)
 {
     struct stat file;
     uint64_t pages;
-    return count(d, SQL_PAGES, &pages) && stat(d->path, &file) == 0 && (uint64_t)file.st_size < pages * PF_SPOOL_PAGE;
+    if (!count(d, SQL_PAGES, &pages) || stat(d->path, &file) != 0 || (uint64_t)file.st_size >= pages * PF_SPOOL_PAGE)
+        return 0;
+    return pages * PF_SPOOL_PAGE - (uint64_t)file.st_size;
 }
 
 /* By how many pages an object of n bytes, and what its row changes in the trees, may make the file larger. False: it
@@ -462,12 +464,14 @@ static bool measure_growth(pf_spool_database *d, size_t n, uint64_t *pages)
 /* Removing takes room too: in the log, and, before the log can begin anew, in the file for what the log still has. A
  * spool that had filled the disk to the last byte could never get rid of anything again, so some is left. What comes
  * instead of others takes a page more now and then. */
-static bool has_room(const pf_spool_database *d, uint64_t pages, bool is_exchange, uint64_t *left)
+static bool has_room(pf_spool_database *d, uint64_t pages, bool is_exchange, uint64_t *left)
 {
     struct statvfs disk;
-    if (pages == 0 || !pf_spool_look_at_disk(d->path, &disk))
+    if (!pf_spool_look_at_disk(d->path, &disk))
         return true;
     *left = room_on(&disk);
+    if (pages == 0)
+        return *left >= ROOM_BYTES || *left >= pending_growth(d);
     return *left >= (is_exchange ? ROOM_BYTES / 2 : ROOM_BYTES) + 2 * pages * PF_SPOOL_PAGE;
 }
 
@@ -478,7 +482,7 @@ pf_status pf_spool_check_disk(pf_spool_database *d, size_t n, bool is_exchange)
         return pf_spool_fail(d, "storing");
     if (has_room(d, growth, is_exchange, &left))
         return PF_OK;
-    d->no_room = must_grow(d) ? ENOSPC : 0; /* while there is room */
+    d->no_room = pending_growth(d) > 0 ? ENOSPC : 0; /* while there is room */
     d->stats.errors++;
     return pf_fail(&d->failure, PF_ERR_SPACE, "%s: the disk is full: the last %" PRIu64 " bytes are for removing",
                    d->path, left);
@@ -496,9 +500,12 @@ pf_status pf_spool_pages_to_free(pf_spool_database *d, size_t n, uint64_t *pages
 
 bool pf_spool_reuse_log(pf_spool_database *d)
 {
+    struct statvfs disk;
     int frames = 0, done = 0;
     if (d->is_read_only || d->no_room == 0 || pf_now() < d->retry_ns)
         return false;
+    if (pf_spool_look_at_disk(d->path, &disk) && room_on(&disk) < pending_growth(d))
+        return false; /* the last bytes are for removing */
     const int code = sqlite3_wal_checkpoint_v2(d->db, NULL, SQLITE_CHECKPOINT_PASSIVE, &frames, &done);
     const bool is_reusable = code == SQLITE_OK && frames > 0 && done == frames;
     if (!is_reusable)

@@ -501,14 +501,20 @@ static void test_a_disk_filled_by_others_lets_go_of_everything(void)
 }
 
 /* Proves: once a disk has become too full for more, the file takes what so far only the log has, while there is room
- * for that: when the rest of the disk is filled all the same, everything can still be removed. */
+ * for that: when the rest of the disk is filled all the same, everything can still be removed. With less room than that
+ * nothing is begun: it would take the last bytes, which removing needs. */
 static void test_a_disk_that_becomes_full_slowly_lets_go_of_everything(void)
 {
+    static uint8_t file[1 << 20];
     hook("pwrite", (sqlite3_syscall_ptr)pwrite_in_place);
     hook("pwrite64", (sqlite3_syscall_ptr)pwrite_in_place);
     open_spool("slowly.db", 0);
     for (uint64_t id = 1; id <= 20; id++)
         TEST_ASSERT_EQUAL_INT(PF_OK, put(id));
+    const size_t small = slurp(temporary_path("slowly.db"), file, sizeof file);
+    room_left = 2;
+    TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(21));
+    TEST_ASSERT_EQUAL_size_t_MESSAGE(small, slurp(temporary_path("slowly.db"), file, sizeof file), "the last room");
     room_left = 512;
     TEST_ASSERT_EQUAL_INT(PF_ERR_SPACE, put(21));
     refuse_with = ENOSPC;
