@@ -400,6 +400,32 @@ def test_a_reply_that_waits_is_returned_before_anything_else_is_waited_for(monke
         asker.close()
 
 
+def test_a_reply_that_came_while_the_host_stood_still_counts_though_its_time_is_up(monkeypatch):
+    class Once(Device):
+        def _control(self, request: pb.Request) -> None:
+            super()._control(request)
+            self._done.set()  # it goes when it has sent the reply
+
+    class Stall:
+        monotonic_ns = staticmethod(time.monotonic_ns)
+        looks = 0
+
+        @classmethod
+        def monotonic(cls) -> float:
+            cls.looks += 1
+            if cls.looks > 1:
+                device.join(PATIENCE_S)
+            return time.monotonic() + 1000 * (cls.looks > 1)
+
+    with Once([], SURVEY) as device:
+        asker = client.Client(open_transport(device.address), client.Handlers())
+        asker.open()
+        asker.run(lambda: asker.up, PATIENCE_S)
+        monkeypatch.setattr(client, "time", Stall)
+        assert asker.answer_to(5.0, get_status=pb.Nothing()).status.frames == 60
+        asker.close()
+
+
 def test_why_the_line_was_lost_is_told_until_the_device_answers():
     """Also where the time is up while the line is open again."""
     with socket.create_server(("127.0.0.1", 0)) as server:
