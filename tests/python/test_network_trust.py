@@ -142,6 +142,7 @@ def test_a_revoked_key_ends_a_session_in_which_nothing_happens(device: Crawler):
             select.select([client.transport], [], [], 1)
             client.transport.read()
     client.close()
+    wait_for_log(device, "host has gone")
 
 
 def test_no_certificate_an_old_tls_and_no_tls_at_all_are_refused(device: Crawler, tmp_path: Path):
