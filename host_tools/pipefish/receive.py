@@ -54,6 +54,7 @@ class Receiver(ObjectHandlers):
     ) -> None:
         self.store = store
         self.live = live
+        self._is_live_resumed = False
         self._line: tuple[float, str] = (-LINE_S, "")  # of the live measurement: when it was last written, what
         self.client = Client(transport, self, link=link)
         self.status: pb.Status | None = None
@@ -108,6 +109,7 @@ class Receiver(ObjectHandlers):
         self.received += 1
         self.received_bytes += len(data)
         if self.live is not None:
+            self.resume_live()
             self.live.take(kind, data)
         return STORED
 
@@ -239,10 +241,18 @@ class Receiver(ObjectHandlers):
                 if reply.status.spool.objects == 0:
                     return
 
+    def resume_live(self) -> None:
+        """Once it is known which survey comes: what an interrupted run has left of it is measured before the rest."""
+        writer = self.store.writers.get(self.store.primary or b"")
+        if self.live is not None and writer is not None and writer.recovered and not self._is_live_resumed:
+            self._is_live_resumed = True
+            self.live.resume(writer.partial)
+
     def show_live(self, bar: Progress) -> None:
         """Warnings of the live measurement; without a terminal a line of values now and then."""
         if self.live is None:
             return
+        self.resume_live()
         for warning in self.live.poll():
             bar.say(f"! {warning}")
         text, now = progress_text(self.live.progress), time.monotonic()
@@ -316,9 +326,7 @@ def receive(
 def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], quiet: bool) -> dict[str, Any]:
     """The run of `receive`."""
     store = receiver.store
-    if receiver.live is not None and store.recovered and store.primary in store.writers:
-        receiver.live.resume(store.writers[store.primary].partial)
-    recovered = store.recovered
+    receiver.resume_live()
     why = "stopped"
     try:
         if receiver.complete:
@@ -342,6 +350,7 @@ def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], qui
         store.close()
         raise
     receiver.client.close()
+    recovered = store.recovered  # a file that is to be replaced is gone on with when the device has named its survey
     summary = receiver.summary()
     keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
     lost = {w.path: w.content.lost for w in store.writers.values()}
