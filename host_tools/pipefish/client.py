@@ -145,12 +145,17 @@ class Client:
         self._open = False
 
     @property
+    def has_clock(self) -> bool:
+        """Whether the device's clock has been measured on the link, whatever it says."""
+        return self.up and self.link.stats["peer_clock_error_ns"] < 2**63
+
+    @property
     def clock(self) -> BootClock | None:
         """The device's clock as measured on the link: unix time = monotonic + offset; None before the first answer, and
         where it is one that no device can have."""
         stats = self.link.stats
         theirs = time.monotonic_ns() + stats["peer_clock_offset_ns"]
-        if not self.up or stats["peer_clock_error_ns"] >= 2**63 or not 0 <= theirs < UPTIME_MAX_NS:
+        if not self.has_clock or not 0 <= theirs < UPTIME_MAX_NS:
             return None
         # A busy machine may do something else between two looks at its clocks.
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
