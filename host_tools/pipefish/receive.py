@@ -235,10 +235,14 @@ class Receiver(ObjectHandlers):
         end, answers = time.monotonic() + LINGER_S, 0
         while self.client.up and (answers < LINGER_ANSWERS or time.monotonic() < end):
             asked = self._ask(get_status=pb.Nothing())
+            if asked is None:  # the link takes no more questions now
+                self.client.step(0.05)
+                answers += 1
+                continue
             latest = time.monotonic() + ANSWER_S
             while self.client.up and asked not in self.client.replies and time.monotonic() < latest:
                 self.client.step(0.05)
-            reply = self.client.replies.pop(asked, None) if asked is not None else None
+            reply = self.client.replies.pop(asked, None)
             if reply is None or not reply.HasField("status"):
                 return
             self.status, answers = reply.status, answers + 1
