@@ -289,8 +289,11 @@ static void service(pf_courier *c, uint64_t now)
         c->failure[0] = '\0';
         pf_log(PF_LOG_DEBUG, "%s: connected", t->ops->name(t->self));
     }
-    c->host.has_stream = status == PF_OK;
-    if (!c->host.has_stream)
+    if (status == PF_OK)
+        c->host.has_stream = true;
+    else if (c->host.has_stream)
+        lose_stream(c, now); /* it ended here, not in a read: a revoked key */
+    else
         tell_failure(c);
     tell_refused(c);
 }

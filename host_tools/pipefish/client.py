@@ -145,12 +145,17 @@ class Client:
         self._open = False
 
     @property
+    def has_clock(self) -> bool:
+        """Whether the device's clock has been measured on the link, whatever it says."""
+        return self.up and self.link.stats["peer_clock_error_ns"] < 2**63
+
+    @property
     def clock(self) -> BootClock | None:
         """The device's clock as measured on the link: unix time = monotonic + offset; None before the first answer, and
         where it is one that no device can have."""
         stats = self.link.stats
         theirs = time.monotonic_ns() + stats["peer_clock_offset_ns"]
-        if not self.up or stats["peer_clock_error_ns"] >= 2**63 or not 0 <= theirs < UPTIME_MAX_NS:
+        if not self.has_clock or not 0 <= theirs < UPTIME_MAX_NS:
             return None
         # A busy machine may do something else between two looks at its clocks.
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -294,8 +299,11 @@ class Client:
         Raises PipefishError: no answer, or the device's text."""
         self.run(lambda: self.up, timeout_s)
         wanted = self.ask(**what)
+        self.step(0.0)  # it is on its way before its time begins
         end = time.monotonic() + (timeout_s or math.inf)
         self.run(lambda: wanted in self.replies or time.monotonic() > end, timeout_s)
+        if wanted not in self.replies:
+            self.step(0.0)  # this host may have stood still until the time was up: what came meanwhile counts
         if wanted not in self.replies:
             raise NoDevice(f"the device on {self.transport.name} did not reply within {timeout_s:g} s")
         reply = self.replies.pop(wanted)

@@ -27,8 +27,10 @@ from pipefish.surveywrite import (
 from pipefish.terminal import say
 from pipefish.transport import Transport, TransportClosed
 
-FIRST_ANSWERS_S = 2.0  # the first object waits this long for the device's clock and the name of its survey
-LINGER_S = 3.0  # most time after the end for the device to take in the last acknowledgement
+FIRST_ANSWERS_S = 10.0  # the first object waits this long for the device's clock and the name of its survey
+SETTLE_S = 10.0  # most time for a device that is to hear that all is here
+# Time after the end, and answers, for the device to take in the last acknowledgement; most time for the first of them.
+LINGER_S, LINGER_ANSWERS, ANSWER_S = 3.0, 20, 30.0
 SURVEY_KINDS = (OBJECT_START, OBJECT_KEYFRAME, OBJECT_END)
 
 
@@ -54,6 +56,7 @@ class Receiver(ObjectHandlers):
     ) -> None:
         self.store = store
         self.live = live
+        self._is_live_resumed = False
         self._line: tuple[float, str] = (-LINE_S, "")  # of the live measurement: when it was last written, what
         self.client = Client(transport, self, link=link)
         self.status: pb.Status | None = None
@@ -96,7 +99,7 @@ class Receiver(ObjectHandlers):
             return STORED
         self._learn()
         waited = time.monotonic() - self._up_since
-        if waited < FIRST_ANSWERS_S and (self.client.clock is None or self._info_id is not None):
+        if waited < FIRST_ANSWERS_S and (not self.client.has_clock or self._info_id is not None):
             return None
         stored = self.store.store(name, kind, data, self._clocks, time.time_ns())
         if not stored:
@@ -108,6 +111,7 @@ class Receiver(ObjectHandlers):
         self.received += 1
         self.received_bytes += len(data)
         if self.live is not None:
+            self.resume_live()
             self.live.take(kind, data)
         return STORED
 
@@ -181,7 +185,7 @@ class Receiver(ObjectHandlers):
         self._is_settling = True
         with contextlib.suppress(PipefishError):
             self.client.open()
-            self.client.run(lambda: self.client.up, LINGER_S)
+            self.client.run(lambda: self.client.up, SETTLE_S)
             self._linger()
 
     def _check_rest(self) -> None:
@@ -226,23 +230,37 @@ class Receiver(ObjectHandlers):
         return text
 
     def _linger(self) -> None:
-        """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure."""
-        end = time.monotonic() + LINGER_S
-        while time.monotonic() < end and self.client.up:
+        """Serves the link until the device's spool is empty, so that the last acknowledgement has arrived for sure. A
+        device with another survey to send says so again and again; one that says nothing may just be busy."""
+        end, answers = time.monotonic() + LINGER_S, 0
+        while self.client.up and (answers < LINGER_ANSWERS or time.monotonic() < end):
             asked = self._ask(get_status=pb.Nothing())
-            turn = min(end, time.monotonic() + 0.5)
-            while self.client.up and time.monotonic() < turn and (asked is None or asked not in self.client.replies):
+            if asked is None:  # the link takes no more questions now
                 self.client.step(0.05)
-            reply = self.client.replies.pop(asked, None) if asked is not None else None
-            if reply is not None and reply.HasField("status"):
-                self.status = reply.status
-                if reply.status.spool.objects == 0:
-                    return
+                answers += 1
+                continue
+            latest = time.monotonic() + ANSWER_S
+            while self.client.up and asked not in self.client.replies and time.monotonic() < latest:
+                self.client.step(0.05)
+            reply = self.client.replies.pop(asked, None)
+            if reply is None or not reply.HasField("status"):
+                return
+            self.status, answers = reply.status, answers + 1
+            if reply.status.spool.objects == 0:
+                return
+
+    def resume_live(self) -> None:
+        """Once it is known which survey comes: what an interrupted run has left of it is measured before the rest."""
+        writer = self.store.writers.get(self.store.primary or b"")
+        if self.live is not None and writer is not None and writer.recovered and not self._is_live_resumed:
+            self._is_live_resumed = True
+            self.live.resume(writer.partial)
 
     def show_live(self, bar: Progress) -> None:
         """Warnings of the live measurement; without a terminal a line of values now and then."""
         if self.live is None:
             return
+        self.resume_live()
         for warning in self.live.poll():
             bar.say(f"! {warning}")
         text, now = progress_text(self.live.progress), time.monotonic()
@@ -316,9 +334,7 @@ def receive(
 def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], quiet: bool) -> dict[str, Any]:
     """The run of `receive`."""
     store = receiver.store
-    if receiver.live is not None and store.recovered and store.primary in store.writers:
-        receiver.live.resume(store.writers[store.primary].partial)
-    recovered = store.recovered
+    receiver.resume_live()
     why = "stopped"
     try:
         if receiver.complete:
@@ -342,6 +358,7 @@ def _receive(receiver: Receiver, timeout_s: float, stop: Callable[[], bool], qui
         store.close()
         raise
     receiver.client.close()
+    recovered = store.recovered  # a file that is to be replaced is gone on with when the device has named its survey
     summary = receiver.summary()
     keyframes = {w.path: len(w.content.indices) for w in store.writers.values()}
     lost = {w.path: w.content.lost for w in store.writers.values()}

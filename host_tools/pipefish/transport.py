@@ -10,6 +10,7 @@ import socket
 import ssl
 import struct
 import termios
+import time
 from abc import ABC, abstractmethod
 
 from pipefish.errors import PipefishError
@@ -17,6 +18,7 @@ from pipefish.errors import PipefishError
 DEFAULT_BAUD = 921600
 DEFAULT_PORT = 7447
 CONNECT_TIMEOUT_S = 5.0
+LEAST_WAIT_S = 0.01  # for what is here already, though the time is up
 RTSCTS = ",rtscts"  # behind the speed in a serial line's address
 
 
@@ -178,6 +180,12 @@ class TcpTransport(Transport):
         return self._socket.fileno() if self._socket is not None else -1
 
     def read(self) -> bytes:
+        data = self._receive()
+        self._heard = self._heard or bool(data)
+        return data
+
+    def _receive(self) -> bytes:
+        """What the socket has, at most 64 KiB."""
         if self._socket is None:
             raise TransportClosed(f"{self.name}: not connected")
         try:
@@ -190,7 +198,6 @@ class TcpTransport(Transport):
             raise TransportClosed(f"{self.name}: {_reason(error)}") from error
         if not data:
             raise self._ended()
-        self._heard = True
         return data
 
     def _ended(self) -> TransportClosed:
@@ -239,6 +246,9 @@ REFUSALS = {
 class TlsTransport(TcpTransport):
     """Mutual TLS 1.3 (docs/network.md): this host's key, and only devices that it knows.
 
+    OpenSSL gets the bytes from here, not from the socket: given that, one call goes on, deaf to Ctrl-C, for as long as
+    a device sends new keys instead of data.
+
     device    name of the device at the other end, once opened"""
 
     scheme = "tls"
@@ -247,6 +257,9 @@ class TlsTransport(TcpTransport):
     def __init__(self, host: str, port: int) -> None:
         super().__init__(host, port)
         self.device = ""
+        self._tls: ssl.SSLObject | None = None
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._unsent = b""  # of what OpenSSL wants to send
 
     def _context(self) -> ssl.SSLContext:
         from pipefish.keys import host_key_file
@@ -276,15 +289,16 @@ class TlsTransport(TcpTransport):
         context = self._context()
         devices = known_devices()
         super().open()
+        self._incoming, self._outgoing, self._unsent = ssl.MemoryBIO(), ssl.MemoryBIO(), b""
+        self._tls = context.wrap_bio(self._incoming, self._outgoing)
         try:
-            self._socket.settimeout(CONNECT_TIMEOUT_S)
-            self._socket = context.wrap_socket(self._socket)
-            key = certificate_key(self._socket.getpeercert(binary_form=True) or b"")
+            self._handshake(self._tls, self._socket)
+            key = certificate_key(self._tls.getpeercert(binary_form=True) or b"")
             self._socket.setblocking(False)
         except ValueError as error:
             self.close()
             raise TransportClosed(f"{self.name}: the device shows no key") from error
-        except (ssl.SSLZeroReturnError, ssl.SSLEOFError, ConnectionResetError) as error:
+        except (ssl.SSLZeroReturnError, ssl.SSLEOFError, ConnectionError) as error:
             self.close()
             why = "the device broke the handshake off: too many at once, or five of this address failed within a minute"
             raise TransportClosed(f"{self.name}: {why}", reason=why) from error
@@ -302,17 +316,45 @@ class TlsTransport(TcpTransport):
             )
         self.device = devices[key]
 
+    def _handshake(self, tls: ssl.SSLObject, line: socket.socket) -> None:
+        end = time.monotonic() + CONNECT_TIMEOUT_S
+        is_done = False
+        while not is_done:
+            try:
+                tls.do_handshake()
+                is_done = True
+            except ssl.SSLWantReadError:
+                pass
+            line.settimeout(max(end - time.monotonic(), LEAST_WAIT_S))
+            line.sendall(self._outgoing.read())
+            if not is_done and not self._incoming.write(line.recv(65536)):
+                self._incoming.write_eof()
+
+    def _send(self) -> bool:
+        """Gives the socket what OpenSSL wants to send. True: the socket has taken all of it."""
+        self._unsent += self._outgoing.read()
+        while self._unsent:
+            taken = super().write(self._unsent)
+            if taken == 0:
+                return False
+            self._unsent = self._unsent[taken:]
+        return True
+
     def read(self) -> bytes:
-        if self._socket is None:
+        if self._tls is None:
             raise TransportClosed(f"{self.name}: not connected")
+        # A device that asks for answers and takes none is not listened to: they would fill our memory.
+        received = self._receive() if self._send() else b""
+        if not received:
+            return b""
+        self._incoming.write(received)
         data, is_over = bytearray(), False
         try:
-            # Also what is decrypted already, for which no descriptor becomes readable.
-            while not is_over and (len(data) < 65536 or self._socket.pending()):
-                part = self._socket.recv(65536)
+            while not is_over:  # all of it: for what is decrypted already no descriptor becomes readable
+                part = self._tls.read(65536)
                 is_over = not part
                 data += part
-        except (ssl.SSLWantReadError, ssl.SSLWantWriteError, InterruptedError):
+        except ssl.SSLWantReadError:
             pass
         except OSError as error:
             raise self._failed(error) from error
@@ -322,14 +364,23 @@ class TlsTransport(TcpTransport):
         return bytes(data)
 
     def write(self, data: bytes) -> int:
-        if self._socket is None:
+        if self._tls is None:
             raise TransportClosed(f"{self.name}: not connected")
-        try:
-            return self._socket.send(data)
-        except (ssl.SSLWantReadError, ssl.SSLWantWriteError, InterruptedError):
+        if not self._send():
             return 0
+        try:
+            taken = self._tls.write(data)
         except OSError as error:
             raise self._failed(error) from error
+        self._send()
+        return taken
+
+    def waiting(self) -> int:
+        return super().waiting() + len(self._unsent)
+
+    def close(self) -> None:
+        super().close()
+        self._tls = None
 
 
 def open_transport(address: str, baud: int | None = None) -> Transport:

@@ -95,4 +95,5 @@ def receiving(device: Crawler) -> Iterator[Store]:
         client.run(lambda: client.up, PATIENCE_S)
         with serving(client):
             yield store
-        assert client.up and client.reconnections == 0, "who looks on has disturbed him"
+        client.run(lambda: client.up, PATIENCE_S)  # of a busy machine's device nothing may be heard for a while
+        assert client.reconnections == 0, "who looks on has disturbed him"

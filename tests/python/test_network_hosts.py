@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -277,7 +278,7 @@ def test_a_host_that_falls_silent_makes_room_for_another(device: Crawler, tmp_pa
 def test_a_device_that_stood_still_hears_its_host_before_another_gets_the_line(tmp_path: Path):
     """Suspended, or on a machine that is too busy: what a host has said meanwhile waits to be read."""
     write_recording(tmp_path / "survey.y4m", 30)
-    keepalive_ms = 500
+    keepalive_ms = 1000  # four of them are the time that this host may be held up for itself
     crawler = Crawler(tmp_path, link__keepalive_ms=keepalive_ms, daemon__exit_when_done="false", daemon__drain_s=0)
     crawler.start()
     store = Store(crawler.port)
@@ -339,22 +340,50 @@ def test_a_peer_that_sends_garbage_inside_the_tunnel_harms_nobody(device: Crawle
     wait_for_status(device, lambda s: s["link"]["crc_errors"] >= 1000)  # a zero in 256 bytes ends a frame
 
 
+@contextlib.contextmanager
+def address_of_nobody() -> Iterator[str]:
+    """An address of those that documents may use, which nobody has: other runs of this test in this network see the
+    name of a socket that holds it for us, and one that a killed run has left can be bound to."""
+    for number in range(1, 255):
+        address = f"192.0.2.{number}"
+        with socket.socket(socket.AF_UNIX) as holder:
+            if can_bind(holder, f"\0pipefish test {address}"):
+                with socket.socket() as probe:
+                    is_there = can_bind(probe, (address, 0))
+                if not is_there:
+                    yield address
+                    return
+    pytest.fail("all addresses of 192.0.2.0/24 are taken")
+
+
+def can_bind(own: socket.socket, name: str | tuple[str, int]) -> bool:
+    with contextlib.suppress(OSError):
+        own.bind(name)
+        return True
+    return False
+
+
+def test_an_address_of_nobody_is_another_for_each_of_those_that_run_at_the_same_time():
+    with address_of_nobody() as one, address_of_nobody() as other:
+        assert one != other
+
+
 def test_an_address_that_comes_later_is_waited_for(tmp_path: Path, device: Crawler):
     let_in(device, "operator")
     device.kill()
-    address = f"192.0.2.{1 + os.getpid() % 254}"  # of those that documents may use: nobody's
-    device.start("--set", f"link.address={address}")
-    wait_for_log(device, f"does not have the address {address} yet")
-    assert device.process.poll() is None
-    alias = [f"{address}/32", "dev", "lo"]
-    added = subprocess.run(["ip", "address", "add", *alias], capture_output=True, text=True)
-    if added.returncode != 0:
-        pytest.skip(f"that the device serves an address that came later is NOT tested: {added.stderr.strip()}")
-    try:
-        client = Client(TlsTransport(address, device.port), Handlers())
-        client.open()
-        client.run(lambda: client.up, PATIENCE_S)
-        assert client.up
-        client.close()
-    finally:
-        subprocess.run(["ip", "address", "del", *alias], capture_output=True)
+    with address_of_nobody() as address:
+        device.start("--set", f"link.address={address}")
+        wait_for_log(device, f"does not have the address {address} yet")
+        assert device.process.poll() is None
+        alias = [f"{address}/32", "dev", "lo"]
+        added = subprocess.run(["ip", "address", "add", *alias], capture_output=True, text=True)
+        if added.returncode != 0:
+            pytest.skip(f"that the device serves an address that came later is NOT tested: {added.stderr.strip()}")
+        try:
+            client = Client(TlsTransport(address, device.port), Handlers())
+            client.open()
+            client.run(lambda: client.up, PATIENCE_S)
+            assert client.up
+            client.close()
+        finally:
+            subprocess.run(["ip", "address", "del", *alias], capture_output=True)

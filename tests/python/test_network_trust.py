@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from crawler import PATIENCE_S, Crawler, find_daemon, wait_for_log, write_recording
-from network_device import let_in, network, open_client, raw_tls
+from network_device import let_in, network, open_client, raw_tls, serving
 from pipefish import keys
 from pipefish import pipefish_pb2 as pb
 from pipefish.cli import main
@@ -63,8 +63,10 @@ def test_an_unknown_host_is_sent_away_with_the_remedy_and_counted(device: Crawle
 def test_a_host_that_speaks_no_tls_to_a_device_that_does_is_told_so(device: Crawler):
     client = Client(open_transport(f"tcp://127.0.0.1:{device.port}"), Handlers())
     client.open()
+    with serving(client):
+        network(device, refused_handshake=1)  # it has closed the connection: why is heard, however late
     with pytest.raises(NoDevice, match="tls:// instead"):
-        client.run(lambda: client.up, 2.0)
+        client.run(lambda: client.up, 0.1)
     client.close()
 
 
@@ -142,6 +144,7 @@ def test_a_revoked_key_ends_a_session_in_which_nothing_happens(device: Crawler):
             select.select([client.transport], [], [], 1)
             client.transport.read()
     client.close()
+    wait_for_log(device, "host has gone")
 
 
 def test_no_certificate_an_old_tls_and_no_tls_at_all_are_refused(device: Crawler, tmp_path: Path):

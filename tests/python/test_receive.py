@@ -15,12 +15,14 @@ import socket
 import subprocess
 import sys
 import termios
+import threading
 import time
 from pathlib import Path
 
 import pytest
+from pipefish._engine import Link
 
-from crawler import PATIENCE_S
+from crawler import END, PATIENCE_S
 from device import Device
 from pipefish import client
 from pipefish import pipefish_pb2 as pb
@@ -75,6 +77,53 @@ def test_wall_time_comes_from_the_clock_measured_on_the_link(tmp_path):
     [error] = [r.clock.error_ns for r in survey.receipts if r.sha256 == keyframe(0)[0]]
     assert 0 < error < took / 2
     assert abs(offset - ours) < error + apart + 1_000_000  # the wall clock itself may be slewed by 0.5 ms a second
+
+
+class Busy(Device):
+    """It stands still once, for longer than three seconds, when the test says so."""
+
+    def __init__(self, *arguments, **options) -> None:
+        super().__init__(*arguments, **options)
+        self.must_stand, self.stands = threading.Event(), threading.Event()
+
+    def _now(self) -> int:
+        if self.must_stand.is_set() and not self.stands.is_set():
+            self.stands.set()
+            time.sleep(3.5)
+        return super()._now()
+
+    def stand(self) -> None:
+        self.must_stand.set()
+        self.stands.wait(PATIENCE_S)
+
+
+def patient_link() -> Link:
+    """A device that stands still on a busy machine is not gone."""
+    sizes = {"max_object": 1 << 20, "receive_slots": 4, "max_latest": 65536, "max_control": 1000}
+    return Link(role=client.ROLE_HOST, nonce=9, schema=1, keepalive_ms=60000, **sizes)
+
+
+def test_the_first_object_waits_for_the_clock_of_a_device_that_stands_still(tmp_path):
+    """Or where this host did, between the device's coming up and its answers."""
+    receiver = Receiver(open_transport("tcp://127.0.0.1:1"), SurveyStore(tmp_path / "a.mcap"), quiet=True)
+    receiver._up_since = time.monotonic() - 3.5
+    assert receiver.on_object(*keyframe(0)) is None
+    receiver._up_since = -1000.0
+    assert receiver.on_object(*keyframe(0)) == client.STORED, "but not for ever"
+
+
+def test_a_device_that_stands_still_at_the_end_hears_that_all_is_here(tmp_path, monkeypatch):
+    stored = SurveyStore.store
+
+    def store(self: SurveyStore, name: bytes, kind: int, *rest) -> bool:
+        if kind == END:
+            device.stand()
+        return stored(self, name, kind, *rest)
+
+    monkeypatch.setattr(SurveyStore, "store", store)
+    with Busy(survey_objects(3), SURVEY) as device:
+        receive_from(device, tmp_path / "a.mcap", link=patient_link())
+        assert not device.spool
 
 
 def wall_of_monotonic() -> tuple[int, int]:
@@ -397,6 +446,32 @@ def test_a_reply_that_waits_is_returned_before_anything_else_is_waited_for(monke
         monkeypatch.setattr(client, "select", Spy)
         asker.step(client.IDLE_S)
         assert Spy.heard and Spy.longest_s == 0.0
+        asker.close()
+
+
+def test_a_reply_that_came_while_the_host_stood_still_counts_though_its_time_is_up(monkeypatch):
+    class Once(Device):
+        def _control(self, request: pb.Request) -> None:
+            super()._control(request)
+            self._done.set()  # it goes when it has sent the reply
+
+    class Stall:
+        monotonic_ns = staticmethod(time.monotonic_ns)
+        looks = 0
+
+        @classmethod
+        def monotonic(cls) -> float:
+            cls.looks += 1
+            if cls.looks > 1:
+                device.join(PATIENCE_S)
+            return time.monotonic() + 1000 * (cls.looks > 1)
+
+    with Once([], SURVEY) as device:
+        asker = client.Client(open_transport(device.address), client.Handlers())
+        asker.open()
+        asker.run(lambda: asker.up, PATIENCE_S)
+        monkeypatch.setattr(client, "time", Stall)
+        assert asker.answer_to(5.0, get_status=pb.Nothing()).status.frames == 60
         asker.close()
 
 
