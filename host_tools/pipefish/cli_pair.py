@@ -14,6 +14,8 @@ def check_pair(args: argparse.Namespace) -> None:
     """Raises UsageError."""
     from pipefish.keys import parse_key
 
+    if args.forget is not None and any((args.device, args.revoke, args.device_key)):
+        raise UsageError("--forget: stands alone")
     if args.device_key is not None:
         if args.device is not None or args.revoke is not None:
             raise UsageError("--device-key: stands alone, with --device-name")
@@ -39,14 +41,23 @@ def ask_device(args: argparse.Namespace, key: str, role: str, name: str) -> str:
         client.close()
 
 
-def run_pair(args: argparse.Namespace) -> Result:
-    """Pairs, revokes, remembers a device, or tells how to pair."""
-    from pipefish.keys import host_key, host_name, known_devices, parse_key, remember_device
+def namesakes_text(name: str, keys: list[str]) -> str:
+    """What to say where other devices are called so: one may be a slip of the pen, or a card that was written anew."""
+    return "".join(f"\nso is another one, {k}; if it is none of yours: pipefish pair --forget {k}" for k in keys)
 
+
+def run_pair(args: argparse.Namespace) -> Result:
+    """Pairs, revokes, remembers or forgets a device, or tells how to pair."""
+    from pipefish.keys import forget_device, host_key, host_name, known_devices, parse_key, remember_device
+
+    if args.forget is not None:
+        name = forget_device(args.forget)
+        return {"forgotten": name}, f"{name} is no longer known"
     if args.device_key is not None:
-        remember_device(args.device_key, args.device_name)
-        return {"device": {"key": parse_key(args.device_key), "name": args.device_name}}, (
-            f"{args.device_name} is known from now on"
+        key = parse_key(args.device_key)
+        others = remember_device(key, args.device_name)
+        return {"device": {"key": key, "name": args.device_name}}, (
+            f"{key} is known as {args.device_name} from now on" + namesakes_text(args.device_name, others)
         )
     if args.revoke is not None:
         key = parse_key(args.revoke)
@@ -55,10 +66,11 @@ def run_pair(args: argparse.Namespace) -> Result:
     key, name = host_key(), args.name or host_name()
     if args.device is not None:
         device = ask_device(args, key, args.role, name)
-        remember_device(device, args.device_name)
+        others = remember_device(device, args.device_name)
         rows = [("this host", f"{name}, {args.role}"), ("its key", key), ("device", args.device_name)]
         result = {"host": {"key": key, "name": name, "role": args.role}}
-        return result | {"device": {"key": device, "name": args.device_name}}, table([*rows, ("its key", device)])
+        text = table([*rows, ("its key", device)]) + namesakes_text(args.device_name, others)
+        return result | {"device": {"key": device, "name": args.device_name}}, text
     devices = known_devices()
     text = table([("this host's key", key), *((f"device {n}", k) for k, n in devices.items())])
     text += (
@@ -68,6 +80,8 @@ def run_pair(args: argparse.Namespace) -> Result:
         "and with the key that this prints, here:\n"
         "  pipefish pair --device-key KEY --device-name crawler"
     )
+    if args.role != "calibrator":
+        text += "\nTo flash profiles and pair other hosts, too: --role calibrator"
     return {"host": {"key": key, "name": name}, "devices": {n: k for k, n in devices.items()}}, text
 
 
@@ -91,6 +105,7 @@ def add_pair(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--name", help="what the device calls this host [user@host]")
     p.add_argument("--device-name", default="crawler", help="what this host calls the device [%(default)s]")
     p.add_argument("--device-key", metavar="KEY", help="know this device without asking it")
+    p.add_argument("--forget", metavar="KEY", help="this host no longer knows the device with this key, or name")
     p.add_argument("--revoke", metavar="KEY", help="the device never lets this host's key in again")
     p.add_argument("--timeout", type=positive, default=10.0, help="seconds to wait for the device [%(default)g]")
     p.set_defaults(check=check_pair)

@@ -156,21 +156,28 @@ def _write_devices(devices: dict[str, str]) -> None:
         raise PipefishError(f"{key_folder() / 'devices'}: {error.strerror}") from error
 
 
-def remember_device(key: str, name: str) -> None:
-    """Adds a device to those known, or gives it another name. Raises PipefishError."""
-    if not name.strip() or not name.isprintable():
+def remember_device(key: str, name: str) -> list[str]:
+    """Adds a device to those known, or gives it another name; returns the keys of others that are called so, too.
+
+    Raises PipefishError."""
+    key, name = parse_key(key), name.strip()
+    if not name or not name.isprintable():
         raise PipefishError(f"'{name}' is no name for a device")
     with _locked():
-        _write_devices(known_devices() | {parse_key(key): name.strip()})
+        devices = known_devices() | {key: name}
+        _write_devices(devices)
+    return [k for k, n in devices.items() if n == name and k != key]
 
 
 def forget_device(key_or_name: str) -> str:
-    """Removes a device; returns its name. Raises PipefishError if it is not known."""
+    """Removes a device; returns its name. Raises PipefishError if it is not known, or several have this name."""
     with _locked():
         devices = known_devices()
-        for key, name in devices.items():
-            if key_or_name in (key, name):
-                del devices[key]
-                _write_devices(devices)
-                return name
-    raise PipefishError(f"no device '{key_or_name}' is known here")
+        keys = [key for key, name in devices.items() if key_or_name in (key, name)]
+        if not keys:
+            raise PipefishError(f"no device '{key_or_name}' is known here")
+        if len(keys) > 1:
+            raise PipefishError(f"{len(keys)} devices are called '{key_or_name}': say the key: {', '.join(keys)}")
+        name = devices.pop(keys[0])
+        _write_devices(devices)
+        return name

@@ -310,9 +310,11 @@ class TlsTransport(TcpTransport):
             raise self._failed(error) from error
         if key not in devices:
             self.close()
+            known = ", ".join(f"{name} {k}" for k, name in devices.items())
             raise Refused(
-                f"{self.name}: a device that this host does not know (key {key}). If it is yours, pair with it: "
-                "pipefish pair"
+                f"{self.name}: a device that this host does not know (key {key}"
+                + (f"; known: {known}" if known else "")
+                + "). If it is yours, pair with it: pipefish pair"
             )
         self.device = devices[key]
 

@@ -108,8 +108,23 @@ def test_a_device_with_another_key_gets_not_a_byte(device: Crawler):
     let_in(device, "operator")
     keys.forget_device("crawler")
     keys.remember_device("cd" * 32, "crawler")
-    with pytest.raises(Refused, match="does not know"):
+    with pytest.raises(Refused, match=f"does not know .*; known: crawler {'cd' * 32}"):
         open_client(device)
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_a_key_with_a_slip_of_the_pen_is_seen_when_it_is_said_again_and_can_be_taken_back(capsys):
+    wrong, right = "ab" * 31 + "ac", "ab" * 32
+    know = ["pair", "--device-name", "crawler", "--device-key"]
+    assert main([*know, wrong]) == 0 and main([*know, wrong]) == 0
+    assert "another" not in capsys.readouterr().out
+    assert main([*know, right]) == 0
+    assert f"pipefish pair --forget {wrong}" in capsys.readouterr().out
+    assert main(["pair", "--forget", "crawler"]) == 1
+    assert wrong in capsys.readouterr().err
+    assert main(["pair", "--forget", wrong]) == 0
+    assert keys.known_devices() == {right: "crawler"}
+    assert main(["pair", "--forget", wrong]) == 1 and main(["pair", "--forget", right, "--revoke", wrong]) == 2
 
 
 def test_a_revoked_key_ends_its_session_at_once_and_never_comes_back(device: Crawler, tmp_path: Path):
