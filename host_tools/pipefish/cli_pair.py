@@ -82,7 +82,7 @@ def run_pair(args: argparse.Namespace) -> Result:
     )
     if args.role != "calibrator":
         text += "\nTo flash profiles and pair other hosts, too: --role calibrator"
-    return {"host": {"key": key, "name": name}, "devices": {n: k for k, n in devices.items()}}, text
+    return {"host": {"key": key, "name": name}, "devices": [{"key": k, "name": n} for k, n in devices.items()]}, text
 
 
 def add_pair(commands: argparse._SubParsersAction) -> None:
