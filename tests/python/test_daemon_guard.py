@@ -143,9 +143,11 @@ def test_a_camera_that_hangs_starves_the_watchdog_until_it_goes_on(tmp_path: Pat
     crawler.kill()
 
 
-def test_a_camera_that_hangs_while_it_is_opened_starves_the_watchdog(tmp_path: Path, manager: Manager):
-    os.mkfifo(tmp_path / "survey.y4m")
-    crawler = Crawler(tmp_path, daemon__watchdog_s=2)
+def test_a_start_that_hangs_starves_the_watchdog(tmp_path: Path, manager: Manager):
+    write_recording(tmp_path / "survey.y4m", 5)
+    (tmp_path / "trust").mkdir(0o700)
+    os.mkfifo(tmp_path / "trust" / "peers")  # nobody writes: who reads it waits for ever
+    crawler = Crawler(tmp_path, link__transport="tls", link__trust=tmp_path / "trust", daemon__watchdog_s=2)
     crawler.start()
     said = manager.wait_for(crawler, "STATUS=hangs: main")
     assert set(said[:-1]) == {"EXTEND_TIMEOUT_USEC=30000000"}, "before that it asks for time to start"
