@@ -109,7 +109,9 @@ void pf_storing_do(pf_store *s)
     }
     if (status == PF_OK) {
         s->has_more = true;
-        s->stats.spool.objects++; /* at once: pf_store_is_drained must not see an empty queue and the old number */
+        /* At once: who sees the empty queue must not see the old numbers beside it. */
+        s->stats.spool.objects += 1 - (uint64_t)made.count;
+        s->stats.spool.evicted += made.count;
         if (is_keyframe(job)) {
             for (uint32_t i = 0; i < made.count; i++)
                 pf_survey_lose(&s->survey, made.victims[i].number);

@@ -24,10 +24,12 @@ static struct {
     } object[OBJECTS_MAX];
     uint64_t rows;
     int fail_puts, fail_next, fail_reads, fail_removes; /* so many of the calls to come fail */
-    bool is_full;
-    uint64_t healed;
+    bool is_full;                                       /* but for who gives something up */
+    bool has_victims;                                   /* the first object */
+    uint64_t healed, evicted;
     uint32_t kept;                  /* bit n: row n could not be removed */
     _Atomic bool is_hanging;        /* a write takes for ever */
+    _Atomic bool is_counting;       /* so does a question for what there is, after something was given up */
     uint8_t value[PF_SURVEY_BYTES]; /* as stored with the newest object */
     size_t value_n;
 } fake = {.mutex = PTHREAD_MUTEX_INITIALIZER};
@@ -62,14 +64,12 @@ static pf_status exchange(void *self, const pf_spool_victim *victims, uint32_t c
 {
     pf_status status = PF_OK;
     (void)self;
-    (void)victims;
-    (void)count;
     (void)rank;
     (void)key;
     while (fake.is_hanging)
         (void)poll(NULL, 0, 5);
     (void)pthread_mutex_lock(&fake.mutex);
-    if (fake.is_full) {
+    if (fake.is_full && count == 0) {
         status = PF_ERR_SPACE;
     } else if (fails(&fake.fail_puts)) {
         status = PF_ERR_IO;
@@ -80,6 +80,10 @@ static pf_status exchange(void *self, const pf_spool_victim *victims, uint32_t c
         memcpy(item->name, name, 32);
         memcpy(fake.value, value, value_n);
         fake.value_n = value_n;
+        for (uint32_t i = 0; i < count; i++)
+            fake.object[victims[i].row - 1].item.size = 0;
+        fake.evicted += count;
+        fake.is_counting = count > 0;
     }
     (void)pthread_mutex_unlock(&fake.mutex);
     return status;
@@ -145,9 +149,9 @@ static pf_status victims(void *self, uint64_t after, uint32_t importance, size_t
     (void)after;
     (void)importance;
     (void)n;
-    (void)found;
-    *count = 0;
-    return PF_ERR_SPACE;
+    *count = fake.has_victims;
+    found[0] = (pf_spool_victim){.row = 1, .number = 0};
+    return fake.has_victims ? PF_OK : PF_ERR_SPACE;
 }
 
 static pf_status keep_status;
@@ -162,9 +166,12 @@ static void get_stats(void *self, pf_spool_stats *stats)
 {
     (void)self;
     check_mutex();
+    while (fake.is_counting)
+        (void)poll(NULL, 0, 5);
     memset(stats, 0, sizeof *stats);
     stats->healed = fake.healed;
     (void)pthread_mutex_lock(&fake.mutex);
+    stats->evicted = fake.evicted;
     for (uint64_t i = 0; i < fake.rows; i++)
         stats->objects += fake.object[i].item.size > 0;
     (void)pthread_mutex_unlock(&fake.mutex);
@@ -405,6 +412,26 @@ static void test_a_disk_that_is_full_at_the_start_gives_nothing_up(void)
     close_store();
 }
 
+/* Proves: who has waited until all is stored sees at once how many objects there are and how many were given up, though
+ * the store's thread has not asked the spool yet: the status that a survey's end tells is right. */
+static void test_what_is_given_up_counts_as_soon_as_the_queue_is_empty(void)
+{
+    open_store(false);
+    give(PF_OBJECT_KEYFRAME, 0, "");
+    pf_store_settle(store);
+    (void)pthread_mutex_lock(&fake.mutex);
+    fake.is_full = fake.has_victims = true;
+    (void)pthread_mutex_unlock(&fake.mutex);
+    give(PF_OBJECT_KEYFRAME, 1, "");
+    pf_store_settle(store);
+    const pf_store_stats s = stats();
+    fake.is_counting = false;
+    close_store();
+    TEST_ASSERT_EQUAL_UINT64(2, fake.rows);
+    TEST_ASSERT_EQUAL_UINT64(1, s.spool.objects);
+    TEST_ASSERT_EQUAL_UINT64(1, s.spool.evicted);
+}
+
 /* After longer than a thread may work on one thing; a busy machine gets more time. */
 static bool is_well_again(void)
 {
@@ -586,6 +613,7 @@ int main(void)
     RUN_TEST(test_a_failing_disk_is_tried_again);
     RUN_TEST(test_what_cannot_be_removed_stays_and_keeps_nothing_back);
     RUN_TEST(test_a_disk_that_is_full_at_the_start_gives_nothing_up);
+    RUN_TEST(test_what_is_given_up_counts_as_soon_as_the_queue_is_empty);
     RUN_TEST(test_a_disk_that_hangs_starves_the_watchdogs);
     RUN_TEST(test_losses_of_later_keyframes_are_not_kept);
     RUN_TEST(test_flush_and_quit_count_what_is_lost);
